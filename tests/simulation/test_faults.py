@@ -12,15 +12,10 @@ from sealscope.parameters import load_rig
 from sealscope.simulation.commands import Sine, Step
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults import (
-    AirInOil,
     DutyChange,
-    ExternalLeakage,
-    FrictionChange,
     From,
     Growing,
-    PumpLeakage,
-    SensorGain,
-    SensorOffset,
+    ParameterFault,
     SensorStuck,
     Tabulated,
     parse_fault,
@@ -39,17 +34,17 @@ LEAKING_PUMP = {"G_pump": 2.4e-13}
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
-        ("pump leak x3 from 90 s", PumpLeakage(3.0, None, From(90.0))),
-        ("pump leakage +50 % growing from 1 s to 3 s", PumpLeakage(1.5, None, Growing(1.0, 3.0))),
-        ("pump leak G = 5e-13", PumpLeakage(None, 5e-13)),
-        ("rod seal A 0.012 L/min from 90 s", ExternalLeakage("A", None, 0.012 * LPM, From(90.0))),
-        ("external leak B G = 2e-13 from 90", ExternalLeakage("B", 2e-13, None, From(90.0))),
-        ("friction x1.3 from 90 s", FrictionChange(1.3, From(90.0))),
-        ("friction -20 %", FrictionChange(0.8)),
-        ("air 1 % growing from 60 s to 120 s", AirInOil(0.01, Growing(60.0, 120.0))),
-        ("sensor p_A offset -2 psi from 90 s", SensorOffset("p_A", -13789.514586336723, From(90.0))),
-        ("sensor x offset 1 mm", SensorOffset("x", 1e-3)),
-        ("sensor p_B gain +1 % from 9 s", SensorGain("p_B", 0.01, From(9.0))),
+        ("pump leak x3 from 90 s", ParameterFault("pump leak", 3.0, opening=From(90.0))),
+        ("pump leakage +50 % growing from 1 s to 3 s", ParameterFault("pump leak", 1.5, opening=Growing(1.0, 3.0))),
+        ("pump leak G = 5e-13", ParameterFault("pump leak G", 5e-13)),
+        ("rod seal A 0.012 L/min from 90 s", ParameterFault("rod seal", 0.012 * LPM, "A", From(90.0))),
+        ("external leak B G = 2e-13 from 90", ParameterFault("rod seal G", 2e-13, "B", From(90.0))),
+        ("friction x1.3 from 90 s", ParameterFault("friction", 1.3, opening=From(90.0))),
+        ("friction -20 %", ParameterFault("friction", 0.8)),
+        ("air 1 % growing from 60 s to 120 s", ParameterFault("air", 0.01, opening=Growing(60.0, 120.0))),
+        ("sensor p_A offset -2 psi from 90 s", ParameterFault("sensor offset", -13789.514586336723, "p_A", From(90.0))),
+        ("sensor x offset 1 mm", ParameterFault("sensor offset", 1e-3, "x")),
+        ("sensor p_B gain +1 % from 9 s", ParameterFault("sensor gain", 0.01, "p_B", From(9.0))),
         ("sensor p_1 stuck from 90 s to 100 s", SensorStuck("p_1", 90.0, 100.0)),
         ("sensor q_leak stuck", SensorStuck("q_leak")),
         ("duty amplitude x1.5 from 90 s", DutyChange(1.5, 1.0, From(90.0))),
@@ -69,7 +64,7 @@ def test_faults_are_read_from_words_and_their_own_words_read_back(text, fault):
 
 def test_no_fault_is_none():
     assert parse_fault("none") is None
-    assert Experiment.of(fault=["none", "friction x2"], duration=1.0).faults == (FrictionChange(2.0),)
+    assert Experiment.of(fault=["none", "friction x2"], duration=1.0).faults == (ParameterFault("friction", 2.0),)
 
 
 @pytest.mark.parametrize(

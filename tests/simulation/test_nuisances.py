@@ -23,7 +23,7 @@ from sealscope.simulation.changes import (
     Wander,
 )
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.faults import FrictionChange, PumpLeakage
+from sealscope.simulation.faults import parse_fault
 from sealscope.simulation.instruments import FILTER_REACH, decimate
 from sealscope.simulation.simulate import simulate, simulate_with_truth
 
@@ -86,7 +86,7 @@ def test_a_drift_of_nothing_changes_no_byte():
 def test_a_number_that_steps_in_the_table_is_the_rig_with_that_number(throttled):
     """Pump leakage of three times from the start on is the rig with three times the pump leakage, to the last bit."""
     values = {"G_pump": 1e-13} | ({"orifices": "present", "closed_A": 0.5, "closed_B": 0.5} if throttled else {})
-    changed = simulate_with_truth(Experiment.of(duration=3.0, set=values, fault=PumpLeakage(3.0))).truth.outputs
+    changed = simulate_with_truth(Experiment.of(duration=3.0, set=values, fault="pump leak x3")).truth.outputs
     built = simulate_with_truth(Experiment.of(duration=3.0, set={**values, "G_pump": 3.0 * 1e-13})).truth.outputs
     for name in ("x", "p_A", "p_B", "p_1"):
         np.testing.assert_array_equal(changed[name], built[name])
@@ -104,7 +104,7 @@ def test_the_oil_s_modulus_may_drift_without_making_oil():
 def test_blocks_are_short_where_it_changes_fast_and_long_where_nothing_changes():
     base, rate = rig_numbers(load_rig()), 2000.0
     assert len(Schedule([], base, 10_000, rate).numbers) == 1
-    fault = FrictionChange(1.5)
+    fault = parse_fault("friction x1.5")
     step = [
         replace(e, jumps=(2.2001,), change=lambda t: np.where(t >= 2.2001, 1.5, 1.0)) for e in fault.effects(load_rig())
     ]

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar, Literal, Protocol
 
@@ -262,115 +263,129 @@ def _check_factor(factor: float, what: str) -> None:
         raise InputError(f"{what} must change by a factor >= 0, got {factor:g}")
 
 
-def _check_size(size: float, what: str, unit: str) -> None:
-    if not (math.isfinite(size) and size >= 0):
-        raise InputError(f"{what} must be >= 0 {unit} and finite, got {size:g}")
-
-
 @dataclass(frozen=True)
-class PumpLeakage(Fault):
-    """A worn pump: its internal leakage `pump.G_pump` grows `factor` times, or by `added` [m^3/(s Pa)]."""
+class ChangeOfParameters:
+    """What a fault of a kind changes, in what words: a row of `CHANGES`.
 
-    factor: float | None = None
-    added: float | None = None
-    opening: Opening = field(default_factory=From)
-    kind: ClassVar[str] = "pump leakage"
-
-    def __post_init__(self) -> None:
-        if (self.factor is None) == (self.added is None):
-            raise InputError("a pump leak needs either a factor or a conductance, and not both")
-        if self.factor is not None:
-            _check_factor(self.factor, "a pump leak")
-        if self.added is not None:
-            _check_size(self.added, "a pump leak", "m^3/(s Pa)")
-
-    def effects(self, rig: Rig) -> tuple[Effect, ...]:
-        """Return the change of `G_pump`; a factor needs a pump that leaks."""
-        if self.added is not None:
-            return (self._plus("G_pump", self.added),)
-        if rig.pump.G_pump == 0:
-            raise InputError(f"a pump leak by a factor needs pump.G_pump > 0, got 0 ({self})")
-        return (self._times("G_pump", self.factor or 0.0),)
-
-    def __str__(self) -> str:
-        if self.factor is not None:
-            return f"pump leak x{number_text(self.factor)} {self.opening}"
-        return f"pump leak G = {number_text(self.added or 0.0)} {self.opening}"
-
-
-@dataclass(frozen=True)
-class ExternalLeakage(Fault):
-    """A worn rod seal of side A or B: oil leaves the chamber, Q = G p (laminar).
-
-    Its size is `coefficient` G [m^3/(s Pa)], or `flow` [m^3/s], the flow at the charge pressure. A closed circuit holds
-    8e-13 m^3 of oil for each pascal: give the rig a make-up (`makeup.check_valves = "present"`), or it runs empty.
+    `words` have places for `{value}` (or `{lpm}`, `{unit}`) and for `{at}`, a side or a channel, as have `parameters`.
+    These are multiplied by the value where it is a `factor`; otherwise it is added to them, over the rig's parameter
+    `over`. `needs`: a parameter that must be > 0 on the rig, and who needs it; `least`, `most`: of the value, as
+    `allowed` says after `what`.
     """
 
-    side: Literal["A", "B"]
-    coefficient: float | None = None
-    flow: float | None = None
-    opening: Opening = field(default_factory=From)
-    kind: ClassVar[str] = "external leakage"
+    kind: str
+    words: str
+    parameters: tuple[str, ...]
+    what: str
+    factor: bool = False
+    needs: tuple[str, str] | None = None
+    over: str | None = None
+    least: float = 0.0
+    most: float = sys.float_info.max
+    allowed: str = "change by a factor >= 0"
 
-    def __post_init__(self) -> None:
-        if self.side not in ("A", "B"):
-            raise InputError(f"a rod seal must be A or B, got {self.side!r}")
-        if (self.coefficient is None) == (self.flow is None):
-            raise InputError("a rod seal's leak needs either a coefficient or a flow, and not both")
-        _check_size(self.coefficient or self.flow or 0.0, "a rod seal's leak", "m^3/s or m^3/(s Pa)")
 
-    def effects(self, rig: Rig) -> tuple[Effect, ...]:
-        """Return the change of the side's `G_ext`; a flow needs a charge pressure."""
-        G = self.coefficient
-        if self.flow is not None:
-            if rig.fluid.p_charge == 0:
-                raise InputError(f"a rod seal's flow is that at fluid.p_charge, which must be > 0 Pa, got 0 ({self})")
-            G = self.flow / rig.fluid.p_charge
-        return (self._plus(f"G_ext_{self.side}", G or 0.0),)
-
-    def __str__(self) -> str:
-        if self.flow is not None:
-            return f"rod seal {self.side} {self.flow / LITRE_PER_MINUTE:g} L/min {self.opening}"
-        return f"rod seal {self.side} G = {number_text(self.coefficient or 0.0)} {self.opening}"
+_PUMP_LEAK, _SEAL_LEAK = "a pump leak", "a rod seal's leak"
+#: What faults that change parameters change. Adding friction: dry or swollen seals, a side load. Rod seals lose oil as
+#: Q = G p, their `flow` is that at the charge pressure; a closed circuit holds 8e-13 m^3 of oil for each pascal: give
+#: the rig a make-up (`makeup.check_valves = "present"`), or it runs empty. A filter that grows evenly under a steady
+#: duty is cake filtration, R = R_0 (1 + V/V_c) over the volume V that has passed (J. Hermia, Constant pressure blocking
+#: filtration laws, Trans. IChemE 60 (1982) 183-187). Sensors read an offset in the channel's SI unit too much, or a
+#: share.
+CHANGES: Mapping[str, ChangeOfParameters] = {
+    "pump leak": ChangeOfParameters(
+        "pump leakage", "pump leak x{value}", ("G_pump",), _PUMP_LEAK, factor=True,
+        needs=("pump.G_pump", "a pump leak by a factor needs"),
+    ),
+    "pump leak G": ChangeOfParameters(
+        "pump leakage", "pump leak G = {value}", ("G_pump",), _PUMP_LEAK, allowed="be >= 0 m^3/(s Pa) and finite"
+    ),
+    "rod seal": ChangeOfParameters(
+        "external leakage", "rod seal {at} {lpm:g} L/min", ("G_ext_{at}",), _SEAL_LEAK, over="fluid.p_charge",
+        needs=("fluid.p_charge", "a rod seal's flow needs"), allowed="be >= 0 m^3/s and finite",
+    ),
+    "rod seal G": ChangeOfParameters(
+        "external leakage", "rod seal {at} G = {value}", ("G_ext_{at}",), _SEAL_LEAK,
+        allowed="be >= 0 m^3/(s Pa) and finite",
+    ),
+    "friction": ChangeOfParameters(
+        "friction", "friction x{value}", tuple(of.rpartition(".")[2] for of in GROUPS["friction"]), "friction",
+        factor=True,
+    ),
+    "air": ChangeOfParameters(
+        "air", "air {value}", ("air",), "air in the oil", most=0.5, allowed="be 0 to 0.5 (0 % to 50 %) of its volume"
+    ),
+    "filter": ChangeOfParameters(
+        "filter", "filter {at} x{value}", ("R_{at}",), "a filter's resistance", factor=True,
+        needs=("line.R_{at}", "a filter that clogs must have"),
+    ),
+    "sensor offset": ChangeOfParameters(
+        "sensor offset", "sensor {at} offset {value} {unit}", ("sensors.{at}.offset",), "the offset of a faulty sensor",
+        least=-sys.float_info.max, allowed="be finite",
+    ),
+    "sensor gain": ChangeOfParameters(
+        "sensor gain", "sensor {at} gain {value}", ("sensors.{at}.{gain}",), "the gain error of a sensor",
+        least=math.nextafter(-1.0, 0.0), allowed="be > -100 % and finite",
+    ),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
-class FrictionChange(Fault):
-    """Friction of piston and rod, as a whole, becomes `factor` times what it was (dry or swollen seals, side load)."""
+class ParameterFault(Fault):
+    """A fault that changes parameters of the machine or of a sensor: the row `name` of `CHANGES`.
 
-    factor: float
+    `value` is a factor or what is added, in SI units; `at` the side or the channel.
+    """
+
+    name: str
+    value: float
+    at: str = ""
     opening: Opening = field(default_factory=From)
-    kind: ClassVar[str] = "friction"
 
     def __post_init__(self) -> None:
-        _check_factor(self.factor, "friction")
+        if self.name.startswith("sensor"):
+            _check_channel(self.at)
+        elif "{at}" in self._row.words and self.at not in ("A", "B"):
+            raise InputError(f"a {self.name} must be A or B, got {self.at!r}")
+        if not self._row.least <= self.value <= self._row.most:
+            raise InputError(f"{self._row.what} must {self._row.allowed}, got {self.value:g}")
+
+    @property
+    def _row(self) -> ChangeOfParameters:
+        return CHANGES[self.name]
+
+    @property
+    def kind(self) -> str:  # type: ignore[override]
+        """The kind that this fault is one of."""
+        return self._row.kind
+
+    def _parameters(self) -> tuple[str, ...]:
+        return tuple(name.format(at=self.at, gain=GAINS.get(self.at)) for name in self._row.parameters)
 
     def effects(self, rig: Rig) -> tuple[Effect, ...]:
-        """Return the change of all forces of friction."""
-        return tuple(self._times(name.rpartition(".")[2], self.factor) for name in GROUPS["friction"])
+        """Return the change of the machine's parameters."""
+        if self.name.startswith("sensor"):
+            return ()
+        row = self._row
+        if row.needs is not None and rig[name := row.needs[0].format(at=self.at)] == 0:
+            raise InputError(f"{row.needs[1]} {name} > 0, got 0 ({self})")
+        if row.factor:
+            return tuple(self._times(name, self.value) for name in self._parameters())
+        size = self.value if row.over is None else self.value / float(rig[row.over])
+        return tuple(self._plus(name, size) for name in self._parameters())
+
+    def adjustments(self) -> tuple[Adjustment, ...]:
+        """Return the change of the sensor's parameters."""
+        if not self.name.startswith("sensor"):
+            return ()
+        return tuple(
+            Adjustment(name, lambda t: self.value * self.opening.share(t), added=True) for name in self._parameters()
+        )
 
     def __str__(self) -> str:
-        return f"friction x{number_text(self.factor)} {self.opening}"
-
-
-@dataclass(frozen=True)
-class AirInOil(Fault):
-    """Air drawn into the oil: `share` more of free air, by volume of oil at atmospheric pressure (`fluid.air`)."""
-
-    share: float
-    opening: Opening = field(default_factory=From)
-    kind: ClassVar[str] = "air"
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.share <= 0.5:
-            raise InputError(f"air in the oil must be 0 % to 50 % of its volume, got {100 * self.share:g} %")
-
-    def effects(self, rig: Rig) -> tuple[Effect, ...]:
-        """Return the change of `air`."""
-        return (self._plus("air", self.share),)
-
-    def __str__(self) -> str:
-        return f"air {number_text(self.share)} {self.opening}"
+        unit, lpm = CHANNEL_UNITS.get(self.at), self.value / LITRE_PER_MINUTE
+        words = self._row.words.format(at=self.at, value=number_text(self.value), lpm=lpm, unit=unit)
+        return f"{words} {self.opening}"
 
 
 #: A valve that moves is held within blocks of one output of the solver, whatever their length [s].
@@ -446,35 +461,6 @@ class Circulation(Fault):
 
 
 @dataclass(frozen=True)
-class FilterClogs(Fault):
-    """The filter of line A or B clogs: its resistance becomes `factor` times what it was.
-
-    While it grows evenly under a steady duty, that is cake filtration, R = R_0 (1 + V/V_c) over the volume V that has
-    passed (J. Hermia, Constant pressure blocking filtration laws, Trans. IChemE 60 (1982) 183-187).
-    """
-
-    side: Literal["A", "B"]
-    factor: float
-    opening: Opening = field(default_factory=From)
-    kind: ClassVar[str] = "filter"
-
-    def __post_init__(self) -> None:
-        if self.side not in ("A", "B"):
-            raise InputError(f"a filter must be in line A or B, got {self.side!r}")
-        _check_factor(self.factor, "a filter's resistance")
-
-    def effects(self, rig: Rig) -> tuple[Effect, ...]:
-        """Return the change of the filter's resistance; the rig must have the filter."""
-        name = f"R_{self.side}"
-        if getattr(rig.line, name) == 0:
-            raise InputError(f"a filter that clogs must have line.{name} > 0, got 0 ({self})")
-        return (self._times(name, self.factor),)
-
-    def __str__(self) -> str:
-        return f"filter {self.side} x{number_text(self.factor)} {self.opening}"
-
-
-@dataclass(frozen=True)
 class OilTemperature(Fault):
     """The oil becomes `change` [K] warmer than `fluid.T_oil`: its viscosity, density and bulk modulus move.
 
@@ -534,57 +520,9 @@ class OilTemperature(Fault):
         return f"oil {self.change:+.12g} K {self.opening}"
 
 
-def _check_sensor(channel: str, value: float, what: str) -> None:
+def _check_channel(channel: str) -> None:
     if channel not in GAINS:
         raise InputError(f"a faulty sensor must be one of {', '.join(GAINS)}, got {channel!r}")
-    if not math.isfinite(value):
-        raise InputError(f"{what} of a faulty sensor must be finite, got {value} ({channel})")
-
-
-@dataclass(frozen=True)
-class SensorOffset(Fault):
-    """The sensor of a channel reads `offset` too much, in the channel's SI unit."""
-
-    channel: str
-    offset: float
-    opening: Opening = field(default_factory=From)
-    kind: ClassVar[str] = "sensor offset"
-
-    def __post_init__(self) -> None:
-        _check_sensor(self.channel, self.offset, "offset")
-
-    def adjustments(self) -> tuple[Adjustment, ...]:
-        """Return the offset over time."""
-        return (
-            Adjustment(f"sensors.{self.channel}.offset", lambda t: self.offset * self.opening.share(t), added=True),
-        )
-
-    def __str__(self) -> str:
-        offset = f"{number_text(self.offset)} {CHANNEL_UNITS[self.channel]}"
-        return f"sensor {self.channel} offset {offset} {self.opening}"
-
-
-@dataclass(frozen=True)
-class SensorGain(Fault):
-    """The sensor of a channel reads `error` too much, relative: 0.01 is one per cent."""
-
-    channel: str
-    error: float
-    opening: Opening = field(default_factory=From)
-    kind: ClassVar[str] = "sensor gain"
-
-    def __post_init__(self) -> None:
-        _check_sensor(self.channel, self.error, "gain error")
-        if not self.error > -1:
-            raise InputError(f"the gain error of a sensor must be > -100 %, got {100 * self.error:g} %")
-
-    def adjustments(self) -> tuple[Adjustment, ...]:
-        """Return the error of the gain over time."""
-        parameter = f"sensors.{self.channel}.{GAINS[self.channel]}"
-        return (Adjustment(parameter, lambda t: self.error * self.opening.share(t), added=True),)
-
-    def __str__(self) -> str:
-        return f"sensor {self.channel} gain {number_text(self.error)} {self.opening}"
 
 
 @dataclass(frozen=True)
@@ -597,7 +535,9 @@ class SensorStuck(Fault):
     kind: ClassVar[str] = "sensor stuck"
 
     def __post_init__(self) -> None:
-        _check_sensor(self.channel, self.at, "time")
+        _check_channel(self.channel)
+        if not math.isfinite(self.at):
+            raise InputError(f"the time of a faulty sensor must be finite, got {self.at} ({self.channel})")
         if not self.until > self.at:
             raise InputError(f"a sensor must be stuck until later than {self.at:g} s, got {self.until:g} s")
 
@@ -681,7 +621,8 @@ _LEAK = rf"(?:{_MEAN}|(?P<letter>[GC])\s*=\s*(?P<coefficient>{UNSIGNED}))(?:\s+(
 _FACTOR = rf"(?:x\s*(?P<times>{NUMBER})|(?P<percent>[-+]\s*{UNSIGNED})\s*%)"
 _SHARE = rf"(?P<share>{NUMBER})\s*(?P<sign>%?)"
 _SIZE = rf"(?P<size>{NUMBER}\s*(?:\[[^\]]+\]|[a-zA-Z][a-zA-Z0-9^/_]*))"
-_SENSOR = r"sensor\s+(?P<channel>\w+)"
+_SENSOR = r"sensor\s+(?P<place>\w+)"
+_SEAL = r"(?:rod\s+seal|external\s+leak(?:age)?)\s+(?P<place>[ABab])"
 _Part = dict[str, str | None]
 
 
@@ -745,49 +686,49 @@ def _share(part: _Part) -> float:
     return _number(part["share"]) / (100.0 if part["sign"] else 1.0)
 
 
-def _rod_seal(part: _Part) -> Fault:
-    side: Literal["A", "B"] = "A" if (part["side"] or "").upper() == "A" else "B"
-    if part["G"] is not None:
-        return ExternalLeakage(side, coefficient=_number(part["G"]), opening=_opening(part))
-    flow = parse_quantity(part["size"] or "", "m^3/s", name="a rod seal's leak")
-    return ExternalLeakage(side, flow=flow, opening=_opening(part))
-
-
-def _offset(part: _Part) -> Fault:
-    channel = part["channel"] or ""
-    offset = parse_quantity(part["size"] or "", CHANNEL_UNITS.get(channel, "Pa"), name="a sensor's offset")
-    return SensorOffset(channel, offset, _opening(part))
+def _size(part: _Part, unit: str, name: str) -> float:
+    return parse_quantity(part["size"] or "", unit, name=name)
 
 
 def _stuck(part: _Part) -> Fault:
     until = math.inf if part["until"] is None else seconds(part["until"])
-    return SensorStuck(part["channel"] or "", seconds(part["since"]), until)
+    return SensorStuck(part["place"] or "", seconds(part["since"]), until)
+
+
+#: A row of `CHANGES`: its words, and the value that they say.
+_CHANGED: tuple[tuple[str, str, Callable[[_Part], float]], ...] = (
+    ("pump leak", rf"pump\s+leak(?:age)?\s+{_FACTOR}", _factor),
+    ("pump leak G", rf"pump\s+leak(?:age)?\s+G\s*=\s*(?P<G>{NUMBER})", lambda p: _number(p["G"])),
+    ("rod seal G", rf"{_SEAL}\s+G\s*=\s*(?P<G>{NUMBER})", lambda p: _number(p["G"])),
+    ("rod seal", rf"{_SEAL}\s+{_SIZE}", lambda p: _size(p, "m^3/s", "a rod seal's leak")),
+    ("friction", rf"friction\s+{_FACTOR}", _factor),
+    ("air", rf"air\s+{_SHARE}", _share),
+    ("filter", rf"filter\s+(?P<place>[AB])\s+{_FACTOR}", _factor),
+    (
+        "sensor offset",
+        rf"{_SENSOR}\s+offset\s+{_SIZE}",
+        lambda p: _size(p, CHANNEL_UNITS.get(p["place"] or "", "Pa"), "a sensor's offset"),
+    ),
+    ("sensor gain", rf"{_SENSOR}\s+gain\s+{_SHARE}", _share),
+)
+
+
+def _changed(name: str, value: Callable[[_Part], float]) -> Callable[[_Part], Fault]:
+    def fault(part: _Part) -> Fault:
+        place = part.get("place") or ""
+        return ParameterFault(name, value(part), place if name.startswith("sensor") else place.upper(), _opening(part))
+
+    return fault
 
 
 _FORMS: tuple[tuple[str, Callable[[_Part], Fault]], ...] = (
-    (rf"pump\s+leak(?:age)?\s+{_FACTOR}{_WHEN}", lambda p: PumpLeakage(_factor(p), None, _opening(p))),
-    (
-        rf"pump\s+leak(?:age)?\s+G\s*=\s*(?P<G>{NUMBER}){_WHEN}",
-        lambda p: PumpLeakage(None, _number(p["G"]), _opening(p)),
-    ),
-    (
-        rf"(?:rod\s+seal|external\s+leak(?:age)?)\s+(?P<side>[ABab])\s+(?:G\s*=\s*(?P<G>{NUMBER})|{_SIZE}){_WHEN}",
-        _rod_seal,
-    ),
-    (rf"friction\s+{_FACTOR}{_WHEN}", lambda p: FrictionChange(_factor(p), _opening(p))),
-    (rf"air\s+{_SHARE}{_WHEN}", lambda p: AirInOil(_share(p), _opening(p))),
+    *((pattern + _WHEN, _changed(name, value)) for name, pattern, value in _CHANGED),
     (
         rf"shut-off\s+(?P<side>[AB])\s+to\s+{_SHARE}{_SPAN}",
         lambda p: ShutOff("A" if p["side"] == "A" else "B", _share(p), _between(p)),
     ),
     (rf"circulation{_SPAN}", lambda p: Circulation(_between(p))),
-    (
-        rf"filter\s+(?P<side>[AB])\s+{_FACTOR}{_WHEN}",
-        lambda p: FilterClogs("A" if p["side"] == "A" else "B", _factor(p), _opening(p)),
-    ),
     (rf"oil\s+(?P<kelvin>[-+]\s*{UNSIGNED})\s*K{_WHEN}", lambda p: OilTemperature(_number(p["kelvin"]), _opening(p))),
-    (rf"{_SENSOR}\s+offset\s+{_SIZE}{_WHEN}", _offset),
-    (rf"{_SENSOR}\s+gain\s+{_SHARE}{_WHEN}", lambda p: SensorGain(p["channel"] or "", _share(p), _opening(p))),
     (rf"{_SENSOR}\s+stuck(?:\s+from\s+(?P<since>{TIME})(?:\s+to\s+(?P<until>{TIME}))?)?", _stuck),
     (
         rf"duty(?=\s+[af])(?:\s+amplitude\s+x\s*(?P<amplitude>{NUMBER}))?"

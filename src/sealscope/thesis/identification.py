@@ -180,7 +180,12 @@ def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     assert context.sheet is not None
     log = log_residuals(_identified_rig(), context.sheet)
     columns = [(c, q, log[:, k, j]) for k, c in enumerate(CHAMBERS) for j, q in enumerate(QUANTITIES)]
-    heads = ("chamber", "detail", "geometric mean of simulated / measured leak-free RMS", "within 25 %")
+    heads: tuple[str, ...] = (
+        "chamber",
+        "detail",
+        "geometric mean of simulated / measured leak-free RMS",
+        "within 25 %",
+    )
     rows: list[tuple[Cell, ...]] = []
     for chamber, name, of in columns:
         mean, scatter = float(np.exp(of.mean())), float(np.exp(of.std(ddof=1)))
