@@ -9,7 +9,7 @@ import traceback
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache
+from functools import cache, cached_property, lru_cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
@@ -74,7 +74,11 @@ class Reproduction:
 
     def products(self, status: ItemStatus) -> tuple[Product | Claim, ...]:
         """Read the products of an item from the folder; () where there are none."""
-        return (Builder(self.job).products(status.item.id) or ()) if status.available else ()
+        return (self._builder.products(status.item.id) or ()) if status.available else ()
+
+    @cached_property
+    def _builder(self) -> Builder:
+        return Builder(self.job)
 
 
 def reproduce(
