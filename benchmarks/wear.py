@@ -33,7 +33,7 @@ import numpy as np
 
 from sealscope.diagnosis.trend.reading import reading_of, scatter_of
 from sealscope.diagnosis.trend.trend import YEARS
-from sealscope.diagnosis.trend.wear import MONTH, Levels, WearPrior, episodes, merged, search, single_outliers
+from sealscope.diagnosis.trend.wear import MONTH, DayToDay, Levels, episodes, merged, search
 from sealscope.evaluation.binomial import clopper_pearson
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Array, Recording
@@ -144,28 +144,31 @@ def machines_of(folder: Path, view: str) -> list[list[dict[str, Any]]]:
     return [[own[day] for day in sorted(own)] for own in whole]
 
 
+def levels_at(t: Array, value: Array, error: Array | float) -> Levels:
+    """Return levels of recordings that can all be compared."""
+    zeros = np.zeros(len(t))
+    return Levels(t, value, zeros + error, zeros.astype(np.int64), zeros)
+
+
 def levels_of(days: Sequence[dict[str, Any]], basis: str) -> tuple[Levels, float]:
     """Return the levels in L/min that the detector states, and the pressure for which."""
     kept = [row for row in days if row["basis"] == basis]
     pressure = float(np.median([row["pressure"] for row in kept]))
     unit = pressure / LITRE_PER_MINUTE
     t, value, error = (np.array([row[name] for row in kept], dtype=float) for name in ("day", "value", "error"))
-    return Levels.of(t, value * unit, error * unit), unit
+    return levels_at(t, value * unit, error * unit), unit
 
 
-def prior_of(basis: str, levels: Levels, told: int, unit: float) -> WearPrior:
+def prior_of(basis: str, levels: Levels, told: int, unit: float) -> DayToDay:
     """Return the prior as `sealscope trend` sets it."""
     own = scatter_of(basis, float(np.mean(levels.value[:told])) / unit)  # type: ignore[arg-type]
-    return WearPrior(replace(own, scale=own.scale * unit))
+    return own._replace(scale=own.scale * unit)
 
 
-def first_alarm(levels: Levels, prior: WearPrior, told: int) -> float | None:
+def first_alarm(levels: Levels, prior: DayToDay, told: int) -> float | None:
     """Return the day of the first alarm when each day was the last one, None where there is none."""
-    kept = np.setdiff1d(np.arange(len(levels)), single_outliers(levels, prior))
-    own = levels.part(kept)
-    known = max(1, int(np.count_nonzero(kept < told)))
-    alarm = search(own, prior, known).alarm(YEARS * 365.25)
-    return None if alarm is None else float(own.t[alarm])
+    alarm = search(levels, prior, told).alarm(YEARS * 365.25)
+    return None if alarm is None else float(levels.t[alarm])
 
 
 def delays(folder: Path) -> None:
@@ -231,7 +234,7 @@ def false_alarms(folder: Path, years: int) -> None:
                 noise = random.standard_normal(365)
                 for k in range(1, noise.size):
                     noise[k] = lasts * noise[k - 1] + math.sqrt(1.0 - lasts**2) * noise[k]
-                levels = Levels.of(np.arange(365.0), mean + scatter * noise, error)
+                levels = levels_at(np.arange(365.0), mean + scatter * noise, error)
                 prior = prior_of(basis, levels, told, unit)
                 few = merged(levels)
                 known = max(1, round(told * len(few) / len(levels)))

@@ -171,7 +171,7 @@ def trend() -> Trend:
                 None,
                 1.03 if 20 <= k <= 22 else 1.0,
                 None,
-                bytes([k]),
+                str(k),
                 "needs theta" if k == 5 else "",
             )
         )

@@ -42,20 +42,6 @@ class TrendFormat(StrEnum):
     csv = "csv"
 
 
-def _files(given: Sequence[Path]) -> list[Path]:
-    """Return the files of a call, those of its folders in the order of their names; hidden ones are left out."""
-    files: list[Path] = []
-    for path in given:
-        if path.is_dir():
-            inside = sorted(own for own in path.iterdir() if own.is_file() and not own.name.startswith("."))
-            if not inside:
-                raise InputError(f"a folder must hold recordings, got none in {path}")
-            files += inside
-        else:
-            files.append(path)
-    return files
-
-
 def _readings(
     files: Sequence[Path], channel_map: ChannelMap, rate: float | None, rig: Rig | None
 ) -> Iterator[LeakReading | None]:
@@ -110,6 +96,7 @@ def trend(
 
     Exit status 1 where a file could not be read.
     """
+    from sealscope.diagnosis.commissioned.machine import recordings_in
     from sealscope.diagnosis.trend.trend import trend_of
     from sealscope.diagnosis.verdict.severity import RepairLimit
     from sealscope.recordings.formats.columns import check_call
@@ -125,7 +112,7 @@ def trend(
     spacing = None if every is None else parse_quantity(every, "s", name="--every")
     if output is not None:
         _check_output(output, files)
-    paths = _files(files)
+    paths = recordings_in(files)
     read = list(_readings(paths, channel_map, rate, assumed_rig(rig, area, displacement)))
     readings = [reading for reading in read if reading is not None]
     if not readings:

@@ -17,7 +17,7 @@ from sealscope.recordings.timebase import seconds_of
 _SAME_START = 1e-6
 _YEAR_FIRST = re.compile(
     r"(?<!\d)(?P<year>(?:19|20)\d\d)[-_.]?(?P<month>\d\d)[-_.]?(?P<day>\d\d)[-_ T.]?"
-    r"(?P<hour>[01]\d|2[0-3])[-_.h:]?(?P<minute>[0-5]\d)(?:[-_.m:]?(?P<second>[0-5]\d))?(?!\d)"
+    r"(?:(?P<hour>[01]\d|2[0-3])[-_.h:]?(?P<minute>[0-5]\d)(?:[-_.m:]?(?P<second>[0-5]\d))?)?(?!\d)"
 )
 #: Twelve hours, which loggers write with the month first.
 _TWELVE_HOURS = re.compile(
@@ -27,25 +27,28 @@ _TWELVE_HOURS = re.compile(
 )
 
 
-def start_seconds(recording: Recording) -> float | None:
-    """Return when the recording's first sample was taken [s since 1970], None where it is not known."""
+def start_seconds(recording: Recording, file: str = "") -> float | None:
+    """Return when the recording's first sample was taken [s since 1970], None where it is not known.
+
+    By its provenance, else by the name of its file; of one with a date and no time of day: the beginning of the day.
+    """
     start = seconds_of(str(recording.provenance.get("start", "")))
     if start is None:
-        start = _stamp_in_name(str(recording.provenance.get("file", "")))
+        start = _stamp_in_name(str(recording.provenance.get("file") or file))
     return None if start is None else start + (float(recording.t[0]) if len(recording) else 0.0)
 
 
 def _stamp_in_name(name: str) -> float | None:
-    match = _YEAR_FIRST.search(name) or _TWELVE_HOURS.search(name)
+    match = _TWELVE_HOURS.search(name) or _YEAR_FIRST.search(name)
     if match is None:
         return None
     fields = match.groupdict()
-    hour = int(fields["hour"])
+    hour = int(fields["hour"] or 0)
     if fields.get("half"):
         hour = hour % 12 + (12 if fields["half"].upper() == "P" else 0)
     return seconds_of(
         f"{fields['year']}-{int(fields['month']):02d}-{int(fields['day']):02d}"
-        f"T{hour:02d}:{fields['minute']}:{fields['second'] or '00'}"
+        f"T{hour:02d}:{fields['minute'] or '00'}:{fields['second'] or '00'}"
     )
 
 

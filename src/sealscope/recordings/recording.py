@@ -302,7 +302,8 @@ def remembered(
     `channels`: those that the result depends on (default: all that the recording has). The views that
     `Recording.only` makes share results which depend on the same channels.
     """
-    names = frozenset(recording.channels if channels is None else channels)
+    present = frozenset(recording.channels)
+    names = present if channels is None else present.intersection(channels)
     result = recording._results.setdefault((key, names), _Result())
     with result.lock:
         if not result.known:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 
 #: Suffixes of files in a folder that are no recordings: Sealscope's own pages and settings, and notes.
 NO_RECORDINGS = frozenset({".toml", ".html", ".htm", ".pdf", ".png", ".svg", ".md", ".jsonl", ".part", ".bak"})
+#: How a trend, or a verdict, that was written beside the recordings begins.
+_WRITTEN = re.compile(rb'\s*\{\s*"(verdict|file)":|file,time[, ]')
 
 
 @dataclass(frozen=True)
@@ -161,12 +164,20 @@ def recordings_in(paths: Iterable[str | os.PathLike[str]] | str | os.PathLike[st
     for path in map(Path, named):
         if path.is_dir():
             inside = sorted(own for own in path.iterdir() if own.is_file() and not own.name.startswith("."))
-            files += [own for own in inside if own.suffix.lower() not in NO_RECORDINGS]
+            files += [own for own in inside if own.suffix.lower() not in NO_RECORDINGS and not _is_written(own)]
         else:
             files.append(path)
     if not files:
         raise InputError(f"a folder of recordings must hold one, got none ({', '.join(map(str, named)) or 'no path'})")
     return files
+
+
+def _is_written(file: Path) -> bool:
+    try:
+        with file.open("rb") as opened:
+            return _WRITTEN.match(opened.read(200)) is not None
+    except OSError:
+        return False  # it is read again, and the error then is named
 
 
 def learn(recording: Recording, rig: Rig, file: str, checksum: str = "") -> tuple[Learnt, dict[str, Any]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -26,8 +26,8 @@ from sealscope.recordings.recording import Recording
 #: details.
 Basis = Literal["volume balance", "pressure response", "ringing"]
 BASES: tuple[Basis, ...] = ("volume balance", "pressure response", "ringing")
-#: From day to day a level moves by this share of itself, or by this much; both known as from five recordings. Those of
-#: the conductances are what `diagnose` assumes; that of the ringing is `rms change`'s between sessions.
+#: Between recordings a level moves by this share of itself, or by this much; both known as from five recordings. Those
+#: of the conductances are what `diagnose` assumes; that of the ringing is `rms change`'s between sessions.
 _SHARE, _RINGING, _FREEDOM = 0.1, 0.11, 4.0
 #: Error of a ringing's logarithm that a recording states of itself.
 _RINGING_ERROR = 0.01
@@ -60,18 +60,14 @@ class LeakReading:
     problem: str = ""
 
 
-@dataclass(frozen=True)
-class _Stated:
+class _Stated(NamedTuple):
     """What a detector states: a level on a basis, and which of its figures have a unit."""
 
-    basis: Basis | None
-    level: Level
+    basis: Basis | None = None
+    level: Level = Level(np.nan, np.nan)
     states_flow: bool = False
     in_metres: bool = False
     scale: float | None = None
-
-
-_NOTHING = _Stated(None, Level(float("nan"), float("nan")))
 
 
 def reading_of(recording: Recording, rig: Rig | str | os.PathLike[str] | None = None, file: str = "") -> LeakReading:
@@ -81,17 +77,18 @@ def reading_of(recording: Recording, rig: Rig | str | os.PathLike[str] | None = 
     """
     known, machine = assumed_rig(rig, recording)
     inspection = inspected(recording)
-    part, problem = inspection.part, inspection.defect
-    stated = _NOTHING
-    if problem is None:
+    part, problem, stated = inspection.part, inspection.defect or "", _Stated()
+    if not problem:
         with np.errstate(all="ignore"):
             stated = _stated(part, known)
         if stated.basis is None:
-            problem = "no detector states a level: " + _reasons(part, known)
+            reasons = (unusable(detector(known), part) for detector in (VolumeBalance, PressureResponse))
+            why = dict.fromkeys(reason for reason in reasons if reason) or ["the pressures do not ring"]
+            problem = "no detector states a level: " + "; ".join(why)
     both = len(chambers_of(part)) == len(CHAMBERS) and len(part) > 0
     return LeakReading(
         file=file or str(recording.provenance.get("file", "recording")),
-        start=start_seconds(recording),
+        start=start_seconds(recording, file),
         duration=recording.duration,
         basis=stated.basis,
         level=stated.level,
@@ -102,31 +99,25 @@ def reading_of(recording: Recording, rig: Rig | str | os.PathLike[str] | None = 
         scale=stated.scale,
         machine=machine,
         digest=inspection.digest,
-        problem=problem or "",
+        problem=problem,
     )
 
 
 def _stated(part: Recording, rig: Rig) -> _Stated:
     """Return the most specific level that a recording without a defect allows."""
-    balance = VolumeBalance(rig)
+    balance, response = VolumeBalance(rig), PressureResponse(rig)
     if unusable(balance, part) is None:
         own = balance.balance(part)
         if own is not None and len(own.columns) == 1:
             size, total = own.size, own.level
-            of_all = Level(total.value * size.scale, (total.high - total.low) * size.scale / 3.92)
+            level = Level(total.value * size.scale, (total.high - total.low) * size.scale / 3.92)
             ratio = None if size.ratio is None else size.ratio.value
-            return _Stated("volume balance", of_all, size.stated, ("x", "m") in own.units, ratio)
-    response = PressureResponse(rig)
+            return _Stated("volume balance", level, size.stated, ("x", "m") in own.units, ratio)
     if unusable(response, part) is None and (reading := response.reading(part)) is not None:
         return _Stated("pressure response", Level(*reading.level), reading.stated)
     log_rms = whole_log_rms(part).reshape(-1, len(QUANTITIES))
     ringing = float(-np.mean(log_rms[:, [QUANTITIES.index(name) for name in JUDGED]]))
-    return _Stated("ringing", Level(ringing, _RINGING_ERROR)) if np.isfinite(ringing) else _NOTHING
-
-
-def _reasons(part: Recording, rig: Rig) -> str:
-    reasons = (unusable(detector(rig), part) for detector in (VolumeBalance, PressureResponse))
-    return "; ".join(dict.fromkeys(reason for reason in reasons if reason)) or "the pressures do not ring"
+    return _Stated("ringing", Level(ringing, _RINGING_ERROR)) if np.isfinite(ringing) else _Stated()
 
 
 def oil_temperature(recording: Recording) -> float | None:
@@ -137,7 +128,7 @@ def oil_temperature(recording: Recording) -> float | None:
 
 
 def scatter_of(basis: Basis, usual: float) -> DayToDay:
-    """Return the prior on the scatter of a level from day to day, for a machine of that usual level."""
+    """Return the prior on the scatter of a level between recordings, for a machine of that usual level."""
     if basis == "volume balance":
         return DayToDay(max(_SHARE * abs(usual), float(np.finfo(float).tiny)), _FREEDOM)
     return DayToDay(priors("response")["G_level"].width if basis == "pressure response" else _RINGING, _FREEDOM)

@@ -16,24 +16,23 @@ from sealscope.signals.filters import IntArray
 
 #: Readings whose displacement over area differs by more were not taken by the same sensors, or of another machine.
 SAME_SENSORS = 0.01
-#: A wait longer than this many typical ones, and than a day, is a gap.
-_GAP = 5.0
 DAY = 86_400.0
-_MOST_NAMES = 3
+#: Most names that a finding lists, and most times that a clock is set back: numbers that fall more often are no order.
+_MOST_NAMES, _FEW_BACK = 3, 2
 
 
 @dataclass(frozen=True, eq=False)
 class Timeline:
     """Readings in the order of their times.
 
-    `readings`: those that take part, `group` (n,): number of the group of each, within which they can be compared;
-    `groups`: what each group is, in words; `left_out`: the others, each with the reason; `findings`: on the whole.
+    `group` (n,): number of the group of each, within which they can be compared, -1 where it is left out, for the
+    reason `notes`; `groups`: what each group is, in words; `findings`: on the whole; `basis` of those that take part.
     """
 
     readings: tuple[LeakReading, ...]
     group: IntArray
+    notes: tuple[str, ...]
     groups: tuple[str, ...]
-    left_out: tuple[tuple[LeakReading, str], ...]
     findings: tuple[Finding, ...]
     basis: Basis | None
 
@@ -58,140 +57,88 @@ def timeline(readings: Sequence[LeakReading]) -> Timeline:
     unknown = [reading.file for reading in readings if reading.start is None]
     if unknown:
         raise InputError(
-            f"the time of every recording must be known, got none of {_names(unknown)}: give --every 1d where they "
-            "were made at equal intervals, in the order of their names, or put date and time into the names "
-            "(press_20240531_0730.csv)"
+            f"the time of every recording must be known, got none of {_names(unknown)}: put the date into the names "
+            "(press_20240531.csv, press_20240531_0730.csv), or give --every 1d where they were made at equal "
+            "intervals, in the order of their names"
         )
     ordered = sorted(readings, key=lambda reading: (reading.start or 0.0, natural(reading.file)))
-    findings = _clock(ordered)
-    left_out: list[tuple[LeakReading, str]] = []
-    kept: list[LeakReading] = []
-    seen: dict[str, str] = {}
+    first: dict[str, str] = {}
+    notes = []
     for reading in ordered:
-        if reading.basis is None:
-            left_out.append((reading, reading.problem))
-        elif reading.digest in seen:
-            left_out.append((reading, f"the same samples as {seen[reading.digest]}"))
-        else:
-            seen[reading.digest] = reading.file
-            kept.append(reading)
-    basis: Basis | None = None
-    if kept:
-        counts = [sum(reading.basis == own for reading in kept) for own in BASES]
-        basis = BASES[int(np.argmax(counts))]
-        others = [reading for reading in kept if reading.basis != basis]
-        left_out += [(reading, f"its channels allow the {reading.basis}, not the {basis}") for reading in others]
-        kept = [reading for reading in kept if reading.basis == basis]
-    group, groups = _groups(kept)
-    findings += _named(left_out, kept, group, groups)
-    findings += _gaps(kept)
-    return Timeline(tuple(kept), group, groups, tuple(left_out), tuple(findings), basis)
+        copy = first.setdefault(reading.digest, reading.file) if reading.basis is not None else reading.file
+        notes.append(reading.problem or ("" if copy == reading.file else f"the same samples as {copy}"))
+    kept = [reading.basis for reading, note in zip(ordered, notes, strict=True) if not note]
+    basis: Basis | None = max(BASES, key=kept.count) if kept else None
+    for k, reading in enumerate(ordered):
+        if not notes[k] and reading.basis != basis:
+            notes[k] = f"its channels allow the {reading.basis}, not the {basis}"
+    group, groups = _groups(ordered, notes)
+    findings = [*_clock(ordered), *_named(ordered, notes, group, groups)]
+    return Timeline(tuple(ordered), group, tuple(notes), groups, tuple(findings), basis)
 
 
-def _groups(readings: Sequence[LeakReading]) -> tuple[IntArray, tuple[str, ...]]:
-    """Return the group of each reading, and what each group is, against the first reading."""
-    first: list[LeakReading] = []
-    texts: list[str] = []
-    numbers = []
-    for reading in readings:
-        alike = [number for number, other in enumerate(first) if _apart(reading, other) is None]
-        numbers.append(alike[0] if alike else len(first))
-        if not alike:
-            texts.append((_apart(reading, first[0]) or "") if first else "")
-            first.append(reading)
-    return np.array(numbers, dtype=np.int64), tuple(texts)
+def _groups(readings: Sequence[LeakReading], notes: Sequence[str]) -> tuple[IntArray, tuple[str, ...]]:
+    """Return the group of each reading, and what each group is: of one scale, in words against the first reading."""
+    scales: list[float | None] = []
+    numbers = np.full(len(readings), -1)
+    for k, (reading, note) in enumerate(zip(readings, notes, strict=True)):
+        if not note:
+            alike = [
+                number for number, scale in enumerate(scales) if abs(_change(reading.scale, scale)) <= SAME_SENSORS
+            ]
+            numbers[k] = alike[0] if alike else len(scales)
+            scales += [] if alike else [reading.scale]
+    texts = [
+        f"position or angle is scaled by {100.0 * _change(scale, scales[0]):+.2g} %: a sensor exchanged, or another "
+        "machine"
+        for scale in scales[1:]
+    ]
+    return numbers, ("", *texts) if scales else ()
 
 
-def _apart(reading: LeakReading, other: LeakReading) -> str | None:
-    """Return why two readings cannot be compared, in words, None where they can."""
-    if reading.scale is not None and other.scale is not None:
-        change = reading.scale / other.scale - 1.0
-        if abs(change) > SAME_SENSORS:
-            return f"position or angle is scaled by {100.0 * change:+.2g} %: a sensor exchanged, or another machine"
-    return None
-
-
-#: A clock is set back a few times; numbers that fall more often do not follow the order.
-_FEW_BACK = 2
+def _change(scale: float | None, other: float | None) -> float:
+    return 0.0 if scale is None or other is None else scale / other - 1.0
 
 
 def _clock(ordered: Sequence[LeakReading]) -> list[Finding]:
-    """Return what shows that a clock was set back: recordings that overlap, or numbered names against the times."""
+    """Return what shows that a clock was set back: recordings that overlap, or numbered names against the times.
+
+    Recordings of one date without times of day have the same start.
+    """
+    timed = [(reading.start or 0.0, reading) for reading in ordered]
     overlaps = [
-        (early, late)
-        for early, late in pairwise(ordered)
-        if early.digest != late.digest and (late.start or 0.0) < (early.start or 0.0) + 0.99 * early.duration
+        f"{early.file} was still recording when {late.file} began: a clock was set back, or they are of two machines"
+        for (begin, early), (start, late) in pairwise(timed)
+        if early.digest != late.digest and begin < start < begin + 0.99 * early.duration
     ]
-    if overlaps:
-        early, late = overlaps[0]
-        return [
-            _finding(
-                "clock",
-                "warning",
-                len(overlaps),
-                f"{early.file} was still recording when {late.file} began: a clock was set back, or they are of two "
-                "machines",
-            )
-        ]
-    kinds = sorted({_kind(reading.file) for reading in ordered})
-    if len(kinds) != 1:
-        return _names_of_kinds(ordered, kinds)
-    by_number = sorted(ordered, key=lambda reading: natural(reading.file))
-    back = [(early, late) for early, late in pairwise(by_number) if (late.start or 0.0) < (early.start or 0.0)]
-    if not back or len(back) > max(_FEW_BACK, len(ordered) // 10):  # numbers that say nothing of the order
-        return []
-    early, late = back[0]
-    text = f"{late.file} is numbered after {early.file} and has an earlier time: a clock was set back"
-    return [_finding("clock", "warning", len(back), text)]
-
-
-def _kind(name: str) -> str:
-    """Return the first word of a file's name, without numbers."""
-    return re.split(r"[\d\W_]", name, maxsplit=1)[0].lower()
-
-
-def _names_of_kinds(ordered: Sequence[LeakReading], kinds: Sequence[str]) -> list[Finding]:
-    """Return that the names begin with few words, each with several recordings, as those of several machines do."""
-    counts = {kind: sum(_kind(reading.file) == kind for reading in ordered) for kind in kinds}
-    if len(kinds) > 3 or min(counts.values()) < 3 or "" in counts:
-        return []
-    listed = ", ".join(f"{count} as {kind!r}" for kind, count in counts.items())
-    text = f"the names begin with {len(kinds)} words ({listed}): a trend is that of a single machine"
-    return [_finding("names", "note", len(ordered), text)]
+    numbered = sorted(timed, key=lambda own: natural(own[1].file))
+    back = [
+        f"{late.file} is numbered after {early.file} and has an earlier time: a clock was set back"
+        for (begin, early), (start, late) in pairwise(numbered)
+        if start < begin
+    ]
+    alike = len({re.split(r"[\d\W_]", reading.file, maxsplit=1)[0].lower() for reading in ordered}) == 1
+    texts = overlaps or (back if alike and len(back) <= max(_FEW_BACK, len(ordered) // 10) else [])
+    return [_finding("clock", "warning", len(texts), texts[0])] if texts else []
 
 
 def _named(
-    left_out: Sequence[tuple[LeakReading, str]], kept: Sequence[LeakReading], group: IntArray, groups: Sequence[str]
+    readings: Sequence[LeakReading], notes: Sequence[str], group: IntArray, groups: Sequence[str]
 ) -> list[Finding]:
-    reasons: dict[str, list[str]] = {}
-    texts: dict[str, str] = {}
-    for reading, reason in left_out:
-        alike = re.sub(r"\d[\d.]*", "#", reason)  # but for its numbers
-        texts.setdefault(alike, reason)
-        reasons.setdefault(alike, []).append(reading.file)
-    total = len(left_out) + len(kept)
-    findings = [
-        _finding("left_out", "warning", len(files), f"{len(files)} of {total} left out: {texts[own]} ({_names(files)})")
-        for own, files in reasons.items()
-    ]
+    """Return findings on what is left out, one for each reason, and on what is compared among itself only."""
+    reasons: dict[str, list[int]] = {}
+    for k, note in enumerate(notes):
+        if note:
+            reasons.setdefault(re.sub(r"\d[\d.]*", "#", note), []).append(k)  # alike but for its numbers
+    total, findings = len(readings), []
+    for rows in reasons.values():
+        text = f"{len(rows)} of {total} left out: {notes[rows[0]]} ({_names([readings[k].file for k in rows])})"
+        findings.append(_finding("left_out", "warning", len(rows), text))
     for number in range(1, len(groups)):
-        files = [reading.file for reading, own in zip(kept, group, strict=True) if own == number]
+        files = [reading.file for reading, own in zip(readings, group, strict=True) if own == number]
         text = f"{len(files)} of {total} compared among themselves only: {groups[number]} ({_names(files)})"
         findings.append(_finding("not_comparable", "note", len(files), text))
     return findings
-
-
-def _gaps(kept: Sequence[LeakReading]) -> list[Finding]:
-    starts = np.array([reading.start or 0.0 for reading in kept])
-    waits = np.diff(starts)
-    if waits.size < 3:
-        return []
-    gaps = np.flatnonzero(waits > max(_GAP * float(np.median(waits)), DAY))
-    if not gaps.size:
-        return []
-    longest = int(gaps[int(np.argmax(waits[gaps]))])
-    text = f"{gaps.size} gap{'s' if gaps.size > 1 else ''}, the longest of {waits[longest] / DAY:.3g} days after "
-    return [_finding("gap", "note", int(gaps.size), text + kept[longest].file)]
 
 
 def _finding(code: str, severity: Severity, count: int, text: str) -> Finding:

@@ -6,14 +6,15 @@ import math
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from sealscope.calls import checked_call
+from sealscope.diagnosis.inference.onset import Interval
 from sealscope.diagnosis.trend.reading import Basis, LeakReading, reading_of, scatter_of
 from sealscope.diagnosis.trend.timeline import DAY, Timeline, spaced, timeline
-from sealscope.diagnosis.trend.wear import Episode, Interval, Levels, Wear, WearPrior, episodes, merged, single_outliers
+from sealscope.diagnosis.trend.wear import DayToDay, Episode, Levels, Wear, beyond, episodes, merged
 from sealscope.diagnosis.verdict.diagnosis import next_check
 from sealscope.diagnosis.verdict.evidence import Verdict
 from sealscope.diagnosis.verdict.machine import AssumedMachine
@@ -21,6 +22,7 @@ from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
+from sealscope.signals.filters import IntArray
 from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
@@ -36,6 +38,7 @@ _PER_KELVIN, _PER_KELVIN_SD = 0.04, 0.015
 _FOUND = 5.0
 #: Fewest comparable recordings that show that nothing grows.
 _FEWEST = 3
+_APART = "apart from the recordings before and after: it counts as if it were near"
 
 
 @dataclass(frozen=True)
@@ -159,6 +162,8 @@ class Trend:
     def as_dict(self) -> dict[str, Any]:
         """Return the trend as plain JSON values; a number that is not finite becomes null."""
         wear, alarm = self.wear, self.alarm
+        reached = None if wear is None or wear.reach is None or not self.points else wear.reach
+        last = self.points[-1].day if self.points else 0.0
         return {
             "verdict": self.verdict,
             "reason": self.reason,
@@ -168,18 +173,19 @@ class Trend:
             "recordings": len(self.points),
             "compared": len(self.rows),
             "first": self._moment(self.points[0].day) if self.points else None,
-            "last": self._moment(self.points[-1].day) if self.points else None,
+            "last": self._moment(last) if self.points else None,
             "now": None if wear is None else _interval(wear.now),
             "healthy": None if wear is None else _interval(wear.healthy),
             "day_to_day": None if wear is None else _plain(wear.scatter),
             "growth_per_month": None if wear is None else _interval(wear.growth),
             "step": None if wear is None or wear.step is None else _interval(wear.step),
-            "onset": None if wear is None or wear.onset is None else self._moments(wear.onset),
+            "onset": None if wear is None or wear.onset is None else self._moments(*wear.onset),
             "alarm": None if alarm is None else {"file": alarm.file, "time": self._moment(alarm.day)},
             "repairs": [{"file": point.file, "time": self._moment(point.day)} for point in self.repairs],
             "limit": _plain(self.limit),
             "repair_limit": self.repair.as_dict(),
-            "days_to_limit": None if wear is None or wear.reach is None else _interval(wear.reach),
+            "days_to_limit": None if reached is None else _interval(reached),
+            "limit_reached": None if reached is None else self._moments(*(last + days for days in reached)),
             "false_alarm_years": self.years,
             "healthy_recordings": self.healthy,
             "rig": None if self.machine is None else self.machine.as_dict(),
@@ -189,9 +195,7 @@ class Trend:
                     "file": point.file,
                     "time": self._moment(point.day),
                     "day": point.day,
-                    "value": _plain(point.value),
-                    "low": _plain(point.low),
-                    "high": _plain(point.high),
+                    **{name: _plain(getattr(point, name)) for name in ("value", "low", "high")},
                     "group": None if point.group < 0 else point.group,
                     "temperature_C": _plain(point.temperature),
                     "note": point.note,
@@ -199,7 +203,7 @@ class Trend:
                 for point in self.points
             ],
             "findings": [
-                {"code": finding.code, "count": finding.count, "severity": finding.severity, "text": finding.text}
+                {name: getattr(finding, name) for name in ("code", "count", "severity", "text")}
                 for finding in self.findings
             ],
             "next_check": self.next_check,
@@ -213,8 +217,8 @@ class Trend:
             return day
         return str(np.datetime64(round((self.points[0].start + (day - self.points[0].day) * DAY) * 1e3), "ms"))[:19]
 
-    def _moments(self, days: Interval) -> dict[str, str | float | None]:
-        return {name: self._moment(getattr(days, name)) for name in ("value", "low", "high")}
+    def _moments(self, *days: float) -> dict[str, str | float | None]:
+        return dict(zip(("value", "low", "high"), map(self._moment, days), strict=True))
 
 
 def _plain(value: float | None) -> float | None:
@@ -222,7 +226,7 @@ def _plain(value: float | None) -> float | None:
 
 
 def _interval(interval: Interval) -> dict[str, float | None]:
-    return {"value": _plain(interval.value), "low": _plain(interval.low), "high": _plain(interval.high)}
+    return {name: _plain(value) for name, value in interval._asdict().items()}
 
 
 @checked_call
@@ -298,41 +302,44 @@ def trend_of(
 
 
 def _trend(line: Timeline, *, healthy: int, repair: RepairLimit, years: float, dated: bool) -> Trend:
-    every = [*line.readings, *(reading for reading, _ in line.left_out)]
-    first = min((reading.start or 0.0 for reading in every), default=0.0)
-    series = _series(line, first, healthy, repair)
-    findings = list(line.findings)
+    kept = np.flatnonzero(line.group >= 0)
+    series = _series(line, kept, healthy, repair) if kept.size else None
+    findings, rows = list(line.findings), kept
     stretches: tuple[Episode, ...] = ()
-    rows: tuple[int, ...] = ()
-    notes: dict[int, str] = {}
+    points = [_point(reading, line.readings[0], note) for reading, note in zip(line.readings, line.notes, strict=True)]
     if series is not None:
-        alone = single_outliers(series.levels, series.prior)
-        notes = dict.fromkeys(map(int, alone), "apart from the recordings before and after it, which agree: left out")
+        levels, few = series.levels, merged(series.levels)
+        alone = np.flatnonzero(beyond(levels, series.prior)[1])
         if alone.size:
-            files = ", ".join(line.readings[int(k)].file for k in alone[:3])
-            text = f"{alone.size} of {len(every)} left out: apart from the recordings before and after ({files})"
+            files = ", ".join(line.readings[int(kept[k])].file for k in alone[:3])
+            text = f"{alone.size} of {len(points)} {_APART} ({files})"
             findings.append(Finding("outlier", "warning", None, int(alone.size), None, text))
-        kept = np.setdiff1d(np.arange(len(series.levels)), alone)
-        whole = series.levels.part(kept)
-        few = merged(whole)
-        known = max(1, int(np.count_nonzero(kept < healthy)))
-        if len(few) < len(whole):
-            known = max(1, round(known * len(few) / len(whole)))
+        for k, row in enumerate(kept):
+            value, half = float(levels.value[k]), 1.96 * float(levels.error[k])
+            points[row] = replace(
+                points[row],
+                value=value,
+                low=value - half,
+                high=value + half,
+                group=int(line.group[row]),
+                note=_APART if k in alone else "",
+            )
+        known = max(1, round(healthy * len(few) / len(levels)))
         stretches = tuple(episodes(few, series.prior, years=years, known=known, allowed=series.allowed))
-        rows = tuple(int(kept[np.argmin(np.abs(whole.t - t))]) for t in few.t)
-    points, places = _points(line, series, notes, first)
+        if len(few) < len(levels):
+            rows = kept[[int(np.argmin(np.abs(levels.t - t))) for t in few.t]]
     trend = Trend(
         verdict="cannot tell",
         reason="",
         basis=line.basis,
         unit="L/min" if series is not None and series.states_flow else "%",
         pressure=series.pressure if series is not None and series.states_flow else None,
-        points=points,
+        points=tuple(points),
         groups=line.groups,
         episodes=stretches,
-        rows=tuple(places[row] for row in rows),
+        rows=tuple(map(int, rows)),
         repair=repair,
-        machine=every[0].machine if every else None,
+        machine=line.readings[0].machine if line.readings else None,
         findings=tuple(findings),
         years=years,
         healthy=healthy,
@@ -342,8 +349,7 @@ def _trend(line: Timeline, *, healthy: int, repair: RepairLimit, years: float, d
     return replace(trend, verdict=verdict, reason=reason)
 
 
-@dataclass(frozen=True, eq=False)
-class _Series:
+class _Series(NamedTuple):
     """Levels of readings in the trend's unit, and their prior.
 
     `states_flow`: whether the unit is L/min, at the `pressure` [Pa]; `allowed`: rise at which a repair is due, None
@@ -351,29 +357,23 @@ class _Series:
     """
 
     levels: Levels
-    prior: WearPrior
+    prior: DayToDay
     states_flow: bool
     pressure: float
     allowed: float | None
 
 
-def _series(line: Timeline, first: float, healthy: int, repair: RepairLimit) -> _Series | None:
-    if line.basis is None:
-        return None
-    readings = line.readings
-    t = np.array([((reading.start or 0.0) - first) / DAY for reading in readings])
-    value = np.array([reading.level.value for reading in readings])
-    error = np.array([reading.level.error for reading in readings])
-    usual = float(np.mean(value[:healthy]))
-    pressure = float(np.median([reading.pressure for reading in readings]))
-    scatter = scatter_of(line.basis, usual)
-    covariate, slope_sd = np.zeros(t.size), 0.0
-    temperatures = [reading.temperature for reading in readings]
-    if line.basis != "ringing" and all(own is not None for own in temperatures):
-        warmer = np.array(temperatures, dtype=float) - float(temperatures[0] or 0.0)
-        factor = np.exp(-_PER_KELVIN * warmer)
-        value, error = value * factor, error * factor
-        covariate, slope_sd = warmer, _PER_KELVIN_SD * abs(usual)
+def _series(line: Timeline, kept: IntArray, healthy: int, repair: RepairLimit) -> _Series:
+    readings = [line.readings[k] for k in kept]
+    t = np.array([_day(reading, line.readings[0]) for reading in readings])
+    value, error = (np.array([reading.level[k] for reading in readings]) for k in (0, 1))
+    usual, pressure = float(np.mean(value[:healthy])), float(np.median([reading.pressure for reading in readings]))
+    scatter = scatter_of(line.basis or "ringing", usual)
+    warmer, slope_sd = np.zeros(t.size), 0.0
+    temperatures = [reading.temperature for reading in readings if reading.temperature is not None]
+    if line.basis != "ringing" and len(temperatures) == t.size:
+        warmer, slope_sd = np.array(temperatures) - temperatures[0], _PER_KELVIN_SD * abs(usual)
+        value, error = value * np.exp(-_PER_KELVIN * warmer), error * np.exp(-_PER_KELVIN * warmer)
     flows = all(reading.states_flow for reading in readings)
     unit = pressure / LITRE_PER_MINUTE if flows else 100.0 / max(abs(usual), float(np.finfo(float).tiny))
     if line.basis == "ringing":
@@ -383,39 +383,18 @@ def _series(line: Timeline, first: float, healthy: int, repair: RepairLimit) -> 
         allowed = repair.value / LITRE_PER_MINUTE
     elif repair.kind == "creep" and readings[0].area is not None:
         allowed = repair.value * readings[0].area / pressure * unit
-    levels = Levels(t, value * unit, error * unit, line.group, covariate, slope_sd * unit)
-    prior = WearPrior(replace(scatter, scale=scatter.scale * unit))
-    return _Series(levels, prior, flows, pressure, allowed)
+    levels = Levels(t, value * unit, error * unit, line.group[kept], warmer, slope_sd * unit)
+    return _Series(levels, scatter._replace(scale=scatter.scale * unit), flows, pressure, allowed)
 
 
-def _points(
-    line: Timeline, series: _Series | None, notes: dict[int, str], first: float
-) -> tuple[tuple[TrendPoint, ...], dict[int, int]]:
-    """Return all recordings in the order of their times, and the place among them of each that takes part."""
-    made: list[tuple[TrendPoint, int]] = []
-    for k, reading in enumerate(line.readings if series is not None else ()):
-        assert series is not None
-        value, half = float(series.levels.value[k]), 1.96 * float(series.levels.error[k])
-        point = TrendPoint(
-            reading.file,
-            reading.start or 0.0,
-            float(series.levels.t[k]),
-            value,
-            value - half,
-            value + half,
-            int(line.group[k]),
-            reading.temperature,
-            notes.get(k, ""),
-        )
-        made.append((point, k))
-    for reading, reason in line.left_out:
-        start = reading.start or 0.0
-        point = TrendPoint(
-            reading.file, start, (start - first) / DAY, None, None, None, -1, reading.temperature, reason
-        )
-        made.append((point, -1))
-    made.sort(key=lambda own: (own[0].start, own[0].file))
-    return tuple(point for point, _ in made), {k: place for place, (_, k) in enumerate(made) if k >= 0}
+def _day(reading: LeakReading, first: LeakReading) -> float:
+    return ((reading.start or 0.0) - (first.start or 0.0)) / DAY
+
+
+def _point(reading: LeakReading, first: LeakReading, note: str) -> TrendPoint:
+    """Return the point of a recording that is left out."""
+    day, start = _day(reading, first), reading.start or 0.0
+    return TrendPoint(reading.file, start, day, None, None, None, -1, reading.temperature, note)
 
 
 def _verdict(trend: Trend) -> tuple[Verdict, str]:

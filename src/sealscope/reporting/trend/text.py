@@ -5,18 +5,20 @@ from __future__ import annotations
 import csv
 import io
 import math
+from textwrap import fill
 
 import numpy as np
 
+from sealscope.diagnosis.inference.onset import Interval
 from sealscope.diagnosis.trend.timeline import DAY
 from sealscope.diagnosis.trend.trend import Trend, TrendPoint
-from sealscope.diagnosis.trend.wear import MONTH, Interval
+from sealscope.diagnosis.trend.wear import MONTH
 from sealscope.reporting.messages import machine_text, number
 
 #: Times are shown to the minute where all recordings lie within so many days.
 _WITHIN_DAYS = 3.0
-#: Furthest time that is stated, in months.
-_FURTHEST = 120.0
+#: Furthest time that is stated [days].
+_FURTHEST = 120.0 * MONTH
 _BASES = {
     "volume balance": "by the volume balance",
     "pressure response": "by the pressures' response",
@@ -46,18 +48,18 @@ def since(trend: Trend) -> str | None:
     wear = trend.wear
     if wear is None or wear.onset is None:
         return None
-    onset = wear.onset
-    return f"{moment(trend, onset.value)} ({moment(trend, onset.low)} to {moment(trend, onset.high)})"
+    value, low, high = (moment(trend, day) for day in wear.onset)
+    return f"{value} ({low} to {high})"
 
 
 def headline(trend: Trend) -> str:
     """Return verdict and what it rests on, in one line."""
-    count = len(trend.points)
-    span = f", {moment(trend, trend.points[0].day)} to {moment(trend, trend.points[-1].day)}" if count else ""
-    own = since(trend)
+    count, wear = len(trend.points), trend.wear
+    onset = "" if wear is None or wear.onset is None else f" since {moment(trend, wear.onset.value)}"
     if trend.verdict == "no leak" and trend.repairs:  # what was before is over
-        own = f"{moment(trend, trend.repairs[-1].day)}, when the level fell"
-    return f"{trend.verdict} in {count} recording{'' if count == 1 else 's'}{span}{f', since {own}' if own else ''}"
+        onset = f" since {moment(trend, trend.repairs[-1].day)}, when the level fell"
+    span = f", {moment(trend, trend.points[0].day)} to {moment(trend, trend.points[-1].day)}" if count else ""
+    return f"{trend.verdict}{onset}: {count} recording{'' if count == 1 else 's'}{span}"
 
 
 def sentence(trend: Trend) -> str:
@@ -93,17 +95,9 @@ def healthy(trend: Trend) -> str | None:
     wear = trend.wear
     if wear is None:
         return None
-    return f"{number(wear.healthy.low, 2)} to {number(wear.healthy.high, 2)} {trend.unit}, 95 of 100 recordings"
-
-
-def level(trend: Trend) -> str | None:
-    """Return the present level beside the healthy band, None where there is no level."""
-    wear = trend.wear
-    if wear is None or trend.basis is None:
-        return None
-    band = f"{number(wear.healthy.low, 2)} to {number(wear.healthy.high, 2)}"
-    relative = "" if trend.unit == "L/min" or trend.basis == "ringing" else ", beside the first; no rig was stated"
-    return f"{level_now(trend)}; healthy {band}; {_BASES[trend.basis]}{relative}"
+    of_first = " of the first; no rig was stated" if trend.unit == "%" and trend.basis != "ringing" else ""
+    ends = f"{number(wear.healthy.low, 2)} to {number(wear.healthy.high, 2)} {trend.unit}{of_first}"
+    return f"{ends}, 95 of 100 recordings"
 
 
 def assumed(trend: Trend) -> str:
@@ -139,32 +133,28 @@ def growth(trend: Trend) -> str | None:
     return f"{figure(wear.growth, trend.unit)} a month"
 
 
-def _wait(days: float) -> str:
-    months = days / MONTH
-    if not months <= _FURTHEST:
-        return f"more than {_FURTHEST / 12:.0f} years"
-    return f"{days:.0f} days" if months < 2.0 else f"{months:.0f} months"
-
-
 def reach(trend: Trend) -> str | None:
     """Return when the level reaches the limit, None where no limit is known."""
     wear = trend.wear
     if wear is None or wear.reach is None or trend.limit is None:
         return None
-    limit = f"{number(trend.limit, 2)} {trend.unit}"
-    own = wear.reach
-    if math.isnan(own.value):
-        return None
+    limit, last, own = f"{number(trend.limit, 2)} {trend.unit}", trend.points[-1].day, wear.reach
+    value, low, high = (moment(trend, last + days) if days <= _FURTHEST else "later" for days in own)
     if own.value == 0.0:
-        text = f"{limit} is reached"
-    elif trend.alarm is None or not math.isfinite(own.value) or own.value / MONTH > _FURTHEST:
-        text = f"{limit} not before {_wait(own.low)}" if own.low / MONTH <= _FURTHEST else f"{limit} not in sight"
-    else:
-        text = f"{limit} in {_wait(own.value)} ({_wait(own.low)} to {_wait(own.high)}) if it goes on so"
-    limit_text = f"{trend.repair} beyond the healthy level"
-    if not trend.repair.stated:
-        limit_text += ", what a maker of excavators allows a cylinder in service"
-    return f"{text}; the limit is {limit_text}"
+        return f"{limit} is reached"
+    if trend.alarm is not None and own.value <= _FURTHEST:
+        return f"{limit}, reached {value} ({low} to {high}) if it goes on so"
+    if own.low > _FURTHEST:
+        return f"{limit}, not within {_FURTHEST / MONTH / 12.0:.0f} years"
+    if own.low * max(len(trend.rows) - 1, 1) < last - trend.points[0].day or math.isnan(own.value):
+        return f"{limit}; the recordings are too few to say when"
+    return f"{limit}, not before {low} (95 %)"
+
+
+def limit_note(trend: Trend) -> str:
+    """Return what the limit is."""
+    maker = "" if trend.repair.stated else ", what a maker of excavators allows a cylinder in service"
+    return f"{trend.repair} beyond the healthy level{maker}"
 
 
 def events(trend: Trend) -> list[str]:
@@ -181,19 +171,20 @@ def events(trend: Trend) -> list[str]:
 
 
 def trend_text(trend: Trend, *, whole: bool = False) -> str:
-    """Return the trend as lines for the terminal; `whole`: with the reason and all findings."""
-    rows = [("now", level(trend)), ("growth", growth(trend)), ("limit", reach(trend))]
+    """Return the trend as lines of at most 80 columns; `whole`: with the reason, what was assumed and all findings."""
+    rows = [("now", level_now(trend)), ("healthy", healthy(trend)), ("growth", growth(trend)), ("limit", reach(trend))]
     rows += [("event", line) for line in events(trend)]
     findings = [finding.text for finding in trend.findings]
     if whole:
-        rows += [("reason", trend.reason), *(("data", text) for text in findings)]
+        rows += [("since", since(trend)), ("reason", trend.reason), ("assumed", assumed(trend))]
+        rows += [("limit", limit_note(trend)), *(("data", text) for text in findings)]
     elif findings:
-        more = f" (and {len(findings) - 1} more, see -v)" if len(findings) > 1 else ""
-        rows.append(("data", findings[0] + more))
-    if trend.wear is None and not whole:
+        rows.append(("data", findings[0] + (f" (and {len(findings) - 1} more: -v)" if len(findings) > 1 else "")))
+    if not whole and trend.verdict == "cannot tell":
         rows.append(("reason", trend.reason))
     rows.append(("next", trend.next_check))
-    return "\n".join([headline(trend), *(f"  {name:<8}{text}" for name, text in rows if text)])
+    lines = [fill(text, 80, initial_indent=f"  {name:<8}", subsequent_indent=10 * " ") for name, text in rows if text]
+    return "\n".join([headline(trend), *lines])
 
 
 def trend_csv(trend: Trend) -> str:

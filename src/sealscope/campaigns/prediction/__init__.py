@@ -1,1 +1,0 @@
-"""Prediction: the smallest leak that each detector finds on a rig, before anyone measures."""

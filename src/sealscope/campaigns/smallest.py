@@ -1,0 +1,237 @@
+"""Plan a recording before anyone measures: which command, load and duration find a leak of a size on a rig.
+
+Leak-free recordings of the rig with its instruments are simulated under each duty; the information of their blocks says
+which step of the leak's conductance `diagnose` finds in them, by the same test that judges (`StepTest.findable`),
+
+    findable = (threshold^(1/2) + z_detection) s,
+
+s the deviation of a step at the median onset, the threshold that of the likelihood ratio at the false-alarm
+probability. A seal is a conductance: duties are compared by it, and sizes stated as the flow that it passes under the
+first duty. Whether a step of the piston's leak can be told from one of the pump's is the Fisher information of both at
+once, all other terms free.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sealscope.diagnosis.inference.blocks import Blocks, Columns, solve
+from sealscope.diagnosis.inference.decision import SECOND
+from sealscope.diagnosis.inference.detector import VolumeBalance
+from sealscope.diagnosis.inference.terms import PUMP
+from sealscope.errors import InputError, SealscopeError
+from sealscope.parameters import Rig
+from sealscope.recordings.recording import Recording
+from sealscope.simulation.bench.machines import centred_start
+from sealscope.simulation.courses import Position, command_or_target, parse_force
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.units import LITRE_PER_MINUTE
+
+#: Commands and constant loads that are tried beside the machine's own duty.
+COMMANDS, LOADS = ("3 sin(4t)", "5 sin(2t)", "7 sin(4t)", "8 sin(t)"), ("", "100 N", "2 kN")
+#: Durations that are tried [s], and that at which duties are compared.
+DURATIONS, COMPARED = (20.0, 30.0, 45.0, 60.0, 90.0, 120.0, 180.0, 270.0, 400.0, 600.0), 60.0
+#: Records of a duty whose median is stated, and how much of a command is looked at to centre its sweep [s].
+RECORDS, _LONGEST_LOOK = 3, 1000.0
+
+
+class Duty(NamedTuple):
+    """A command [V] and a load, in words, "" for none."""
+
+    command: str
+    load: str = ""
+
+    def __str__(self) -> str:
+        return self.command + (f" under {self.load}" if self.load else "")
+
+
+#: The duty of a machine whose own is not stated.
+USUAL = Duty(COMMANDS[0])
+
+
+class Findable(NamedTuple):
+    """What recordings of a duty and a `duration` [s] find.
+
+    `conductance` of the smallest step of the leak that is found, and of that which is told from the pump's [m^3/(s
+    Pa)], infinite where none is; `pressure`: mean |p_A - p_B| [Pa]; `note`: why there are no figures.
+    """
+
+    duty: Duty
+    duration: float
+    conductance: float
+    told_apart: float
+    pressure: float
+    note: str = ""
+
+
+class RecordingPlan(NamedTuple):
+    """The recording to make, and all duties that were compared; `wanted` conductance [m^3/(s Pa)], None for none.
+
+    `chosen`: of the shortest duration that finds it, or the best that was tried; `telling`: the same of what is told
+    from the pump; `usual` pressure [Pa], at which flows are stated.
+    """
+
+    rig: str
+    wanted: float | None
+    chosen: Findable
+    telling: Findable
+    compared: tuple[Findable, ...]
+    usual: float
+    false_alarm: float
+    detection: float
+
+    @property
+    def finds(self) -> bool:
+        """Whether the chosen recording finds what is wanted."""
+        return self.wanted is None or self.chosen.conductance <= self.wanted
+
+    def lpm(self, conductance: float) -> float | None:
+        """Return a conductance as the flow at the usual pressure [L/min], None for one that is not finite."""
+        return conductance * self.usual / LITRE_PER_MINUTE if np.isfinite(conductance) else None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the plan as plain JSON values, sizes in L/min at the usual pressure."""
+
+        def plain(own: Findable) -> dict[str, Any]:
+            sizes = {"smallest_leak_lpm": self.lpm(own.conductance), "told_from_pump_lpm": self.lpm(own.told_apart)}
+            driving = own.pressure if np.isfinite(own.pressure) else None
+            return {**own.duty._asdict(), "duration_s": own.duration, **sizes, "pressure_Pa": driving, "note": own.note}
+
+        return {
+            "rig": self.rig,
+            "wanted_lpm": None if self.wanted is None else self.lpm(self.wanted),
+            "finds": self.finds,
+            "usual_pressure_Pa": self.usual,
+            "false_alarm_probability": self.false_alarm,
+            "detection_probability": self.detection,
+            "recording": plain(self.chosen),
+            "telling_from_pump": plain(self.telling),
+            "compared": [plain(own) for own in self.compared],
+        }
+
+    def text(self) -> str:
+        """Return the plan as lines of text, the answer first."""
+        own, telling, at = self.chosen, self.telling, f"at {self.usual / 1e6:.2g} MPa"
+        wanted = "" if self.wanted is None else f"{self.lpm(self.wanted):.2g} L/min {at}: "
+        doubt = "" if self.finds else "not found; the best is "
+        lines = [
+            f"{wanted}{doubt}{own.duty} for {own.duration:g} s finds {self._size(own.conductance)} {at}",
+            f"  in {100 * self.detection:g} % of recordings, {100 * self.false_alarm:g} % false alarms; rig {self.rig}",
+            "  told from a leak of the pump: "
+            + (
+                f"{telling.duty} for {telling.duration:g} s, {self._size(telling.told_apart)}"
+                if np.isfinite(telling.told_apart)
+                else "no; record the pump's ports p_1 and p_2 behind throttles"
+            ),
+            f"  {'other duties, ' + f'{self.compared[0].duration:g} s':<34}{'found':>14}{'told from pump':>18}",
+        ]
+        able = [row for row in self.compared if not row.note]
+        lines += [
+            f"  {row.duty!s:<34}{self._size(row.conductance):>14}{self._size(row.told_apart):>18}" for row in able
+        ]
+        notes = [row for row in self.compared if row.note]
+        lines += [f"  left out: {row.duty}: {row.note}"[:120] for row in notes[:1]]
+        return "\n".join(lines)
+
+    def _size(self, conductance: float) -> str:
+        flow = self.lpm(conductance)
+        return "-" if flow is None else f"{flow:.2g} L/min"
+
+
+def experiment_of(rig: Rig, duty: Duty, duration: float, seed: int = 0) -> Experiment:
+    """Return the leak-free experiment of a duty, its sweep centred; raises InputError for what is no command."""
+    command = command_or_target(duty.command)
+    if isinstance(command, Position):
+        raise InputError(f"a plan must be of a command in volts ('3 sin(4t)'), got a target ({command})")
+    start = centred_start(rig, command, min(duration, _LONGEST_LOOK))
+    load = parse_force(duty.load) if duty.load else None
+    return Experiment(rig=rig, command=command, duration=duration, x_0=start, load=load, seed=seed)
+
+
+def findable(rig: Rig, duty: Duty, duration: float, *, false_alarm: float = 0.01, detection: float = 0.9) -> Findable:
+    """Return what leak-free recordings of a duty say they find; what cannot be simulated or judged is its note."""
+    steps, told, pressures = [], [], []
+    try:
+        for seed in range(RECORDS):
+            recording = simulate_with_truth(experiment_of(rig, duty, duration, seed)).recording
+            step, apart, pressure = _found_in(recording, rig, false_alarm, detection)
+            steps.append(step)
+            told.append(apart)
+            pressures.append(pressure)
+    except SealscopeError as error:
+        return Findable(duty, duration, np.inf, np.inf, np.nan, str(error))
+    step, apart, pressure = (float(np.median(own)) for own in (steps, told, pressures))
+    return Findable(duty, duration, step, apart, pressure)
+
+
+def _found_in(recording: Recording, rig: Rig, false_alarm: float, detection: float) -> tuple[float, float, float]:
+    """Return the conductance found, that told from the pump, and the mean pressure, of a leak-free recording."""
+    detector = VolumeBalance(rig)
+    if reason := detector.usable(recording):
+        raise InputError(f"no balance: {reason}")
+    balance = detector.balance(recording)
+    if balance is None or balance.test is None:
+        raise InputError("no balance: too short, or no block says anything of a leak")
+    share = false_alarm * (1.0 - SECOND if rig.pump.G_healthy > 0.0 else 1.0)
+    size = balance.size.scale
+    step = balance.test.findable(share, detection) * size
+    ratio = _told_over_known(balance.blocks, balance.columns)
+    return step, step * ratio, balance.mean(0)
+
+
+def _told_over_known(blocks: Blocks, columns: Sequence[Columns]) -> float:
+    """Return the deviation of a step of the leak at mid-record with the pump's step free, over that with it known.
+
+    Infinite where no term of the pump is in the balance.
+    """
+    own = columns[0]
+    if PUMP not in own.names or len(columns) > 1:
+        return np.inf
+    gram, late = (blocks.gram[first:, 0].sum(axis=0) for first in (0, len(blocks) // 2))
+    levels, steps = np.array(own.nuisance), np.array([own.leak, own.names.index(PUMP)])
+    cross = late[np.ix_(levels, steps)]
+    information = late[np.ix_(steps, steps)] - cross.T @ solve(gram[np.ix_(levels, levels)], cross)
+    lone, free = information[0, 0], information[0, 0] - information[0, 1] ** 2 / max(information[1, 1], 1e-300)
+    return float(np.sqrt(lone / free)) if free > 1e-9 * lone else np.inf
+
+
+def plan_recording(
+    rig: Rig,
+    find: float | None = None,
+    *,
+    usual: Duty = USUAL,
+    duties: Iterable[Duty] | None = None,
+    false_alarm: float = 0.01,
+    detection: float = 0.9,
+    progress: Callable[[str, float], None] = lambda label, share: None,
+) -> RecordingPlan:
+    """Return the shortest recording that finds a leak of `find` [m^3/s] at the pressure of the usual duty.
+
+    Without `find`: the recording of `COMPARED` seconds that finds the smallest. Raises InputError where the usual duty
+    cannot be simulated or judged.
+    """
+    others = [Duty(command, load) for load in LOADS for command in COMMANDS] if duties is None else list(duties)
+    tried = [usual, *(duty for duty in others if duty != usual)]
+    compared = []
+    for k, duty in enumerate(tried):
+        compared.append(findable(rig, duty, COMPARED, false_alarm=false_alarm, detection=detection))
+        if compared[0].note:
+            raise InputError(f"the usual duty must have a balance, got none of {usual}: {compared[0].note}")
+        progress("duties compared", (k + 1) / len(tried))
+    pressure = compared[0].pressure
+    wanted = None if find is None else find / pressure
+    best = []
+    for name in ("conductance", "told_apart"):
+        own = min(compared, key=lambda own: float(getattr(own, name)))
+        if wanted is not None and np.isfinite(getattr(own, name)):
+            guess = COMPARED * (getattr(own, name) / wanted) ** 2  # a deviation falls with the root of the duration
+            for duration in [of for of in DURATIONS if of >= 0.5 * guess] or DURATIONS[-1:]:
+                own = findable(rig, own.duty, duration, false_alarm=false_alarm, detection=detection)
+                if getattr(own, name) <= wanted:
+                    break
+        best.append(own)
+    return RecordingPlan(rig.name, wanted, best[0], best[1], tuple(compared), pressure, false_alarm, detection)
