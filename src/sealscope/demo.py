@@ -1,11 +1,14 @@
-"""The main job shown once, whole: a leak appears in a simulated actuator, is recorded, is found, and is reported."""
+"""The main job shown once, whole: a machine is commissioned, then a healthy and a leaking recording are judged."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-from sealscope.diagnosis.diagnose import diagnose
+from sealscope.diagnosis.commissioned.machine import CommissionedMachine, commission
+from sealscope.diagnosis.commissioned.machine_file import write_machine
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.recordings import read, write
 from sealscope.reporting import write_page
@@ -13,48 +16,64 @@ from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import Progress, Truth, simulate_with_truth
 from sealscope.storage.folders import make_folder
 
-#: The demo's experiment: the thesis's rig with both throttles half closed (its Table 4.3 d), its smallest leak from
-#: half time on.
-EXPERIMENT = {
+#: The demo's machine and duty: the thesis's rig with both throttles half closed (its Table 4.3 d).
+DUTY: dict[str, Any] = {
     "command": "3 sin(4t)",
-    "leak": "0.0042 L/min from 90 s",
-    "duration": 180.0,
     "set": {"line.orifices": "present", "line.closed_A": "50[%]", "line.closed_B": "50[%]"},
 }
+#: Healthy recordings that the machine is commissioned on, and the length of each, and of the healthy one judged [s].
+HEALTHY, SECONDS = 5, 20.0
+#: What is judged as leaking: the thesis's smallest leak, from half time on.
+LEAKING = {"leak": "0.0042 L/min from 30 s", "duration": 60.0}
 
 
 @dataclass(frozen=True)
 class Demo:
-    """What the demo made: the diagnosis, the truth it never saw, and the files."""
+    """What the demo made: the machine, diagnoses of a healthy and of a leaking recording, the truth, and the files."""
 
+    machine: CommissionedMachine
+    healthy: Diagnosis
     diagnosis: Diagnosis
     truth: Truth
+    machine_file: Path
     recording: Path
     page: Path
 
 
 def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> Demo:
-    """Simulate, write the recording, read it back, diagnose it and write the page, all into `folder`."""
-    experiment = Experiment.of(**EXPERIMENT, seed=seed)  # type: ignore[arg-type]
+    """Simulate and write all recordings, commission the machine, diagnose two and write the page, all into `folder`."""
+    update = progress or (lambda task, share: None)
+    names = [*(f"healthy/run{k + 1}.nc" for k in range(HEALTHY)), "healthy.nc"]
+    recordings = {}
+    for k, name in enumerate(names):
+        without = Experiment.of(**DUTY, duration=SECONDS, seed=len(names) * seed + k)
+        recordings[name] = simulate_with_truth(without).recording
+        update("simulating healthy recordings", (k + 1) / len(names))
+    experiment = Experiment.of(**DUTY, **LEAKING, seed=seed)  # type: ignore[arg-type]
     result = simulate_with_truth(experiment, progress)
-    make_folder(folder)
     file, page = folder / "recording.nc", folder / "report.html"
-    write(result.recording, file)
-    recording = read(file)
-    if progress is not None:
-        progress("diagnosing", 0.0)
-    diagnosis = diagnose(recording, file=file.name)
-    if progress is not None:
-        progress("writing the page", 0.5)
+    make_folder(folder / "healthy")
+    for name, recording in {**recordings, file.name: result.recording}.items():
+        write(recording, folder / name)
+    update("commissioning", 0.0)
+    machine = commission(folder / "healthy", rig=experiment.rig, name="demo")
+    machine_file = write_machine(machine, folder / "machine.toml")
+    update("diagnosing", 0.0)
+    judged = partial(_judged, machine, folder)
+    healthy, diagnosis = judged("healthy.nc"), judged(file.name)
+    update("writing the page", 0.5)
     write_page(
         page,
-        recording,
+        read(file),
         diagnosis,
         rig=experiment.rig,
         truth_onset_s=result.truth.onset_s,
         truth_leak_lpm=result.truth.mean_leak_lpm,
-        title="Sealscope demo: a leak of 0.0042 L/min from 90 s",
+        title=f"Sealscope demo: a leak of {LEAKING['leak']}",
     )
-    if progress is not None:
-        progress("writing the page", 1.0)
-    return Demo(diagnosis, result.truth, file, page)
+    update("writing the page", 1.0)
+    return Demo(machine, healthy, diagnosis, result.truth, machine_file, file, page)
+
+
+def _judged(machine: CommissionedMachine, folder: Path, name: str) -> Diagnosis:
+    return replace(machine.diagnose(machine.read(folder / name)), file=name)

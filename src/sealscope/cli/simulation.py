@@ -219,20 +219,29 @@ def _listing(title: str, rows: Sequence[Mapping[str, Any]], width: int) -> str:
 
 
 def demo(
-    folder: Annotated[Path, typer.Option("--output", "-o", help="Folder for the recording and the page.")] = Path(
+    context: typer.Context,
+    folder: Annotated[Path, typer.Option("--output", "-o", help="Folder for the recordings and the page.")] = Path(
         "sealscope-demo"
     ),
     seed: SeedOption = 1,
 ) -> None:
-    """Simulate 180 s with a leak of 0.0042 L/min from second 90, record it, diagnose the recording, write the page."""
+    """Commission a simulated machine on five healthy recordings, then judge a healthy and a leaking one.
+
+    With -v what was learnt, and every method's verdict.
+    """
     from sealscope.demo import run_demo
-    from sealscope.reporting import diagnosis_text
+    from sealscope.reporting import diagnosis_text, short_text
     from sealscope.storage.folders import make_folder
 
     make_folder(folder)
     with progress() as report_progress:
         result = run_demo(folder, seed, report_progress)
-    typer.echo(diagnosis_text(result.diagnosis))
+    whole = bool(context.find_root().params.get("verbose"))
+    typer.echo(f"{result.machine_file}: learnt from {len(result.machine.healthy)} healthy recordings")
+    typer.echo(str(result.machine) if whole else f"  smallest leak it will show: {result.machine.summary.smallest}")
+    for diagnosis in (result.healthy, result.diagnosis):
+        text = diagnosis_text(diagnosis) if whole else short_text(diagnosis)
+        typer.echo(text if whole or diagnosis.verdict == "leak" else "\n".join(text.splitlines()[:2]))
     typer.echo(f"truth:     {result.truth.mean_leak_lpm:.4f} L/min from {result.truth.onset_s:.1f} s")
     typer.echo(f"recording: {result.recording}")
     typer.echo(f"page:      {result.page}")

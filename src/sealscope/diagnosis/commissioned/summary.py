@@ -55,6 +55,10 @@ class Smallest(NamedTuple):
     share: float
     halved_by: int | None
 
+    def __str__(self) -> str:
+        share = f"{100.0 * self.share:.2g} % of the pump's flow"
+        return share if self.lpm is None else f"{self.lpm:.2g} L/min, {share}"
+
 
 @dataclass(frozen=True)
 class Summary:
@@ -214,9 +218,7 @@ def _smallest(rises: Sequence[Rise], lessons: Sequence[Mapping[str, Any]]) -> Sm
 
 
 def _smallest_text(smallest: Smallest) -> str:
-    share = f"{100.0 * smallest.share:.2g} % of the pump's flow"
-    size = share if smallest.lpm is None else f"{smallest.lpm:.2g} L/min, {share}"
-    return f"the next recording shows {size} ({POWER:.0%} of the time)"
+    return f"the next recording shows {smallest} ({POWER:.0%} of the time)"
 
 
 def _half_text(smallest: Smallest, count: int) -> str:
