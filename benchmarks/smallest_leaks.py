@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 
-from sealscope.campaigns.smallest import Duty, experiment_of, findable
+from sealscope.campaigns.smallest import PlannedDuty, experiment_of, findable
 from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.parameters import load_rig
 from sealscope.simulation.faults import From, Leak
@@ -33,7 +33,7 @@ def main() -> None:
     )
     print("| --- | --- | " + "--- | " * len(FACTORS))
     for name, command in CASES:
-        rig, duty = load_rig(name), Duty(command)
+        rig, duty = load_rig(name), PlannedDuty(command)
         predicted = findable(rig, duty, given.duration)
         counts = []
         for factor in FACTORS:

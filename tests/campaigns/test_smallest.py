@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sealscope.campaigns import smallest
-from sealscope.campaigns.smallest import Duty, Findable, RecordingPlan, experiment_of, findable, plan_recording
+from sealscope.campaigns.smallest import Findable, PlannedDuty, RecordingPlan, experiment_of, findable, plan_recording
 from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
@@ -17,7 +17,7 @@ from sealscope.simulation.faults import From, Leak
 from sealscope.simulation.simulate import simulate_with_truth
 from sealscope.units import LITRE_PER_MINUTE
 
-DUTY = Duty("3 sin(4t)")
+DUTY = PlannedDuty("3 sin(4t)")
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_the_shortest_recording_that_finds_it_is_planned(
 
 def test_a_leak_that_no_recording_finds_is_said_so(monkeypatch: pytest.MonkeyPatch, rig: Rig) -> None:
     monkeypatch.setattr(smallest, "DURATIONS", (20.0,))
-    plan = plan_recording(rig, 1e-12, usual=DUTY, duties=[Duty("11 sin(4t)")])
+    plan = plan_recording(rig, 1e-12, usual=DUTY, duties=[PlannedDuty("11 sin(4t)")])
     assert not plan.finds and "not found; the best is 3 sin(4t) for 20 s" in plan.text()
     assert "must stay within +-10 V" in plan.compared[1].note and plan.as_dict()["compared"][1]["pressure_Pa"] is None
     assert "left out: 11 sin(4t)" in plan.text()
@@ -78,6 +78,6 @@ def test_without_a_term_of_the_pump_nothing_tells_it_apart() -> None:
 
 def test_what_is_no_command_is_refused(rig: Rig) -> None:
     with pytest.raises(InputError, match="command in volts"):
-        experiment_of(rig, Duty("position 20 mm sin(2t)"), 20.0)
+        experiment_of(rig, PlannedDuty("position 20 mm sin(2t)"), 20.0)
     with pytest.raises(InputError, match="usual duty must have a balance"):
-        plan_recording(rig, usual=Duty("11 sin(4t)"), duties=[])
+        plan_recording(rig, usual=PlannedDuty("11 sin(4t)"), duties=[])

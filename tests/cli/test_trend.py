@@ -101,3 +101,12 @@ def test_diagnose_offers_the_trend_of_days_and_of_nothing_else(call, days: Path)
     assert call("diagnose", *files[:2]).err == ""
     assert call("diagnose", *files, "--format", "jsonl").err == ""
     assert call("diagnose", *files, "--quiet").err == ""
+
+
+def test_a_machine_s_file_states_rig_and_limit(call, days: Path, tmp_path: Path) -> None:
+    file, first = tmp_path / "press.toml", [days / f"day_{k}.nc" for k in (1, 2, 3)]
+    assert call("commission", *first, "-o", file, "--rig", "thesis", "--limit", "3 mL/min").status == 0
+    stated = call("trend", days, "--machine", file)
+    assert stated.status == 0 and stated.out == call("trend", days, "--rig", "thesis", "--limit", "3 mL/min").out
+    assert "--limit must not stand beside" in call("trend", days, "--machine", file, "--limit", "5 mL/min").refused()
+    assert "--machine must state a rig" in call("plan", "--machine", file, "--set", "pump.G_pump=1e-13").refused()

@@ -61,6 +61,16 @@ def test_views_share_what_depends_on_the_channels_they_keep() -> None:
     assert asked == [("u", "p_A", "p_B"), ("u", "p_A", "p_B"), ("p_A", "p_B"), ("u", "p_A", "p_B")]
 
 
+def test_a_view_without_a_channel_does_not_share_what_depends_on_it() -> None:
+    t = np.arange(4.0)
+    recording = Recording(t, {"x": t, "p_A": t}, {"x": "m", "p_A": "Pa"}, 1.0)
+    views = (recording, recording.only(["p_A"]))
+    assert [remembered(own, "balance", lambda of: tuple(of.channels), ("x", "p_A")) for own in views] == [
+        ("x", "p_A"),
+        ("p_A",),
+    ]
+
+
 @pytest.mark.parametrize("names", [None, ("p_A", "p_B"), ("p_A",)], ids=str)
 def test_the_cycle_is_computed_once_a_diagnosis(monkeypatch: pytest.MonkeyPatch, names: tuple[str, ...] | None) -> None:
     recording = simulate(command="3 sin(4t)", duration=60.0)

@@ -39,7 +39,7 @@ DURATIONS, COMPARED = (20.0, 30.0, 45.0, 60.0, 90.0, 120.0, 180.0, 270.0, 400.0,
 RECORDS, _LONGEST_LOOK = 3, 1000.0
 
 
-class Duty(NamedTuple):
+class PlannedDuty(NamedTuple):
     """A command [V] and a load, in words, "" for none."""
 
     command: str
@@ -50,7 +50,7 @@ class Duty(NamedTuple):
 
 
 #: The duty of a machine whose own is not stated.
-USUAL = Duty(COMMANDS[0])
+USUAL = PlannedDuty(COMMANDS[0])
 
 
 class Findable(NamedTuple):
@@ -60,7 +60,7 @@ class Findable(NamedTuple):
     Pa)], infinite where none is; `pressure`: mean |p_A - p_B| [Pa]; `note`: why there are no figures.
     """
 
-    duty: Duty
+    duty: PlannedDuty
     duration: float
     conductance: float
     told_apart: float
@@ -142,7 +142,7 @@ class RecordingPlan(NamedTuple):
         return "-" if flow is None else f"{flow:.2g} L/min"
 
 
-def experiment_of(rig: Rig, duty: Duty, duration: float, seed: int = 0) -> Experiment:
+def experiment_of(rig: Rig, duty: PlannedDuty, duration: float, seed: int = 0) -> Experiment:
     """Return the leak-free experiment of a duty, its sweep centred; raises InputError for what is no command."""
     command = command_or_target(duty.command)
     if isinstance(command, Position):
@@ -152,7 +152,9 @@ def experiment_of(rig: Rig, duty: Duty, duration: float, seed: int = 0) -> Exper
     return Experiment(rig=rig, command=command, duration=duration, x_0=start, load=load, seed=seed)
 
 
-def findable(rig: Rig, duty: Duty, duration: float, *, false_alarm: float = 0.01, detection: float = 0.9) -> Findable:
+def findable(
+    rig: Rig, duty: PlannedDuty, duration: float, *, false_alarm: float = 0.01, detection: float = 0.9
+) -> Findable:
     """Return what leak-free recordings of a duty say they find; what cannot be simulated or judged is its note."""
     steps, told, pressures = [], [], []
     try:
@@ -203,8 +205,8 @@ def plan_recording(
     rig: Rig,
     find: float | None = None,
     *,
-    usual: Duty = USUAL,
-    duties: Iterable[Duty] | None = None,
+    usual: PlannedDuty = USUAL,
+    duties: Iterable[PlannedDuty] | None = None,
     false_alarm: float = 0.01,
     detection: float = 0.9,
     progress: Callable[[str, float], None] = lambda label, share: None,
@@ -214,7 +216,7 @@ def plan_recording(
     Without `find`: the recording of `COMPARED` seconds that finds the smallest. Raises InputError where the usual duty
     cannot be simulated or judged.
     """
-    others = [Duty(command, load) for load in LOADS for command in COMMANDS] if duties is None else list(duties)
+    others = [PlannedDuty(command, load) for load in LOADS for command in COMMANDS] if duties is None else list(duties)
     tried = [usual, *(duty for duty in others if duty != usual)]
     compared = []
     for k, duty in enumerate(tried):

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from sealscope.cli.options import RigOption, SetOption, progress, rig_with
+from sealscope.cli.options import MachineOption, RigOption, SetOption, progress, rig_with
 
 
 class PlanFormat(StrEnum):
@@ -20,6 +20,7 @@ class PlanFormat(StrEnum):
 
 def plan(
     rig: RigOption = "thesis",
+    machine: MachineOption = None,
     find: Annotated[
         str | None,
         typer.Option("--find", metavar="FLOW", help="Leak to be found, under the usual duty: '0.005 L/min'."),
@@ -39,7 +40,8 @@ def plan(
 
     From the information of simulated leak-free recordings, by the test that diagnose judges with.
     """
-    from sealscope.campaigns.smallest import Duty, plan_recording
+    from sealscope.campaigns.smallest import PlannedDuty, plan_recording
+    from sealscope.diagnosis.commissioned.machine_file import load_machine
     from sealscope.diagnosis.diagnose import check_probability
     from sealscope.errors import InputError
     from sealscope.units import parse_quantity
@@ -50,11 +52,17 @@ def plan(
     wanted = None if find is None else parse_quantity(find, "m^3/s", name="--find")
     if wanted is not None and not wanted > 0.0:
         raise InputError(f"--find must be a flow > 0, got {find}")
+    known = rig_with(rig, overrides)
+    if machine is not None:
+        stated = load_machine(machine).rig
+        if stated is None or overrides:
+            raise InputError(f"--machine must state a rig for a plan, without --set ({machine})")
+        known = stated
     with progress() as update:
         planned = plan_recording(
-            rig_with(rig, overrides),
+            known,
             wanted,
-            usual=Duty(command, load),
+            usual=PlannedDuty(command, load),
             false_alarm=false_alarm,
             detection=detection,
             progress=update,

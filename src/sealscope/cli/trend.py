@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
@@ -17,6 +17,7 @@ from sealscope.cli.options import (
     AssumeOption,
     DisplacementOption,
     LimitOption,
+    MachineOption,
     MapOption,
     RateOption,
     assumed_rig,
@@ -24,6 +25,7 @@ from sealscope.cli.options import (
     channel_map_of,
     check_folder,
     progress,
+    refuse_beside_machine,
     say,
 )
 from sealscope.errors import InputError, UnreadableFile
@@ -31,7 +33,7 @@ from sealscope.errors import InputError, UnreadableFile
 if TYPE_CHECKING:
     from sealscope.diagnosis.trend.reading import LeakReading
     from sealscope.parameters import Rig
-    from sealscope.recordings.formats.columns import ChannelMap
+    from sealscope.recordings.recording import Recording
 
 
 class TrendFormat(StrEnum):
@@ -43,15 +45,14 @@ class TrendFormat(StrEnum):
 
 
 def _readings(
-    files: Sequence[Path], channel_map: ChannelMap, rate: float | None, rig: Rig | None
+    files: Sequence[Path], reader: Callable[[Path], Recording], rig: Rig | None
 ) -> Iterator[LeakReading | None]:
     """Yield what each file states of the leakage, None for one that cannot be read."""
     from sealscope.diagnosis.trend.reading import reading_of
-    from sealscope.recordings import read
 
     with progress() as update:
         for k, file in enumerate(files):
-            recording = attempt(file, partial(read, file, map=channel_map or None, rate=rate))
+            recording = attempt(file, partial(reader, file))
             reading = None
             if recording is not None:
                 reading = attempt(file, partial(reading_of, recording, rig, file.name))
@@ -85,6 +86,7 @@ def trend(
     ] = None,
     maps: MapOption = None,
     rate: RateOption = None,
+    machine: MachineOption = None,
     rig: AssumeOption = None,
     area: AreaOption = None,
     displacement: DisplacementOption = None,
@@ -97,8 +99,10 @@ def trend(
     Exit status 1 where a file could not be read.
     """
     from sealscope.diagnosis.commissioned.machine import recordings_in
+    from sealscope.diagnosis.commissioned.machine_file import load_machine
     from sealscope.diagnosis.trend.trend import trend_of
     from sealscope.diagnosis.verdict.severity import RepairLimit
+    from sealscope.recordings import read
     from sealscope.recordings.formats.columns import check_call
     from sealscope.reporting.trend.page import write_trend_page
     from sealscope.reporting.trend.text import trend_csv, trend_text
@@ -106,15 +110,21 @@ def trend(
 
     if wrong := [verdict for verdict in fail_on or () if verdict not in ("leak", "no leak", "cannot tell")]:
         raise InputError(f"--fail-on must be leak, no leak or cannot tell, got {wrong[0]!r}")
-    channel_map = channel_map_of(maps)
-    check_call(channel_map, rate)
+    if machine is not None:
+        refuse_beside_machine(None, maps, rate, rig, area, displacement, limit)
+        known = load_machine(machine)
+        reader, assumed, limit = known.read, known.rig, known.limit
+    else:
+        reader = partial(read, map=channel_map_of(maps) or None, rate=rate)
+        assumed = assumed_rig(rig, area, displacement)
+    check_call(channel_map_of(maps), rate)
     RepairLimit.of(limit)
     spacing = None if every is None else parse_quantity(every, "s", name="--every")
     if output is not None:
         _check_output(output, files)
     paths = recordings_in(files)
-    read = list(_readings(paths, channel_map, rate, assumed_rig(rig, area, displacement)))
-    readings = [reading for reading in read if reading is not None]
+    read_each = list(_readings(paths, reader, assumed))
+    readings = [reading for reading in read_each if reading is not None]
     if not readings:
         raise UnreadableFile("no recording could be read, so there is no trend")
     result = trend_of(readings, healthy=healthy, limit=limit, years=years, every=spacing)
@@ -132,7 +142,7 @@ def trend(
         else:
             write_trend_page(output, result, title=files[0].resolve().name if files[0].is_dir() else "")
     failed = result.verdict in (fail_on or ())
-    if failed or len(readings) < len(read):
+    if failed or len(readings) < len(read_each):
         raise typer.Exit(FAILED_ON if failed else 1)
 
 
