@@ -374,7 +374,7 @@ def not_used(diagnosis: Diagnosis) -> str | None:
     return f"{listed(diagnosis.unused)}: recorded, and taken for no channel" if diagnosis.unused else None
 
 
-def short_text(diagnosis: Diagnosis, *, width: int = 100) -> str:
+def short_text(diagnosis: Diagnosis, *, width: int = 80) -> str:
     """Return the verdict, its figures and the next step as plain text of about five lines; `width`: columns [1]."""
     sure = in_short(diagnosis) if diagnosis.odds or diagnosis.score is not None else None
     rows = [
@@ -394,7 +394,7 @@ def short_text(diagnosis: Diagnosis, *, width: int = 100) -> str:
     return "\n".join((f"{_printable(diagnosis.file)}: {diagnosis.summary}", *lines))
 
 
-def diagnosis_text(diagnosis: Diagnosis, *, width: int = 100) -> str:
+def diagnosis_text(diagnosis: Diagnosis, *, width: int = 80) -> str:
     """Return the verdict and its figures as plain text, with every method and finding.
 
     `width`: columns [1]. Without colours, and without control characters that a file name or header could bring.

@@ -70,7 +70,7 @@ class Diagnosis(Evidence):
     >>> diagnosis
     Diagnosis('leak', file='recording', onset_s=29.95, leak_lpm=0.05196, score=169.7, threshold=15.47)
     >>> diagnosis.cause, f"{diagnosis.severity.creep_mm_per_min[0]:.0f} mm/min"
-    ('piston or pump leak', '86 mm/min')
+    ('piston or pump leak', '82 mm/min')
     >>> [evidence.detector for evidence in diagnosis.parts if evidence.verdict == "cannot tell"]
     ['rms change']
     >>> [round(end, 1) for end in diagnosis.as_dict()["onset_interval_s"]]
