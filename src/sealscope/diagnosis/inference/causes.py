@@ -24,7 +24,7 @@ from sealscope.diagnosis.inference.blocks import (
 )
 from sealscope.diagnosis.inference.onset import StepTest, step_test
 from sealscope.diagnosis.inference.other_steps.step import OtherStep
-from sealscope.diagnosis.inference.terms import AIR, BIAS, LEAK, MADE_UP, ORIFICE, PUMP, Equation, priors, unlikely
+from sealscope.diagnosis.inference.terms import AIR, BIAS, LEAK, MADE_UP, ORIFICE, PUMP, Equation, priors
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause
 
 #: Blocks that causes are weighed with: a step is dated by the leak's own test.
@@ -82,9 +82,15 @@ def hypotheses(
             if name in (LEAK, ORIFICE, PUMP):
                 beside -= cost
             elif name == SCALE:
-                beside -= unlikely(best.fitted[0], "scale")
+                beside -= _unlikely(best)
             stepped.append(StepHypothesis(name, cause, best, beside))
     return tuple(sorted(stepped, key=lambda own: -own.score))
+
+
+def _unlikely(scale: StepTest) -> float:
+    """Return minus twice the logarithm of what is believed of a step of the scale, over that of the likeliest one."""
+    size, spread = (priors()["scale"][name].value for name in ("size", "spread"))
+    return float(np.log(max(abs(scale.fitted[0]), np.finfo(float).tiny) / size) / spread) ** 2
 
 
 def _agree(test: StepTest, stored: StepTest) -> float:

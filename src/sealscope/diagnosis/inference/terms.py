@@ -53,12 +53,6 @@ def priors() -> Mapping[str, Mapping[str, Prior]]:
     return {table: {name: Prior(**row) for name, row in rows.items()} for table, rows in tree.items()}
 
 
-def unlikely(size: float, what: str) -> float:
-    """Return minus twice the logarithm of what is believed of a step's size, over that of the likeliest size."""
-    believed = priors()[what]
-    return float(np.log(max(abs(size), 1e-12) / believed["size"].value) / believed["spread"].value) ** 2
-
-
 class Signals:
     """Samples of the channels that terms read, with what several terms share.
 

@@ -12,13 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.onset import FEWEST, Information
-from sealscope.diagnosis.inference.other_steps.stretches import readings, stretch_samples
+from sealscope.diagnosis.inference.onset import Information
 from sealscope.diagnosis.inference.terms import priors
 from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.recordings.recording import Array, Recording
 
-#: Blocks of a recording, about.
+#: Blocks of a recording.
 BLOCKS = 40
 #: Differences by which noise is told from motion and ringing: the response goes with this power of the frequency.
 ORDER = 6
@@ -110,18 +109,17 @@ FEATURES = (
 
 def features(recording: Recording, wanted: Sequence[Feature] = FEATURES) -> list[tuple[Feature, Information]]:
     """Return what the blocks of a recording say of features, those left out that its channels do not show."""
-    length = stretch_samples(recording, BLOCKS)
-    count = len(recording) // length if length > ORDER + 1 else 0
-    if count < FEWEST:
+    length = len(recording) // BLOCKS
+    if length <= ORDER + 1:
         return []
-    blocks = {name: values[: count * length].reshape(count, length) for name, values in recording.channels.items()}
+    blocks = {name: values[: BLOCKS * length].reshape(BLOCKS, length) for name, values in recording.channels.items()}
     if recording.bridged is not None:
-        missing = recording.bridged[: count * length].reshape(count, length)
+        missing = recording.bridged[: BLOCKS * length].reshape(BLOCKS, length)
         blocks = {name: np.where(missing, np.nan, values) for name, values in blocks.items()}
-    time = recording.t[0] + (np.arange(count) + 0.5) * length / recording.rate
+    time = recording.t[0] + (np.arange(BLOCKS) + 0.5) * length / recording.rate
     wander, shown = priors()["features"]["wander"].value, []
     for feature in wanted:
         values = feature.of(blocks, recording.rate)
-        if values is not None and np.count_nonzero(np.isfinite(values)) == count and np.ptp(values) > 0.0:
-            shown.append((feature, readings(time, values, wander)))
+        if values is not None and np.count_nonzero(np.isfinite(values)) == BLOCKS and np.ptp(values) > 0.0:
+            shown.append((feature, Information(time, np.eye(BLOCKS), values, slope=wander, walk=wander)))
     return shown

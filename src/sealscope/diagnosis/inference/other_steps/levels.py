@@ -24,16 +24,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.onset import FEWEST, two_sided
-from sealscope.diagnosis.inference.other_steps.stretches import readings, stretch_samples
+from sealscope.diagnosis.inference.onset import Information, two_sided
 from sealscope.diagnosis.inference.terms import HALF_DIFFERENCE
 from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.recordings.recording import Array, Recording
 
 #: Blocks of a recording, the first number of which each moves both ways; what part of a block a way needs.
 BLOCKS, LEAST = (40, 20, 10), 0.1
-#: Numbers of a block: of so many directions their patterns are made.
-NUMBERS = 4
 _RANK = 1e-9  # directions that carry less than this share of the largest carry nothing
 #: Oil that is lost lowers both levels; what raises them has many causes.
 CHARGE = "a loss of oil"
@@ -86,10 +83,9 @@ def levels(recording: Recording) -> tuple[Array, Array] | None:
     if not {"p_A", "p_B"} <= set(recording.channels):
         return None
     way = directions(recording)
-    for blocks in BLOCKS:
-        length = stretch_samples(recording, blocks)
-        count = len(recording) // length if length > 1 else 0
-        if count < FEWEST:
+    for count in BLOCKS:
+        length = len(recording) // count
+        if length < 2:
             continue
         p = np.stack([recording[name][: count * length].reshape(count, length) for name in ("p_A", "p_B")])
         time = recording.t[0] + (np.arange(count) + 0.5) * length / recording.rate
@@ -148,7 +144,8 @@ def _test(pattern: Pattern, rows: Array, whitened: Array, time: Array) -> Level 
     """Return the test of whitened blocks (K, c) by the steps of `rows` (m, c), the first of them as it is."""
     basis, size = np.linalg.qr(rows.T)
     basis = basis[:, np.abs(np.diag(size)) > _RANK * np.abs(size).max()]
-    tests = [test for own in basis.T if (test := two_sided(readings(time, whitened @ own))) is not None]
+    blocks = [Information(time, np.eye(len(time)), whitened @ own) for own in basis.T]
+    tests = [test for own in blocks if (test := two_sided(own)) is not None]
     if not tests:
         return None
     half, count = 0.5 * len(time), len(tests)

@@ -12,8 +12,7 @@ import numpy as np
 
 from sealscope.diagnosis.inference.onset import StepTest, two_sided
 from sealscope.diagnosis.inference.other_steps.features import BLOCKS, DUTY, ORDER, features
-from sealscope.diagnosis.inference.other_steps.levels import NUMBERS, level_tests
-from sealscope.diagnosis.inference.terms import unlikely
+from sealscope.diagnosis.inference.other_steps.levels import level_tests
 from sealscope.diagnosis.verdict.evidence import RAREST, Cause
 from sealscope.recordings.recording import Recording, remembered
 
@@ -48,14 +47,9 @@ def _other_step(recording: Recording) -> OtherStep | None:
 
 def _duty(recording: Recording) -> OtherStep | None:
     sizes = [test for _, own in features(recording, DUTY) if (test := two_sided(own)) is not None]
-    if not sizes or not _alike(sizes):
-        return None
-    chances = [2.0 * test.law.chance(test.score - unlikely(test.fitted[0], "duty")) for test in sizes]
-    return (
-        _of_test("changed duty", "size of the duty", min(sizes, key=lambda test: test.score))
-        if max(chances) < RAREST
-        else None
-    )
+    if sizes and max(2.0 * test.chance for test in sizes) < RAREST and _alike(sizes):
+        return _of_test("changed duty", "size of the duty", min(sizes, key=lambda test: test.score))
+    return None
 
 
 def _feature(recording: Recording) -> OtherStep | None:
@@ -69,7 +63,7 @@ def _feature(recording: Recording) -> OtherStep | None:
 def _level(recording: Recording) -> OtherStep | None:
     patterns = level_tests(recording)
     best = patterns[0] if patterns else None
-    if best is None or best.cause is None or NUMBERS * best.chance >= RAREST:
+    if best is None or best.cause is None or len(patterns) * best.chance >= RAREST:
         return None
     text = f"near {best.onset:.0f} s the pressures step as of {best.name}"
     return OtherStep(best.cause, text, best.score, best.onset, 2.0 * best.block)
