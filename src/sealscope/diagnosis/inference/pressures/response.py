@@ -43,7 +43,6 @@ from sealscope.diagnosis.inference.pressures.evidence import (
     unusable,
     wander_of_conductance,
 )
-from sealscope.diagnosis.inference.pressures.ring_down import ring_down
 from sealscope.physics.cylinder import piston_acceleration, pressure_rate
 from sealscope.physics.friction import coulomb_friction, stribeck_friction
 from sealscope.physics.lanes import SINGLE_WIDTH, load, select, store
@@ -78,11 +77,13 @@ _UNEXPLAINED = 3.0
 _CONDUCTANCES, _STIFFNESSES = np.geomspace(1e-12, 2e-10, SINGLE_WIDTH), np.geomspace(0.15, 1.2, SINGLE_WIDTH)
 #: Least share of a step that is tried; damping [1] of steps that did not gain, at first, at least and at most.
 _LEAST_SHARE, _DAMPED, _LEAST_DAMPED, _MOST_DAMPED = 0.02, 0.1, 1e-3, 100.0
-#: Beginning in which the ring gives the stiffness, and blocks by which it is led along once [s].
-_RING_WINDOW, _BLOCK = 24.0, 6.0
+#: Beginning along which it is led once, and the blocks there [s].
+_BEGINNING, _BLOCK = 24.0, 6.0
 #: The first fit: length of its window [s], width of the Gaussian that takes the ring out [periods], steps of the slow
-#: fit, and stiffnesses from which the whole is fitted.
-_WINDOW, _SLOW, _FIRST_STEPS, _STARTS = 12.0, 0.6, 6, 3
+#: fit, and starts from which the whole is fitted.
+_WINDOW, _SLOW, _FIRST_STEPS, _STARTS = 12.0, 0.6, 6, 8
+#: Breakaway over that of the slow fit, length of the spectra [samples], and steps by which starts are compared.
+_BREAKAWAYS, _SEGMENT, _FEW_STEPS = (0.65, 0.85, 1.0, 1.25), 256, 2
 _POSITIVE = [GAIN, K_OIL, F_C, K_BRK, C_C]
 
 
@@ -214,6 +215,22 @@ class Machine(NamedTuple):
         m = self.numbers
         return 2.0 * math.pi * self.rate * math.sqrt(m.V * m.M_eq / (2.0 * stiffness)) / m.A_A
 
+    def ringing(self, dp: Array, total: Array, beliefs: Beliefs) -> Array:
+        """Return the stiffnesses (2,) [Pa] at which p_A - p_B rings most, beyond noise and hum of p_A + p_B."""
+        window = np.hanning(_SEGMENT)
+
+        def power(values: Array) -> Array:
+            parts = np.lib.stride_tricks.sliding_window_view(values, _SEGMENT)[:: _SEGMENT // 2]
+            return np.asarray(np.square(np.abs(np.fft.rfft(parts * window, 4 * _SEGMENT))).mean(axis=0))
+
+        share = beliefs.width[K_OIL] / beliefs.centre[K_OIL]
+        middle = 4 * _SEGMENT / self.period(beliefs.centre[K_OIL])
+        k = np.arange(math.ceil(middle * math.exp(-2.0 * share)), min(2 * _SEGMENT, int(middle * math.exp(share))))
+        beyond = np.pad((power(dp) - power(total))[k], 1, constant_values=-np.inf)
+        peaks = np.flatnonzero((beyond[1:-1] >= beyond[2:]) & (beyond[1:-1] >= beyond[:-2]))
+        chosen = np.resize(peaks[np.argsort(-beyond[1:-1][peaks])], 2)
+        return np.asarray(beliefs.centre[K_OIL] * (k[chosen] / middle) ** 2)
+
 
 class Normal(NamedTuple):
     """Normal belief on the parameters: mean (p,) and precision (p, p) in units."""
@@ -325,38 +342,36 @@ def held(theta: Array, paths: Array) -> Array:
     return np.asarray(paths)
 
 
-def first_fit(stretch: Stretch, beliefs: Beliefs, searched: bool) -> tuple[Array, float]:
+def first_fit(stretch: Stretch, beliefs: Beliefs, total: Array) -> tuple[Array, float]:
     """Return parameters (p,) that hold over a stretch, and the variance that they leave [Pa^2].
 
     The ringing makes many local minima. So the slow part of the pressure is fitted first, from the best of several
-    gains; then the whole, from what was reached, and where the stiffness is to be `searched`, also from the best about
-    the one believed.
+    gains; then the whole, from stiffnesses by which it rings where the spectra say and from several breakaway forces,
+    and judged beside the noise of the sum p_A + p_B, `total` (n,), in which nothing rings.
     """
-    spread, belief = (
-        np.linspace(-2.0, 2.0, SINGLE_WIDTH),
-        Normal(beliefs.centre, np.diag((beliefs.unit / beliefs.width) ** 2)),
-    )
+    belief = Normal(beliefs.centre, np.diag((beliefs.unit / beliefs.width) ** 2))
 
-    def tried(of: Stretch, theta: Array, parameter: int) -> tuple[Array, Array]:
+    def tried(of: Stretch, theta: Array, changes: dict[int, Array]) -> Array:
         sets = np.tile(theta, (SINGLE_WIDTH, 1))
-        centre = beliefs.centre[parameter]
-        sets[:, parameter] = centre * np.exp(beliefs.width[parameter] / centre * spread)
-        left = of.residuals(sets)
-        return sets, np.nan_to_num(np.einsum("nm,nm->m", left, left), nan=np.inf)
+        for parameter, values in changes.items():
+            sets[:, parameter] = values
+        squares = np.square(of.residuals(sets)).sum(axis=0)
+        return np.asarray(sets[np.argsort(np.nan_to_num(squares, nan=np.inf))])
 
     slow = replace(stretch, smooth=_SLOW * stretch.machine.period(beliefs.centre[K_OIL]))
-    sets, squares = tried(slow, beliefs.centre, GAIN)
-    theta = slow.descend(sets[int(np.argmin(squares))], belief, _FIRST_STEPS).theta
-    starts = [theta]
-    if searched:
-        sets, squares = tried(stretch, theta, K_OIL)
-        beside = np.pad(squares, 1, constant_values=np.inf)
-        minima = np.flatnonzero((squares <= beside[2:]) & (squares <= beside[:-2]))
-        starts += list(sets[minima[np.argsort(squares[minima])][:_STARTS]])
-    fits = [stretch.descend(start, belief, _FIRST_STEPS) for start in starts]
-    noise = float(np.nanmin([stretch.spread(fit.left) for fit in fits]))
-    best = min(fits, key=lambda fit: float(np.nan_to_num(fit.cost(noise, belief, beliefs.unit), nan=np.inf)))
-    best = stretch.descend(best.theta, belief, _STEPS)
+    spread = np.exp(np.linspace(-2.0, 2.0, SINGLE_WIDTH) * beliefs.width[GAIN] / beliefs.centre[GAIN])
+    gains = tried(slow, beliefs.centre, {GAIN: beliefs.centre[GAIN] * spread})
+    theta = slow.descend(gains[0], belief, _FIRST_STEPS).theta
+    stiffnesses = np.append(stretch.machine.ringing(stretch.dp, total, beliefs), [theta[K_OIL], beliefs.centre[K_OIL]])
+    grid = {K_OIL: np.repeat(stiffnesses, 4), K_BRK: np.tile(theta[K_BRK] * np.array(_BREAKAWAYS), 4)}
+    noise = max(float(np.var(np.diff(total, 3))) / 20.0, 1.0)
+
+    def fitted(starts: Sequence[Array], steps: int) -> list[Look]:
+        looks = [stretch.descend(start, belief, steps, noise) for start in starts]
+        return sorted(looks, key=lambda look: float(np.nan_to_num(look.cost(noise, belief, beliefs.unit), nan=np.inf)))
+
+    near = fitted(list(tried(stretch, theta, grid)[:_STARTS]), _FEW_STEPS)
+    best = fitted([look.theta for look in near[:2]], _STEPS)[0]
     return best.theta, stretch.spread(best.left)
 
 
@@ -411,16 +426,13 @@ class Follower:
         u, dp = recording["u"], recording["p_A"] - recording["p_B"]
         sense = float(np.sign(np.mean(u * (dp - dp.mean())))) or 1.0
         beliefs = beliefs_of(rig)
-        ring = ring_down(recording.samples(slice(0, math.ceil(_RING_WINDOW * recording.rate))), rig)
-        if ring is not None:
-            beliefs.centre[K_OIL] *= float(np.mean(ring.stiffness))
-            beliefs.width[K_OIL] = priors("response")["K_of_ring"].width * beliefs.centre[K_OIL]
         follower = Follower(Machine.of(rig, recording.rate), beliefs, sense)
+        total = (recording["p_A"] + recording["p_B"])[: math.ceil(_WINDOW * recording.rate)]
         window = follower.stretch(recording.samples(slice(0, math.ceil(_WINDOW * recording.rate))))
-        follower.theta, follower.variance = first_fit(window, beliefs, searched=ring is None)
+        follower.theta, follower.variance = first_fit(window, beliefs, total)
         covariance, states = follower.covariance, follower.states
         length = round(_BLOCK * recording.rate)
-        for first in range(0, round(_RING_WINDOW * recording.rate), length):  # led on once, to begin where that ends
+        for first in range(0, round(_BEGINNING * recording.rate), length):  # led on once, to begin where that ends
             follower.take(recording.samples(slice(first, first + length)))
         follower.covariance, follower.states, follower.last = covariance, states, math.nan
         return follower
