@@ -216,7 +216,10 @@ class Machine(NamedTuple):
         return 2.0 * math.pi * self.rate * math.sqrt(m.V * m.M_eq / (2.0 * stiffness)) / m.A_A
 
     def ringing(self, dp: Array, total: Array, beliefs: Beliefs) -> Array:
-        """Return the stiffnesses (2,) [Pa] at which p_A - p_B rings most, beyond noise and hum of p_A + p_B."""
+        """Return the stiffnesses (2,) [Pa] at which p_A - p_B rings most, beyond noise and hum of p_A + p_B.
+
+        They are the rig's where no frequency that the recording holds is believed of the machine.
+        """
         window = np.hanning(_SEGMENT)
 
         def power(values: Array) -> Array:
@@ -226,6 +229,8 @@ class Machine(NamedTuple):
         share = beliefs.width[K_OIL] / beliefs.centre[K_OIL]
         middle = 4 * _SEGMENT / self.period(beliefs.centre[K_OIL])
         k = np.arange(math.ceil(middle * math.exp(-2.0 * share)), min(2 * _SEGMENT, int(middle * math.exp(share))))
+        if not k.size:
+            return np.full(2, beliefs.centre[K_OIL])
         beyond = np.pad((power(dp) - power(total))[k], 1, constant_values=-np.inf)
         peaks = np.flatnonzero((beyond[1:-1] >= beyond[2:]) & (beyond[1:-1] >= beyond[:-2]))
         chosen = np.resize(peaks[np.argsort(-beyond[1:-1][peaks])], 2)
