@@ -195,28 +195,11 @@ def course_charts(diagnosis: Diagnosis, *, height: int = 190) -> list[Chart]:
     low, high = (np.where(np.isfinite(end), end, np.nan) for end in (course.low, course.high))
     lines = (ChartLine("leak", "a", course.lpm), ChartLine("low", "d1", low), ChartLine("high", "d1", high))
     bottom, top = _limits(course.lpm, low, high)
-    level = repair_level(diagnosis)
+    level = diagnosis.repair_lpm
     if level is not None and top < level < _LEVEL_SHOWN * top:
         top = 1.06 * level
     title = "Passed by pump and piston together" if course.whole else "Leak past the piston"
     return [Chart(COURSE, COURSE, title, "L/min", lines, COURSE, height, True, (bottom, top), level)]
-
-
-def repair_level(diagnosis: Diagnosis) -> float | None:
-    """Return the repair limit on the axis of the leak's course [L/min]; None where it cannot be stated as a flow.
-
-    A limit counts from the healthy level: the median of the course before the onset, where the course is the total.
-    """
-    course, limit, machine = diagnosis.course, diagnosis.limit, diagnosis.machine
-    if course is None or (limit.kind == "creep" and (machine is None or not machine.area_stated)):
-        return None
-    flow = limit.value if limit.kind == "flow" else limit.value * machine.area  # type: ignore[union-attr]
-    level = flow / LITRE_PER_MINUTE
-    if not course.whole:
-        return level
-    onset = diagnosis.onset_s if diagnosis.onset_s is not None and isfinite(diagnosis.onset_s) else np.inf
-    before = course.lpm[(course.t < onset) & np.isfinite(course.lpm)]
-    return level + float(np.median(before)) if before.size else None
 
 
 def _limits(values: Array, low: Array, high: Array) -> tuple[float, float]:

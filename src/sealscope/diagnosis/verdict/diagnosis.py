@@ -6,15 +6,23 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from html import escape
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from sealscope.diagnosis.verdict.evidence import LEAKS, LEAST_SPECIFIC, RAREST, Cause, Evidence, Passage, Verdict
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.severity import RepairLimit, Severity, beside_the_pump, severity
 from sealscope.diagnosis.verdict.states import MachineState, state_of
+from sealscope.errors import InputError, MissingExtra
 from sealscope.recordings.formats.headings.preamble import remarks_of
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
+from sealscope.units import LITRE_PER_MINUTE
+
+if TYPE_CHECKING:
+    import matplotlib.axes
+    import pandas
 
 #: What a file may call the name of the machine.
 _MACHINE = ("machine", "actuator", "asset", "serial number", "serial", "rig", "test rig", "maschine", "prüfstand")
@@ -120,6 +128,23 @@ class Diagnosis(Evidence):
         return severity(self, self.limit, trusts_position=not contradicted)
 
     @property
+    def repair_lpm(self) -> float | None:
+        """Repair limit on the axis of the leak's course [L/min]; None where it cannot be stated as a flow.
+
+        It counts from the healthy level: the median of the course before the onset, where the course is the total.
+        """
+        course, limit, machine = self.course, self.limit, self.machine
+        if course is None or (limit.kind == "creep" and (machine is None or not machine.area_stated)):
+            return None
+        flow = limit.value if limit.kind == "flow" else limit.value * machine.area  # type: ignore[union-attr]
+        level = flow / LITRE_PER_MINUTE
+        if not course.whole:
+            return level
+        onset = self.onset_s if self.onset_s is not None and math.isfinite(self.onset_s) else np.inf
+        before = course.lpm[(course.t < onset) & np.isfinite(course.lpm)]
+        return level + float(np.median(before)) if before.size else None
+
+    @property
     def measured_ratio(self) -> tuple[float, tuple[float, float]] | None:
         """Displacement over area as measured, over the assumed one, and its interval; None where not measured."""
         for own in (self, *self.parts):
@@ -214,6 +239,62 @@ class Diagnosis(Evidence):
             "evidence": self._evidence(),
             "state": self.state.as_dict(),
         }
+
+    def to_frame(self) -> pandas.DataFrame:
+        """Return the figures as one row of a table, intervals as two columns; `pandas.concat` joins those of several.
+
+        Raises MissingExtra where pandas is not installed.
+        """
+        try:
+            import pandas
+        except ImportError:
+            raise MissingExtra("a table needs pandas: pip install 'sealscope[io]'") from None
+        row: dict[str, Any] = {}
+        for name, value in self.as_dict().items():
+            if isinstance(value, list) and len(value) == len(("low", "high")) and not isinstance(value[0], dict):
+                row |= dict(zip((f"{name}_low", f"{name}_high"), value, strict=True))
+            elif not isinstance(value, list | dict):
+                row[name] = value
+        return pandas.DataFrame([row])
+
+    def plot(self, ax: matplotlib.axes.Axes | None = None) -> matplotlib.axes.Axes:
+        """Draw the leak over the recording with its 95 % interval, the onset and the repair limit.
+
+        Parameters
+        ----------
+        ax : matplotlib.axes.Axes, optional
+            Where to draw; by default the axes of a new figure.
+
+        Returns
+        -------
+        matplotlib.axes.Axes
+            The axes.
+
+        Raises
+        ------
+        InputError
+            No method states the leak over time.
+        MissingExtra
+            matplotlib is not installed.
+        """
+        if self.course is None:
+            raise InputError(
+                f"a diagnosis must state the leak over time to be drawn, got one that does not ({self.file})"
+            )
+        try:
+            from matplotlib.figure import Figure
+        except ImportError:
+            raise MissingExtra("a drawing needs matplotlib: pip install 'sealscope[report]'") from None
+        axes = Figure(layout="constrained").subplots() if ax is None else ax
+        axes.plot(self.course.t, self.course.lpm, label="leak" if not self.course.whole else "pump and piston together")
+        axes.fill_between(self.course.t, self.course.low, self.course.high, alpha=0.3, label="95 % interval")
+        if self.onset_s is not None:
+            axes.axvline(self.onset_s, color="C3", label="onset")
+        if self.repair_lpm is not None:
+            axes.axhline(self.repair_lpm, color="C3", linestyle="--", label=f"repair limit ({self.limit})")
+        axes.set(xlabel="t [s]", ylabel="leak [L/min]", title=f"{self.file}: {self.summary}")
+        axes.legend()
+        return axes
 
     def _evidence(self) -> dict[str, Any]:
         """Return what the verdict rests on as plain JSON values."""
