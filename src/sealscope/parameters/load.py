@@ -18,6 +18,8 @@ from sealscope.storage.toml_file import read_toml
 _PACKAGED = Path(__file__).parent / "rigs"
 _DEEPEST = 8
 _MAP = "[map]"
+#: Tables that the file of a commissioned machine has beside its rig, and the largest such file read [bytes].
+OF_MACHINES, LARGEST = ("machine", "learnt", "healthy"), 50_000_000
 
 
 def rig_names() -> tuple[str, ...]:
@@ -35,7 +37,7 @@ def load_rig(rig: Rig | str | os.PathLike[str] = "thesis") -> Rig:
         Name of a packaged rig (`sealscope parameters` lists one), or path of a TOML file with value, unit and source
         for each parameter; a Rig is returned as it is. A file may say ``[rig] extends = "thesis"`` (or the path of
         another file) and then states only the values that differ; a table ``[map]`` names the columns of the machine's
-        logs (``p_A = "PG_1[psi]"``).
+        logs (``p_A = "PG_1[psi]"``). The file of a commissioned machine is one, too.
 
     Returns
     -------
@@ -114,7 +116,9 @@ def _collect(
     here = path.resolve()
     if here in seen or len(seen) >= _DEEPEST:
         raise InputError(f"extends must end at a rig of its own, got a circle or more than {_DEEPEST} files ({place})")
-    tree = read_toml(path, "a rig file", place)
+    tree = read_toml(path, "a rig file", place, LARGEST)
+    if "machine" in tree:
+        tree = {name: table for name, table in tree.items() if name not in OF_MACHINES}
     head = tree.pop("rig", {})
     if not isinstance(head, dict):
         raise InputError(f"rig must be a table, got {head!r} ({place})")

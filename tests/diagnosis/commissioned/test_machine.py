@@ -135,3 +135,9 @@ def test_a_hostile_file_is_refused_in_one_line(file, tmp_path, part):
     assert rule in str(caught.value)
     assert "\n" not in str(caught.value)
     assert "hostile.toml" in str(caught.value)
+
+
+def test_a_machine_s_file_is_a_rig_s(file, machine):
+    rig = ss.load_rig(file)
+    assert rig == machine.rig
+    assert ss.load_machine(file).rig == machine.rig

@@ -1,8 +1,8 @@
 """The file of a commissioned machine: TOML that people read, with all that a diagnosis compares with.
 
-`[machine]` names it, `[map]` its channels, `[rig]` and the tables below it what is stated of it. `[learnt]` is what its
-healthy recordings say, for people to read. Each `[[healthy]]` is a recording: the checksum of its file, and what it has
-taught each method.
+It is a rig's file, too: `[rig]`, `[motor]` and so on state what is known of it, `[map]` its channels. Beside them
+`[machine]` names it, `[learnt]` is what its healthy recordings say, for people to read, and each `[[healthy]]` is a
+recording: the checksum of its file, and what it has taught each method.
 """
 
 from __future__ import annotations
@@ -23,12 +23,13 @@ from sealscope.diagnosis.learnt import Learnt
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
 from sealscope.parameters import Rig
+from sealscope.parameters.load import LARGEST, OF_MACHINES
 from sealscope.recordings.formats.columns import check_call
 from sealscope.storage.atomic import atomic_write
 from sealscope.storage.toml_file import read_toml
 
-#: Version of the file's format, and the largest file read [bytes]: some 10 kB a recording.
-FORMAT, LARGEST = 1, 50_000_000
+#: Version of the file's format.
+FORMAT = 1
 _HEAD = """\
 # A machine commissioned by Sealscope: what its healthy recordings have taught. [machine], [map] and [rig] may be
 # edited; [learnt] is written anew with each change; [[healthy]] is what diagnoses compare with.
@@ -97,8 +98,7 @@ def _tree(machine: CommissionedMachine) -> dict[str, Any]:
     elif machine.channel_map:
         tree["map"] = dict(machine.channel_map)
     if machine.rig is not None:
-        rig = machine.rig.as_dict()
-        tree["rig"] = {**rig.pop("rig"), **rig}
+        tree |= machine.rig.as_dict()
     learnt = tree["learnt"] = {"problems": summary.problems, "noise": dict(summary.noise)}
     if summary.smallest is not None:
         learnt["smallest_leak"] = _known(summary.smallest)
@@ -213,13 +213,9 @@ def load_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
         own.digest: _part(row, "about", dict, place) if "about" in row else {}
         for own, row in zip(healthy, rows, strict=True)
     }
-    rig = _rig(_part(tree, "rig", dict, place), place) if "rig" in tree else None
-    return CommissionedMachine(name, healthy, rig, channel_map, rate, limit, about)
-
-
-def _rig(tree: Mapping[str, Any], place: str) -> Rig:
-    head = {key: value for key, value in tree.items() if isinstance(value, str)}
-    return Rig.from_dict({"rig": head, **{key: tree[key] for key in tree if key not in head}}, place=place)
+    rig = {name: table for name, table in tree.items() if name not in OF_MACHINES and name != "map"}
+    known = Rig.from_dict(rig, place=place) if rig else None
+    return CommissionedMachine(name, healthy, known, channel_map, rate, limit, about)
 
 
 def _part(tree: Mapping[str, Any], name: str, kind: type, place: str) -> Any:

@@ -15,6 +15,7 @@ import numpy as np
 from sealscope.errors import SealscopeError
 from sealscope.monitor.sources.source_block import UNREADABLE_FILE, BlockReceiver, RefusedMessage, SourceBlock
 from sealscope.monitor.supervisor import DATABASE, PartAway, place_of
+from sealscope.parameters import load_rig
 from sealscope.recordings import Recording, read
 from sealscope.recordings.formats.columns import ChannelMap
 from sealscope.recordings.formats.headings.oil_temperature import stated_oil_temperature
@@ -121,7 +122,7 @@ def folders_of(service: BlockReceiver, *, once: bool) -> None:
     folders = {
         service.supervisor.part(f"folder of {each.name}"): WatchedFolder(
             *(each.name, each.folder, each.pattern, 0.0 if once else settings.settle_s),
-            *(service.store.is_known, each.map or None),
+            *(service.store.is_known, each.map or load_rig(each.rig).channel_map or None),
         )
         for each in settings.actuator
         if each.folder is not None
