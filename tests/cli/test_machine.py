@@ -32,7 +32,7 @@ def test_a_folder_is_judged_a_line_a_recording(call, healthy, tmp_path):
     assert " leak " in lines[0]
     assert "L/min (" in lines[0]
     assert "none above" in lines[1]
-    assert max(map(len, done.out.splitlines())) <= 100
+    assert max(map(len, done.out.splitlines())) <= 90
 
 
 def test_a_recording_is_added_and_the_old_file_kept(call, healthy, tmp_path):

@@ -361,7 +361,9 @@ def _verdicts(files: Sequence[Path], form: str, **options: Any) -> Iterator[Said
         if form == "jsonl":
             text = json.dumps(diagnosis.as_dict(), allow_nan=False)
         else:
-            text = {"whole": diagnosis_text, "table": table_line}.get(form, short_text)(diagnosis)
+            text = diagnosis_text(diagnosis) if form == "whole" else short_text(diagnosis)
+        if form == "table":
+            text = table_line(diagnosis, start_seconds(result[0]))
         text = text.partition("\n")[0] if form == "line" else text
         level = None if diagnosis.severity is None else diagnosis.severity.level
         yield SaidOfFile(diagnosis.verdict, level, text, start_seconds(result[0]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from datetime import UTC, datetime
 from math import floor, isfinite, isnan, log10
 from pathlib import PurePath
 from textwrap import fill, shorten
@@ -438,8 +439,11 @@ def _row(label: str, text: str, width: int) -> str:
 WIDTH = 80
 
 
-def table_line(diagnosis: Diagnosis) -> str:
-    """Return a diagnosis as a line of a table: file, date, verdict, L/min, and where it is no `no leak` what to do."""
+def table_line(diagnosis: Diagnosis, start_s: float | None = None) -> str:
+    """Return a diagnosis as a line of a table: file, date, verdict, L/min, and where it is no `no leak` what to do.
+
+    `start_s`: when the recording began [s since 1970].
+    """
     if diagnosis.verdict == "leak" and diagnosis.leak_lpm is not None:
         low, high = diagnosis.leak_interval_lpm or (diagnosis.leak_lpm,) * 2
         flow = f"{number(diagnosis.leak_lpm, 2)} L/min ({number(low, 2)} to {number(high, 2)})"
@@ -449,7 +453,8 @@ def table_line(diagnosis: Diagnosis) -> str:
         flow = "L/min not stated"
     file = PurePath(diagnosis.file).name
     file = file if len(file) <= 28 else f"{file[:13]}..{file[-13:]}"
-    line = f"{file:<28}  {(diagnosis.start or '')[:16]:<16}  {diagnosis.verdict:<11}  {flow}"
+    date = "" if start_s is None else datetime.fromtimestamp(start_s, UTC).date().isoformat()
+    line = f"{file:<28}  {date:<10}  {diagnosis.verdict:<11}  {flow}"
     if diagnosis.verdict == "no leak":
         return line
     action = diagnosis.reason if diagnosis.verdict == "cannot tell" else next_steps(diagnosis)[0]

@@ -81,12 +81,7 @@ class Summary:
         rows = [
             ("recordings", f"{len(healthy)} healthy, {seconds:.4g} s in all" + (f", {_span(dates)}" if dates else "")),
             ("channels", ", ".join(f"{name} [{unit}]" for name, unit in healthy[0].units.items())),
-            (
-                "machine",
-                "size not stated: --rig, --area or --displacement states L/min"
-                if rig is None
-                else f"{rig.title or rig.name}",
-            ),
+            ("machine", _stated(rig)),
             (
                 "duty",
                 _ranges(
@@ -105,6 +100,19 @@ class Summary:
             for name, text in rows
             if text
         )
+
+
+def _stated(rig: Rig | None) -> str:
+    """Return what is stated of the machine, in words."""
+    if rig is not None and rig.states("cylinder.M_eq"):
+        return rig.title or rig.name
+    parts = []
+    if rig is not None and rig.states("cylinder.A_A", "cylinder.A_B"):
+        areas = dict.fromkeys(f"{1e6 * area:.4g}" for area in (rig.cylinder.A_A, rig.cylinder.A_B))
+        parts.append(f"piston {' and '.join(areas)} mm^2")
+    if rig is not None and rig.states("pump.q_b"):
+        parts.append(f"pump {1e6 * rig.pump.q_b:.3g} cm^3/rev")
+    return ", ".join(parts) or "size not stated: --rig, --area or --displacement states L/min"
 
 
 def _flow(healthy: Learnt) -> dict[str, float]:
