@@ -21,8 +21,9 @@ from numpy.typing import ArrayLike, NDArray
 from sealscope.errors import InputError
 
 Array = NDArray[np.float64]
-#: One litre per minute [m^3/s].
+#: One litre per minute [m^3/s], one pound-force per square inch [Pa].
 LITRE_PER_MINUTE = 1e-3 / 60.0
+PSI = 0.45359237 * 9.80665 / 0.0254**2
 _Powers = tuple[tuple[str, Fraction], ...]
 _Conversion = tuple[Fraction, float, Fraction, Fraction]
 

@@ -24,7 +24,7 @@ def named(name: str, t0: float = 0.0, start: str | None = None) -> Recording:
         ("20260701_140509.csv", None, "2026-07-01T14:05:09"),
         ("20260701-1405 run.csv", None, "2026-07-01T14:05:00"),
         ("20260701_140509.csv", "2026-07-02T00:00:00.5", "2026-07-02T00:00:00.500"),
-        ("rig-2026-07-01.csv", None, None),
+        ("rig-2026-07-01.csv", None, "2026-07-01T00:00:00"),
         ("20261301_140509.csv", None, None),
         ("strokes_2019.csv", None, None),
         ("plain.csv", "5 s", None),

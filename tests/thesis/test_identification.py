@@ -26,7 +26,6 @@ from sealscope.thesis.identification import (
 from sealscope.thesis.sheet import (
     APPENDIX_C,
     BENCH_RIG,
-    PSI,
     QUANTITIES,
     Condition,
     DataSheet,
@@ -34,6 +33,7 @@ from sealscope.thesis.sheet import (
     groups,
     read_sheet,
 )
+from sealscope.units import PSI
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 needs_sheet = pytest.mark.skipif(not (DATA / "appendix_c_pa.csv").is_file(), reason="the thesis's data sheet is absent")

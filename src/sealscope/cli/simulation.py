@@ -172,8 +172,10 @@ def simulate(
     if run.truth.leaks:
         typer.echo(f"mean leak while open: {run.truth.mean_leak_lpm:.5g} L/min")
     if "q_comp" in run.recording:
+        from sealscope.units import LITRE_PER_MINUTE
+
         flow = float(run.recording["q_comp"][-max(1, round(experiment.rate)) :].mean())
-        typer.echo(f"the controller makes good: {flow * 6e4:.4g} L/min at the end (channel q_comp)")
+        typer.echo(f"the controller makes good: {flow / LITRE_PER_MINUTE:.4g} L/min at the end (channel q_comp)")
 
 
 def _names(maps: Sequence[str] | None) -> dict[str, str]:

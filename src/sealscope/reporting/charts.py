@@ -14,7 +14,7 @@ from sealscope.errors import InputError
 from sealscope.recordings.recording import COUNTS, Array, Recording
 from sealscope.reporting.features import NAMES, PRODUCT, ChamberDetails
 from sealscope.reporting.series import DrawnTimes, coded, coded_times, time_base
-from sealscope.units import LITRE_PER_MINUTE
+from sealscope.units import LITRE_PER_MINUTE, PSI
 
 SAMPLES = "samples"
 #: points of a series drawn by the script, and in the still picture
@@ -29,7 +29,7 @@ PRESSURE_UNITS: dict[str, tuple[float, str, float]] = {
     "bar": (1e5, "kPa", 1e3),
     "MPa": (1e6, "kPa", 1e3),
     "kPa": (1e3, "kPa", 1e3),
-    "psi": (6894.757293168, "psi", 6894.757293168),
+    "psi": (PSI, "psi", PSI),
 }
 #: SI unit of other channels -> unit shown, SI per unit
 _SHOWN = {

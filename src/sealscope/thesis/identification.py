@@ -25,13 +25,13 @@ from sealscope.thesis.engine.products import Cell, ThesisTable
 from sealscope.thesis.sheet import (
     APPENDIX_C,
     BENCH_RIG,
-    PSI,
     QUANTITIES,
     Condition,
     DataSheet,
     experiment_values,
     groups,
 )
+from sealscope.units import PSI
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig

@@ -23,8 +23,6 @@ from sealscope.recordings.recording import Array
 QUANTITIES = ("d1", "d2", "d3", "d4", "d3d4")
 #: Units of the columns. The sheet names none; it is taken to be in psi.
 UNITS = {name: "psi^2" if name == "d3d4" else "psi" for name in QUANTITIES}
-#: Pascals in a pound per square inch.
-PSI = 6894.757293168361
 #: The packaged rig that stands for the bench of Appendix C: fitted to its leak-free columns.
 BENCH_RIG = "thesis-calibrated"
 #: File of each chamber, the environment variable that names their folder, and the note on an item left out.

@@ -18,7 +18,7 @@ from sealscope.units import LITRE_PER_MINUTE, parse_quantity
 Level = Literal["repair", "plan", "follow"]
 #: Share of the limit from which a repair is planned.
 HALF = 0.5
-_ML_PER_MINUTE, _MM_PER_MINUTE = 1e-6 / 60.0, 1e-3 / 60.0
+_ML_PER_MINUTE, _MM_PER_MINUTE = 1e-3 * LITRE_PER_MINUTE, 1e-3 / 60.0
 
 
 @dataclass(frozen=True)

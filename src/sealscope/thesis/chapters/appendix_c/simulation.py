@@ -19,13 +19,13 @@ from sealscope.thesis.engine.products import Cell, ThesisTable
 from sealscope.thesis.sheet import (
     APPENDIX_C,
     BENCH_RIG,
-    PSI,
     QUANTITIES,
     UNITS,
     Condition,
     DataSheet,
     experiment_values,
 )
+from sealscope.units import PSI
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
