@@ -27,7 +27,8 @@ from sealscope.thesis.chapters.chapter5 import (
 from sealscope.thesis.engine.context import RunSpec, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Figure
-from sealscope.thesis.sheet import APPENDIX_C, PSI
+from sealscope.thesis.sheet import APPENDIX_C
+from sealscope.units import PSI
 
 THESIS = sorted((Path(__file__).resolve().parents[3] / "shared" / "thesis").glob("0*.txt"))
 
