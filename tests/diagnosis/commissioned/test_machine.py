@@ -141,3 +141,22 @@ def test_a_machine_s_file_is_a_rig_s(file, machine):
     rig = ss.load_rig(file)
     assert rig == machine.rig
     assert ss.load_machine(file).rig == machine.rig
+
+
+def test_another_actuator_is_named_and_is_no_leak(machine):
+    """A piston 15 % larger: not the machine of the file; the same machine is not suspected."""
+    runs = {
+        area: machine.diagnose(
+            ss.simulate(
+                command="3 sin(4t)",
+                duration="20 s",
+                set={"cylinder.A_A": f"{area} mm^2", "cylinder.A_B": f"{area} mm^2"},
+                seed=70,
+            ),
+            quick=True,
+        )
+        for area in (633, 728)
+    }
+    assert {run.verdict for run in runs.values()} == {"no leak"}
+    assert "another machine" not in runs[633].reason
+    assert "motion takes 1.15 times the flow" in runs[728].reason

@@ -13,13 +13,13 @@ from sealscope.diagnosis.inference.blocks import Columns
 from sealscope.diagnosis.inference.circuit.store import lost_beside
 from sealscope.diagnosis.inference.circuit.without_position import circulations
 from sealscope.diagnosis.inference.decision import RecordedBalance, bound_of, judge
-from sealscope.diagnosis.inference.scatter import Rise, Taught, rise
+from sealscope.diagnosis.inference.scatter import Rise, Taught, motion_change, rise
 from sealscope.diagnosis.inference.terms import CYLINDER, LOCKED, circulation, equations, locked, priors
 from sealscope.diagnosis.inference.weak_form import STRIDE, stride_samples
 from sealscope.diagnosis.learnt import Healthy, Lesson, lessons_of
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.recordings.recording import Recording, remembered
+from sealscope.recordings.recording import Array, Recording, remembered
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -126,4 +126,20 @@ class VolumeBalance:
         evidence, rows = judge(own, false_alarm_probability, healthy), own.blocks.rows
         if own.equations[0].name != CYLINDER and len(own.columns) == 1:
             return evidence
+        if healthy and len(own.columns) == 1:
+            evidence = replace(
+                evidence, reason=evidence.reason + _of_another_machine(own, healthy, false_alarm_probability)
+            )
         return replace(evidence, share=float(rows.mean() / max(rows.max(), 1.0)))
+
+
+def _of_another_machine(own: RecordedBalance, healthy: Sequence[Array], probability: float) -> str:
+    """Return in words that motion takes another flow than in the healthy recordings, empty where it does not."""
+    sums = Taught.of(own.blocks, own.columns).sums[0]
+    change = motion_change(sums, [of[0] for of in healthy], own.columns[0])
+    if abs(change.score) <= change.threshold(0.5 * probability):
+        return ""
+    return (
+        f"; motion takes {np.exp(change.value):.3g} times the flow that it does in the healthy recordings: another "
+        "machine, or another scale of its sensors?"
+    )

@@ -87,6 +87,26 @@ def rise(judged: Taught, baseline: Sequence[Array], columns: Sequence[Columns]) 
     return student(value, apart, believed)
 
 
+def motion_change(judged: Array, baseline: Sequence[Array], columns: Columns) -> Rise:
+    """Return the logarithm of the flow that motion takes in a recording, over that in healthy ones, as they scatter.
+
+    Of the sums (m, m) of one equation. Area over displacement differs by it: another machine, or another scale.
+    """
+    everything, motion = np.sum(baseline, axis=0), list(columns.motion)
+    chosen = list(columns.nuisance)
+
+    def logarithm(own: Array, reference: Array) -> float:
+        flows = [
+            np.diag(own)[motion] @ solve(of[np.ix_(chosen, chosen)], of[chosen, columns.left])[at]
+            for of in (own, reference)
+        ]
+        return float(np.log(np.maximum(np.abs(flows), np.finfo(float).tiny)) @ [1.0, -1.0])
+
+    at = [chosen.index(k) for k in motion]
+    apart = [logarithm(own, everything - own) for own in baseline] if len(baseline) > 1 else [0.0]
+    return student(logarithm(judged, everything), apart, priors()["between"]["motion"].value)
+
+
 def student(value: float, apart: Sequence[float], believed: float) -> Rise:
     """Return a rise against n healthy recordings, each of which is so far `apart` from the others.
 
