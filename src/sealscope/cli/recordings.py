@@ -456,6 +456,7 @@ def _report_machine(files: Sequence[Path], machine: Path, output: Path, false_al
     """Write the page of a commissioned machine: the recordings of a folder over time, the newest verdict first."""
     from sealscope.diagnosis.commissioned.machine import recordings_in
     from sealscope.diagnosis.commissioned.machine_file import load_machine
+    from sealscope.recordings.formats.columns import counted
     from sealscope.recordings.joining import start_seconds
     from sealscope.reporting.template import check_page
     from sealscope.reporting.trend.history import Judged, write_history_page
@@ -474,7 +475,7 @@ def _report_machine(files: Sequence[Path], machine: Path, output: Path, false_al
         raise UnreadableFile("no recording could be read, so there is no page")
     left_out = len(results) - len(judged)
     write_history_page(output, judged, title=known.name, left_out=left_out)
-    say(f"{known.name}: {len(judged)} recordings -> {output}")
+    say(f"{known.name}: {counted(len(judged), 'recording')} -> {output}")
     if left_out:
         raise typer.Exit(1)
 
