@@ -35,6 +35,24 @@ def test_a_folder_is_judged_a_line_a_recording(call, healthy, tmp_path):
     assert max(map(len, done.out.splitlines())) <= 90
 
 
+def test_a_folder_gets_a_page_of_its_machine(call, healthy, tmp_path):
+    file, page, suspect = tmp_path / "m.toml", tmp_path / "page.html", tmp_path / "suspect"
+    suspect.mkdir()
+    call("commission", healthy, "-o", file, "--rig", "thesis", "--limit", "3 mL/min")
+    ss.write(ss.simulate(command="3 sin(4t)", duration="15 s", seed=8), suspect / "run_2026-03-01.nc")
+    leaking = ss.simulate(command="3 sin(4t)", duration="15 s", seed=9, leak="0.05 L/min")
+    ss.write(leaking, suspect / "a_2026-04-01.nc")
+    (suspect / "bad.csv").write_text("no recording")
+    done = call("report", suspect, "--machine", file, "-o", page)
+    assert done.status == 1
+    assert "bad.csv" in done.err
+    text = page.read_text()
+    assert "a_2026-04-01.nc, 2026-04-01" in text  # the newest by its date, not by its name
+    assert "1 file that could not be read" in text
+    assert text.index("none above") > text.index("Leak: oil bypasses the piston")
+    assert "--join must not stand" in call("report", suspect, "--join", "--machine", file, "-o", page).refused()
+
+
 def test_a_recording_is_added_and_the_old_file_kept(call, healthy, tmp_path):
     file, new = tmp_path / "m.toml", tmp_path / "new.nc"
     call("commission", healthy, "-o", file)

@@ -379,7 +379,12 @@ def _aside(
 
 
 def report(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings to report on.")],
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE...", help="Recordings to report on; with --machine also a folder: one page of all of them."
+        ),
+    ],
     output: Annotated[
         Path,
         typer.Option(
@@ -406,6 +411,11 @@ def report(
 
     if machine is not None:
         refuse_beside_machine(baseline, maps, rate, rig, area, displacement, limit)
+        if any(path.is_dir() for path in files):
+            if join:
+                raise InputError("--join must not stand beside a folder, whose recordings are judged each for itself")
+            _report_machine(files, machine, output, false_alarm)
+            return
     several = (len(files) > 1 and not join) or output.is_dir()
     read_too = {path.resolve() for path in (*files, *(baseline or ()))}
     pages: dict[Path, Path] = {}
@@ -439,6 +449,34 @@ def report(
     if several and written:
         write_index(output / "index.html", written)
     if not complete:
+        raise typer.Exit(1)
+
+
+def _report_machine(files: Sequence[Path], machine: Path, output: Path, false_alarm: float) -> None:
+    """Write the page of a commissioned machine: the recordings of a folder over time, the newest verdict first."""
+    from sealscope.diagnosis.commissioned.machine import recordings_in
+    from sealscope.diagnosis.commissioned.machine_file import load_machine
+    from sealscope.recordings.formats.columns import counted
+    from sealscope.recordings.joining import start_seconds
+    from sealscope.reporting.template import check_page
+    from sealscope.reporting.trend.history import Judged, write_history_page
+
+    check_folder(check_page(output, card=False))
+    paths = recordings_in(files)
+    if output.resolve() in {path.resolve() for path in paths}:
+        raise InputError(f"a page must not replace a recording, got {output}")
+    known = load_machine(machine)
+    results = [
+        None if own is None else Judged(own[1], start_seconds(own[0], own[1].file), partial(known.read, own[1].file))
+        for own in _diagnoses(paths, False, [], None, None, false_alarm, None, machine=machine)
+    ]
+    judged = [result for result in results if result is not None]
+    if not judged:
+        raise UnreadableFile("no recording could be read, so there is no page")
+    left_out = len(results) - len(judged)
+    write_history_page(output, judged, title=known.name, left_out=left_out)
+    say(f"{known.name}: {counted(len(judged), 'recording')} -> {output}")
+    if left_out:
         raise typer.Exit(1)
 
 

@@ -148,9 +148,9 @@ def trend(
 
 def _check_output(output: Path, files: Sequence[Path]) -> None:
     if output.suffix.lower() not in (".json", ".csv"):
-        from sealscope.reporting.trend.page import check_trend_page
+        from sealscope.reporting.template import check_page
 
-        check_trend_page(output)
+        check_page(output, card=False)
     if output.resolve() in {file.resolve() for file in files}:
         raise InputError(f"a trend must not replace a recording, got {output}")
     check_folder(output)

@@ -37,7 +37,7 @@ def write_index(path: str | os.PathLike[str], pages: Sequence[tuple[Path, Diagno
             "since": messages.since(diagnosis),
             "how_much": messages.how_much(diagnosis) or messages.passes_in_short(diagnosis),
             "cause": messages.cause(diagnosis) if diagnosis.verdict == "leak" else None,
-            "action": diagnosis.reason if diagnosis.verdict == "cannot tell" else messages.next_steps(diagnosis)[0],
+            "action": messages.what_to_do(diagnosis),
         }
         for page, diagnosis in ordered
     ]

@@ -439,23 +439,30 @@ def _row(label: str, text: str, width: int) -> str:
 WIDTH = 80
 
 
+def flow(diagnosis: Diagnosis) -> str:
+    """Return the leak with its interval, or its bound, in a few words."""
+    if diagnosis.verdict == "leak" and diagnosis.leak_lpm is not None:
+        low, high = diagnosis.leak_interval_lpm or (diagnosis.leak_lpm,) * 2
+        return f"{number(diagnosis.leak_lpm, 2)} L/min ({number(low, 2)} to {number(high, 2)})"
+    if diagnosis.verdict != "leak" and diagnosis.bound_lpm is not None:
+        return f"none above {number(diagnosis.bound_lpm, 2)} L/min"
+    return "L/min not stated"
+
+
+def what_to_do(diagnosis: Diagnosis) -> str:
+    """Return the first thing to do, where nothing can be told its reason."""
+    return diagnosis.reason if diagnosis.verdict == "cannot tell" else next_steps(diagnosis)[0]
+
+
 def table_line(diagnosis: Diagnosis, start_s: float | None = None) -> str:
     """Return a diagnosis as a line of a table: file, date, verdict, L/min, and where it is no `no leak` what to do.
 
     `start_s`: when the recording began [s since 1970].
     """
-    if diagnosis.verdict == "leak" and diagnosis.leak_lpm is not None:
-        low, high = diagnosis.leak_interval_lpm or (diagnosis.leak_lpm,) * 2
-        flow = f"{number(diagnosis.leak_lpm, 2)} L/min ({number(low, 2)} to {number(high, 2)})"
-    elif diagnosis.verdict != "leak" and diagnosis.bound_lpm is not None:
-        flow = f"none above {number(diagnosis.bound_lpm, 2)} L/min"
-    else:
-        flow = "L/min not stated"
     file = PurePath(diagnosis.file).name
     file = file if len(file) <= 28 else f"{file[:13]}..{file[-13:]}"
     date = "" if start_s is None else datetime.fromtimestamp(start_s, UTC).date().isoformat()
-    line = f"{file:<28}  {date:<10}  {diagnosis.verdict:<11}  {flow}"
+    line = f"{file:<28}  {date:<10}  {diagnosis.verdict:<11}  {flow(diagnosis)}"
     if diagnosis.verdict == "no leak":
         return line
-    action = diagnosis.reason if diagnosis.verdict == "cannot tell" else next_steps(diagnosis)[0]
-    return f"{line}\n    {shorten(action, WIDTH - 4)}"
+    return f"{line}\n    {shorten(what_to_do(diagnosis), WIDTH - 4)}"

@@ -177,15 +177,10 @@ def render_page(
         uplot_js=uplot_js,
         charts_js=charts_js,
         script_hashes=Markup(" ").join(template.script_hash(code) for code in (uplot_js, charts_js)),
-        chart_data=Markup(_script_json(drawn.data)),
+        chart_data=template.script_json(drawn.data),
         **_evidence(recording, diagnosis, drawn, shown, all_marks),
         **_changes(recording, diagnosis, chambers, pressure_unit),
     )
-
-
-def _script_json(value: Any) -> str:
-    text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def _areas(circuit: Circuit) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from base64 import b64encode
@@ -60,10 +61,19 @@ def script_hash(code: str) -> Markup:
     return Markup(f"'sha256-{b64encode(sha256(code.encode()).digest()).decode()}'")
 
 
-def check_page(path: str | os.PathLike[str]) -> Path:
-    """Return the path of a page to write; raises InputError for another kind of file."""
-    if Path(path).suffix.lower() not in _SUFFIXES:
-        raise InputError(f"a page must be a file {', '.join(_SUFFIXES)}, got {os.fspath(path)}")
+def script_json(value: Any) -> Markup:
+    """Return plain JSON values as they stand inside an element `script`: no sign of them ends it."""
+    from markupsafe import Markup
+
+    text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+    return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))
+
+
+def check_page(path: str | os.PathLike[str], *, card: bool = True) -> Path:
+    """Return the path of a page to write, `card`: or of its picture; raises InputError for another kind of file."""
+    suffixes = _SUFFIXES if card else _SUFFIXES[:-1]
+    if Path(path).suffix.lower() not in suffixes:
+        raise InputError(f"a page must be a file {', '.join(suffixes)}, got {os.fspath(path)}")
     return Path(path)
 
 

@@ -128,18 +128,22 @@ class Diagnosis(Evidence):
         return severity(self, self.limit, trusts_position=not contradicted)
 
     @property
+    def limit_lpm(self) -> float | None:
+        """Repair limit as a flow past the piston [L/min]; None for a speed of a piston whose area is not stated."""
+        limit, machine = self.limit, self.machine
+        if limit.kind == "flow":
+            return limit.value / LITRE_PER_MINUTE
+        return None if machine is None or not machine.area_stated else limit.value * machine.area / LITRE_PER_MINUTE
+
+    @property
     def repair_lpm(self) -> float | None:
         """Repair limit on the axis of the leak's course [L/min]; None where it cannot be stated as a flow.
 
         It counts from the healthy level: the median of the course before the onset, where the course is the total.
         """
-        course, limit, machine = self.course, self.limit, self.machine
-        if course is None or (limit.kind == "creep" and (machine is None or not machine.area_stated)):
-            return None
-        flow = limit.value if limit.kind == "flow" else limit.value * machine.area  # type: ignore[union-attr]
-        level = flow / LITRE_PER_MINUTE
-        if not course.whole:
-            return level
+        course, level = self.course, self.limit_lpm
+        if course is None or level is None or not course.whole:
+            return None if course is None else level
         onset = self.onset_s if self.onset_s is not None and math.isfinite(self.onset_s) else np.inf
         before = course.lpm[(course.t < onset) & np.isfinite(course.lpm)]
         return level + float(np.median(before)) if before.size else None

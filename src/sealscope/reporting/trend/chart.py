@@ -21,17 +21,27 @@ _STEPS = (*(m / 1440 for m in (1, 5, 15, 60, 180, 360)), 1, 2, 7, 14, 30, 61, 91
 
 
 @dataclass(frozen=True)
-class _Scale:
+class Scale:
+    """Where days and levels stand in a picture of `width` x `height`, inside its frame."""
+
     width: float
     height: float
     days: tuple[float, float]
     levels: tuple[float, float]
 
+    @property
+    def frame(self) -> dict[str, float]:
+        """Size of the picture and sides of its frame, as a template draws them."""
+        sides = {"left": _LEFT, "right": self.width - _RIGHT, "top": _TOP, "bottom": self.height - _BOTTOM}
+        return {"width": self.width, "height": self.height, **sides}
+
     def x(self, day: float) -> float:
+        """Return where a day stands."""
         first, last = self.days
         return _LEFT + (day - first) / (last - first) * (self.width - _LEFT - _RIGHT)
 
     def y(self, level: float) -> float:
+        """Return where a level stands."""
         low, high = self.levels
         return _TOP + (high - level) / (high - low) * (self.height - _TOP - _BOTTOM)
 
@@ -41,8 +51,7 @@ def chart_of(trend: Trend, size: str) -> dict[str, Any] | None:
     known = [point for point in trend.points if point.value is not None]
     if not known or trend.wear is None:
         return None
-    width, height = SIZES[size]
-    scale = _Scale(width, height, _days(trend), _levels(trend))
+    scale = Scale(*SIZES[size], with_margin(trend.points[0].day, trend.points[-1].day), _levels(trend))
     low, high = scale.levels
     points = [
         {
@@ -71,25 +80,22 @@ def chart_of(trend: Trend, size: str) -> dict[str, Any] | None:
     ]
     marks += [{"x": scale.x(point.day), "kind": "other"} for point in trend.repairs]
     return {
-        "width": width,
-        "height": height,
-        "left": _LEFT,
-        "right": width - _RIGHT,
-        "top": _TOP,
-        "bottom": height - _BOTTOM,
+        **scale.frame,
         "points": points,
         "course": course,
         "bands": bands,
         "limit": limit,
         "marks": marks,
+        "bounds": [],
+        "beyond": [],
         "absent": [scale.x(point.day) for point in trend.points if point.value is None],
-        "x_ticks": [(scale.x(day), moment(trend, day)) for day in _day_ticks(trend, scale.days, width)],
+        "x_ticks": [(scale.x(day), moment(trend, day)) for day in day_ticks(scale, trend.points[0].day)],
         "y_ticks": [(scale.y(level), f"{level:.6g}") for level in ticks(low, high, 4)],
     }
 
 
-def _days(trend: Trend) -> tuple[float, float]:
-    first, last = trend.points[0].day, trend.points[-1].day
+def with_margin(first: float, last: float) -> tuple[float, float]:
+    """Return the ends of the axis of days from the first to the last."""
     margin = 0.02 * (last - first) or 0.5
     return first - margin, last + margin
 
@@ -120,10 +126,10 @@ def _course(trend: Trend, own: Episode) -> list[tuple[float, float]]:
     )
 
 
-def _day_ticks(trend: Trend, days: tuple[float, float], width: float) -> list[float]:
-    first, last = days
-    most = width / 110.0
+def day_ticks(scale: Scale, origin: float) -> list[float]:
+    """Return days for ticks, round distances from `origin` apart, as many as have room."""
+    first, last = scale.days
+    most = scale.width / 110.0
     step = next((step for step in _STEPS if (last - first) / step <= most), _STEPS[-1])
-    origin = trend.points[0].day if trend.points else 0.0
     begin = math.ceil((first - origin) / step - 1e-9)
     return [origin + step * k for k in range(begin, math.floor((last - origin) / step) + 1)]

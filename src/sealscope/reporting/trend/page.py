@@ -6,24 +6,14 @@ import os
 from pathlib import Path
 
 from sealscope.diagnosis.trend.trend import Trend
-from sealscope.errors import InputError
 from sealscope.reporting import messages, template
 from sealscope.reporting.trend import text
 from sealscope.reporting.trend.chart import SIZES, chart_of
 
-_SUFFIXES = (".html", ".htm", ".pdf")
-
-
-def check_trend_page(path: str | os.PathLike[str]) -> Path:
-    """Return the path of a page to write; raises InputError for another kind of file."""
-    if Path(path).suffix.lower() not in _SUFFIXES:
-        raise InputError(f"the page of a trend must be a file {', '.join(_SUFFIXES)}, got {os.fspath(path)}")
-    return Path(path)
-
 
 def write_trend_page(path: str | os.PathLike[str], trend: Trend, *, title: str = "") -> Path:
     """Write the page of a trend, whole or not at all."""
-    return template.write(check_trend_page(path), render_trend_page(trend, title=title))
+    return template.write(template.check_page(path, card=False), render_trend_page(trend, title=title))
 
 
 def render_trend_page(trend: Trend, *, title: str = "") -> str:

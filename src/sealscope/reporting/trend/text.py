@@ -31,8 +31,13 @@ def moment(trend: Trend, day: float) -> str:
     if not trend.dated or not trend.points:
         return f"day {day:.3g}"
     first, last = trend.points[0], trend.points[-1]
-    stamp = str(np.datetime64(round((first.start + (day - first.day) * DAY) * 1e3), "ms"))
-    return stamp[:16].replace("T", " ") if last.day - first.day < _WITHIN_DAYS else stamp[:10]
+    return stamp(first.start + (day - first.day) * DAY, last.day - first.day)
+
+
+def stamp(seconds: float, span_days: float) -> str:
+    """Return a time [s since 1970] as a date, with the time of day where all times lie within a few days."""
+    text = str(np.datetime64(round(seconds * 1e3), "ms"))
+    return text[:16].replace("T", " ") if span_days < _WITHIN_DAYS else text[:10]
 
 
 def figure(interval: Interval, unit: str, digits: int = 2) -> str:

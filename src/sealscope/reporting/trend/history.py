@@ -1,0 +1,183 @@
+"""The page of a commissioned machine: its newest verdict, and all its recordings on one axis of time."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sealscope.diagnosis.trend.timeline import DAY
+from sealscope.diagnosis.verdict.diagnosis import Diagnosis
+from sealscope.errors import InputError
+from sealscope.recordings.recording import Recording
+from sealscope.reporting import charts, messages, template
+from sealscope.reporting.trend.chart import SIZES, Scale, day_ticks, with_margin
+from sealscope.reporting.trend.text import stamp
+
+#: A figure of more than so many times the median one is not drawn to scale: it would press the others flat.
+_FAR = 8.0
+
+
+class Judged(NamedTuple):
+    """A diagnosis, when its recording began [s since 1970], None where that is not known, and what reads it again."""
+
+    diagnosis: Diagnosis
+    start_s: float | None
+    read: Callable[[], Recording]
+
+
+class _Level(NamedTuple):
+    """What a recording states of the leak [L/min]: figure and interval, or a bound where `low` is None."""
+
+    lpm: float
+    low: float | None
+    high: float
+
+
+def write_history_page(
+    path: str | os.PathLike[str], judged: Sequence[Judged], *, title: str, left_out: int = 0
+) -> Path:
+    """Write the page of a machine, whole or not at all; arguments and errors as for `render_history_page`."""
+    return template.write(template.check_page(path, card=False), render_history_page(judged, title, left_out))
+
+
+def render_history_page(judged: Sequence[Judged], title: str, left_out: int = 0) -> str:
+    """Return the page of a machine as HTML.
+
+    Parameters
+    ----------
+    judged : sequence of Judged
+        Its recordings and their diagnoses, in any order.
+    title : str
+        Name of the machine.
+    left_out : int, optional
+        Files that could not be read.
+
+    Raises
+    ------
+    InputError
+        There is no recording.
+    """
+    from markupsafe import Markup
+
+    if not judged:
+        raise InputError("the page of a machine must have at least 1 recording, got 0")
+    ordered = sorted(judged, key=lambda own: (-math.inf if own.start_s is None else own.start_s, own.diagnosis.file))
+    newest = ordered[-1].diagnosis
+    dates = _dates(ordered)
+    shown, drawn, files = _overlay(ordered)
+    scripts = [template.packaged(name) for name in ("vendor/uPlot.iife.min.js", "templates/charts.js")] if shown else []
+    rows = [
+        {"file": Path(own.diagnosis.file).name, "date": date, "d": own.diagnosis}
+        for own, date in zip(ordered, dates, strict=True)
+    ]
+    return template.render(
+        "history.html.j2",
+        d=newest,
+        messages=messages,
+        title=title,
+        rows=rows[::-1],
+        undated=sum(own.start_s is None for own in ordered),
+        left_out=left_out,
+        pictures=[(size, picture) for size in SIZES if (picture := history_chart(ordered, size)) is not None],
+        charts=shown,
+        still={} if drawn is None else drawn.still,
+        events=[] if drawn is None else charts.events(newest, drawn.data["span"], []),
+        files=files,
+        uplot_license=str(template.packaged("vendor/uPlot.LICENSE")),
+        uplot_css=template.packaged("vendor/uPlot.min.css") if shown else "",
+        scripts=scripts,
+        script_source=Markup(" ").join(map(template.script_hash, scripts)) if shown else "'none'",
+        chart_data=None if drawn is None else template.script_json(drawn.data),
+    )
+
+
+def history_chart(ordered: Sequence[Judged], size: str) -> dict[str, Any] | None:
+    """Return what the template draws of recordings in their order, in a box of one of `SIZES`.
+
+    Days of their dates, numbers from 1 where a date is not known. None where no recording states a figure or a bound.
+    """
+    levels = [_level(own.diagnosis) for own in ordered]
+    known = [level for level in levels if level is not None]
+    if not known:
+        return None
+    dated = all(own.start_s is not None for own in ordered)
+    days = [(own.start_s or 0.0) / DAY if dated else float(k + 1) for k, own in enumerate(ordered)]
+    limit = ordered[-1].diagnosis.limit_lpm
+    far = _FAR * float(np.median([level.lpm for level in known])) or math.inf
+    near = [value for level in known for value in (level.lpm, level.high) if value <= far and value < math.inf]
+    near += [] if limit is None or limit > far else [limit]
+    top = 1.08 * max(near, default=0.0) or 1.0
+    scale = Scale(*SIZES[size], with_margin(days[0], days[-1]), (0.0, top))
+    drawn: dict[str, list[dict[str, Any]]] = {"points": [], "bounds": [], "beyond": []}
+    for own, day, level in zip(ordered, days, levels, strict=True):
+        if level is None:
+            continue
+        mark = {"x": scale.x(day), "y": scale.y(min(level.lpm, top)), "kind": "first"}
+        mark["title"] = f"{Path(own.diagnosis.file).name}: {messages.flow(own.diagnosis)}"
+        if level.lpm > top:
+            drawn["beyond"].append(mark)
+        elif level.low is None:
+            drawn["bounds"].append(mark)
+        else:
+            ends = {"low": scale.y(max(level.low, 0.0)), "high": scale.y(min(level.high, top))}
+            drawn["points"].append(mark | ends)
+    span = days[-1] - days[0]
+    ticks = day_ticks(scale, days[0])
+    ticks = ticks if dated else [day for day in ticks if day.is_integer()]
+    return {
+        **scale.frame,
+        **drawn,
+        "course": [],
+        "bands": [],
+        "marks": [],
+        "absent": [scale.x(day) for day, level in zip(days, levels, strict=True) if level is None],
+        "limit": None if limit is None or limit > top else scale.y(limit),
+        "x_ticks": [(scale.x(day), stamp(day * DAY, span) if dated else f"{day:g}") for day in ticks],
+        "y_ticks": [(scale.y(level), f"{level:.6g}") for level in charts.ticks(0.0, top, 4)],
+    }
+
+
+def _level(diagnosis: Diagnosis) -> _Level | None:
+    leak, bound = diagnosis.leak_lpm, diagnosis.bound_lpm
+    if diagnosis.verdict == "leak" and leak is not None and math.isfinite(leak):
+        low, high = diagnosis.leak_interval_lpm or (leak, leak)
+        return _Level(leak, low if math.isfinite(low) else 0.0, high)
+    bounded = diagnosis.verdict != "leak" and bound is not None and math.isfinite(bound)
+    return _Level(bound, None, bound) if bounded else None  # type: ignore[arg-type]
+
+
+def _dates(ordered: Sequence[Judged]) -> list[str]:
+    known = [own.start_s for own in ordered if own.start_s is not None]
+    span = (max(known) - min(known)) / DAY if known else 0.0
+    return [messages.ABSENT if own.start_s is None else stamp(own.start_s, span) for own in ordered]
+
+
+def _overlay(ordered: Sequence[Judged]) -> tuple[list[charts.Chart], charts.DrawnCharts | None, list[str]]:
+    """Return charts of the newest recording's channels, those of the last one judged `no leak` before it over them.
+
+    Both begin together. With them the two files; nothing where there is no other recording, or no channel of both.
+    """
+    *before, newest = ordered
+    healthy = [own for own in before if own.diagnosis.verdict == "no leak"]
+    if not before:
+        return [], None, []
+    reference = (healthy or before)[-1]
+    own, other = newest.read(), reference.read()
+    if not all(recording.t.size and np.all(np.diff(recording.t) > 0.0) for recording in (own, other)):
+        return [], None, []
+    files = [Path(judged.diagnosis.file).name for judged in (newest, reference)]
+    t = other.t - other.t[0] + own.t[0]
+    shown = []
+    for name in own.channels:
+        if name not in other or own.units[name] != other.units[name]:
+            continue
+        unit, size = charts.shown_unit(own.units[name], "bar")
+        over = np.interp(own.t, t, other[name], left=np.nan, right=np.nan)
+        lines = (charts.ChartLine(files[0], "a", own[name] / size), charts.ChartLine(files[1], "b", over / size))
+        shown.append(charts.Chart(f"over-{name}", "channels", name, unit, lines))
+    return (shown, charts.draw(own, [], shown, newest.diagnosis, []), files) if shown else ([], None, [])

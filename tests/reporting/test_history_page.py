@@ -1,0 +1,127 @@
+"""The page of a commissioned machine: its recordings over time, their bounds and limit, and hostile names."""
+
+from __future__ import annotations
+
+import re
+import shutil
+
+import pytest
+
+from sealscope.diagnosis.verdict.severity import RepairLimit
+from sealscope.errors import InputError
+from sealscope.reporting.printing import BROWSERS
+from sealscope.reporting.trend.history import Judged, history_chart, render_history_page, write_history_page
+
+DAY = 86400.0
+HOSTILE = "<!--<script><img src=x onerror=alert(2)>.csv"
+BROWSER = next(filter(None, map(shutil.which, BROWSERS)), None)
+
+
+@pytest.fixture
+def history(make_diagnosis, make_recording):
+    """Four recordings of four days: a bound of 2 mL/min, nothing stated, a leak, and the newest with a hostile name."""
+    limit = RepairLimit.of("6 mL/min")
+    quiet = {"leak_lpm": None, "leak_interval_lpm": None, "onset_s": None, "onset_interval_s": None}
+    diagnoses = [
+        make_diagnosis(file="a.csv", verdict="no leak", bound_lpm=0.002, limit=limit, **quiet),
+        make_diagnosis(file="b.csv", verdict="cannot tell", reason="no <theta>", limit=limit, **quiet),
+        make_diagnosis(file="c.csv", limit=limit),
+        make_diagnosis(file=HOSTILE, limit=limit, leak_lpm=0.008, leak_interval_lpm=(0.007, 0.009)),
+    ]
+    return [
+        Judged(diagnosis, 1.7e9 + DAY * k, lambda k=k: make_recording(4.0 + k, seed=k))
+        for k, diagnosis in enumerate(diagnoses)
+    ]
+
+
+def test_the_newest_leads_whatever_the_order(history):
+    page = render_history_page(history[::-1], "press 4", left_out=2)
+    heading = page[page.index('<h2 id="verdict">') : page.index("</section>")]
+    assert "Leak: oil bypasses the piston" in heading
+    assert "0.008 L/min" in heading
+    assert f"({history[-1].diagnosis.state.symbol} of NE 107" in heading
+    assert "2 files" in heading
+    table = page[page.index("<tbody>") : page.index("</tbody>")]
+    assert [name for name in re.findall(r"[abc]\.csv", table)] == ["c.csv", "b.csv", "a.csv"]
+    assert "none above 0.002 L/min" in table
+    assert "2023-11-14" in table
+
+
+def test_a_hostile_name_is_text(history):
+    page = render_history_page(history, "</script><script>alert(1)</script>")
+    assert "<script>alert" not in page
+    assert "<img" not in page
+    assert "<!--" not in page
+    assert "&lt;img src=x" in page
+    assert "no &lt;theta&gt;" in page
+    assert page.count("<script") == 3  # data, uPlot, charts
+    assert "://" not in re.sub(r"<script>.*?</script>|<details>.*?</details>", "", page, flags=re.DOTALL)
+
+
+def test_figures_stand_at_their_levels_and_days(history):
+    for size in ("wide", "narrow"):
+        chart = history_chart(history, size)
+        assert (len(chart["points"]), len(chart["bounds"]), len(chart["absent"])) == (2, 1, 1)
+        (bound,), (early, late), bottom = chart["bounds"], chart["points"], chart["bottom"]
+        per_lpm = (bottom - bound["y"]) / 0.002
+        assert bottom - chart["limit"] == pytest.approx(0.006 * per_lpm)
+        assert bottom - late["high"] == pytest.approx(0.009 * per_lpm)
+        assert late["x"] - early["x"] == pytest.approx((late["x"] - bound["x"]) / 3)
+
+
+def test_without_dates_recordings_stand_in_order(history):
+    undated = [own._replace(start_s=None) for own in history]
+    chart = history_chart(undated, "wide")
+    assert [label for _, label in chart["x_ticks"]] == ["1", "2", "3", "4"]
+    assert "4 of 4 recordings state no date" in render_history_page(undated, "press 4")
+
+
+def test_a_single_huge_bound_presses_no_other_flat(history, make_diagnosis):
+    wide = make_diagnosis(verdict="cannot tell", bound_lpm=40.0, leak_lpm=None, leak_interval_lpm=None)
+    chart = history_chart([*history, Judged(wide, 1.7e9 + 9 * DAY, history[0].read)], "wide")
+    assert len(chart["beyond"]) == 1
+    assert chart["points"][0]["low"] - chart["points"][0]["high"] > 20.0
+
+
+def test_wrong_calls_are_refused(history, tmp_path):
+    with pytest.raises(InputError, match="at least 1 recording"):
+        render_history_page([], "press 4")
+    with pytest.raises(InputError, match=r"\.html, \.htm, \.pdf, got .*page\.png"):
+        write_history_page(tmp_path / "page.png", history, title="press 4")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (400, "dark")])
+def test_in_a_browser(history, tmp_path, width, scheme):
+    playwright = pytest.importorskip("playwright.sync_api", reason="the extra `browser` is not installed")
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="the extra `browser` is not installed")
+    if BROWSER is None:
+        pytest.skip("no browser of Chromium's family on this machine")
+    page = write_history_page(tmp_path / "page.html", history, title="press 4")
+    with playwright.sync_playwright() as steering:
+        browser = steering.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"])
+        context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme)
+        shown, errors = context.new_page(), []
+        shown.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+        shown.on("pageerror", lambda error: errors.append(str(error)))
+        shown.on("dialog", lambda dialog: errors.append(dialog.message))
+        shown.goto(page.as_uri())
+        shown.locator('[data-chart="over-p_A"] .u-over').hover()
+        assert shown.locator('figure:has([data-chart="over-p_A"]) output').all_inner_texts()[1].endswith("bar")
+        assert errors == []
+        assert shown.evaluate("document.documentElement.scrollWidth") <= width
+        assert (
+            shown.evaluate(
+                "(() => {const t = document.querySelector('.rows'); return t.scrollWidth - t.clientWidth})()"
+            )
+            <= 0
+        )
+        assert shown.locator("svg.trend:visible").count() == 1
+        context.close()
+        context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme, bypass_csp=True)
+        shown = context.new_page()
+        shown.goto(page.as_uri())
+        faults = axe.Axe().run(shown).response["violations"]
+        assert [fault["id"] for fault in faults if fault["impact"] in ("serious", "critical")] == []
+        browser.close()
