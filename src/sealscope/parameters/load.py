@@ -18,8 +18,8 @@ from sealscope.storage.toml_file import read_toml
 _PACKAGED = Path(__file__).parent / "rigs"
 _DEEPEST = 8
 _MAP = "[map]"
-#: Tables that the file of a commissioned machine has beside its rig, and the largest such file read [bytes].
-OF_MACHINES, LARGEST = ("machine", "learnt", "healthy"), 50_000_000
+#: Tables that the file of a commissioned machine has beside its rig.
+OF_MACHINES = ("machine", "learnt", "healthy")
 
 
 def rig_names() -> tuple[str, ...]:
@@ -116,7 +116,7 @@ def _collect(
     here = path.resolve()
     if here in seen or len(seen) >= _DEEPEST:
         raise InputError(f"extends must end at a rig of its own, got a circle or more than {_DEEPEST} files ({place})")
-    tree = read_toml(path, "a rig file", place, LARGEST)
+    tree = read_toml(path, "a rig file", place)
     if "machine" in tree:
         tree = {name: table for name, table in tree.items() if name not in OF_MACHINES}
     head = tree.pop("rig", {})

@@ -23,13 +23,13 @@ from sealscope.diagnosis.learnt import Learnt
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
 from sealscope.parameters import Rig
-from sealscope.parameters.load import LARGEST, OF_MACHINES
+from sealscope.parameters.load import OF_MACHINES
 from sealscope.recordings.formats.columns import check_call
 from sealscope.storage.atomic import atomic_write
 from sealscope.storage.toml_file import read_toml
 
-#: Version of the file's format.
-FORMAT = 1
+#: Version of the file's format, and the largest file read [bytes]: some 10 kB a recording.
+FORMAT, LARGEST = 1, 50_000_000
 _HEAD = """\
 # A machine commissioned by Sealscope: what its healthy recordings have taught. [machine], [map] and [rig] may be
 # edited; [learnt] is written anew with each change; [[healthy]] is what diagnoses compare with.
