@@ -306,3 +306,31 @@ def test_any_lines_above_the_header_give_short_printable_entries(lines: list[str
     for name, value in about.items():
         assert 0 < len(name) <= 60 and 0 < len(value) <= 200
         assert (name + value).isprintable()
+
+
+@pytest.mark.parametrize("change", ["plain", "decimal comma", "windows", "words", "missing", "comment", "cut", "wide"])
+def test_blocks_of_plain_numbers_are_read_as_other_blocks_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: str
+) -> None:
+    """Bit for bit, whatever stands in some of the blocks."""
+    pytest.importorskip("pyarrow")
+    random = np.random.default_rng(3)
+    rows = [f"{i / 500};{value!r};{i}" for i, value in enumerate((1e4 * random.standard_normal(4000)).tolist())]
+    if change in ("words", "missing", "comment", "wide"):
+        rows[2500] = {"words": "5.0;OVERLOAD;1", "missing": "5.0;;1", "comment": "# pause"}.get(
+            change, rows[2500] + ";"
+        )
+    content = "t [s];p_A [Pa];row\n" + "\n".join(rows) + ("" if change == "cut" else "\n")
+    content = {"decimal comma": content.replace(".", ","), "windows": content.replace("\n", "\r\n")}.get(
+        change, content
+    )
+    path = saved(tmp_path, content[:-6] if change == "cut" else content)
+    monkeypatch.setattr("sealscope.recordings.formats.text._CHUNK", 16 * 1024)
+    recordings = []
+    for large in (0, 2**40):
+        monkeypatch.setattr("sealscope.recordings.formats.text._LARGE", large)
+        recordings.append(read(path))
+    fast, slow = recordings
+    assert np.array_equal(fast.t, slow.t)
+    assert np.array_equal(fast["p_A"], slow["p_A"], equal_nan=True)
+    assert (fast.history, fast.rate) == (slow.history, slow.rate)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -34,6 +36,10 @@ from sealscope.recordings.formats.text_layout import (
 from sealscope.recordings.timebase import is_stamp, stamps
 
 _CHUNK = 8 * 1024 * 1024
+#: Logs of so many bytes are worth the import of pyarrow.
+_LARGE = 2**20
+#: Signs that begin quoted cells and comments.
+_MARKS = (b'"', b"#", b"%", b"/", b"!")
 _LONGEST_OWN_LINE = 64 * 1024 * 1024
 _ROWS_WRITTEN_AT_ONCE = 8192
 #: Most lines of text among the samples, however few these are: marks of events, a summary at the end.
@@ -43,10 +49,9 @@ _LONGEST_REMARK = 400
 _HALF_A_NUMBER = re.compile(r"[\s+\-\d.,:TeE]{0,40}")
 
 
-def read_text(path: Path, choose: Choose, layout: Layout | None = None) -> RawTable:
-    """Read the chosen columns of a text log, whose `layout` may be known already."""
+def read_table(path: Path, choose: Choose, layout: Layout) -> RawTable:
+    """Read the chosen columns of a text log of one table."""
     place = str(path)
-    layout = look_at(path) if layout is None else layout
     choice = choose(layout.labels, layout.rate)
     taken, loose = _Columns(layout, choice, place), _Loose()
     with path.open("rb") as file:
@@ -116,41 +121,98 @@ def _own_line(file: BinaryIO, head: bytes) -> bytes:
     return more + file.read(SNIFF) if more else b""
 
 
-def _blocks(file: BinaryIO, encoding: str, place: str) -> Iterator[tuple[int, list[str], bool]]:
-    """Yield (number of the first line, whole lines, whether the last line is cut short), in bounded blocks."""
+def _blocks(file: BinaryIO, encoding: str, place: str) -> Iterator[tuple[int, bytes, bool]]:
+    """Yield (number of the first line, whole lines, False) in bounded blocks; True for a last line without an end."""
     width = 2 if encoding.startswith("utf-16") else 1
     newline = "\n".encode(encoding if width == 2 else "ascii")
     rest, number = b"", 1
-    while True:
-        data = file.read(_CHUNK)
+    while data := file.read(_CHUNK):
         block = rest + data
-        if not block:
-            return
         if width == 1 and b"\0" in data:
             line = number + block[: block.index(b"\0")].count(b"\n")
             raise UnreadableFile(f"a text log must be text throughout, got binary data (line {line}, {place})")
-        if data:
-            end = block.rfind(newline)
-            while width == 2 and end >= 0 and end % 2:  # a newline's bytes across two characters
-                end = block.rfind(newline, 0, end + 1)
-            if end < 0:
-                if b"\r" not in block or width == 2:
-                    raise UnreadableFile(f"a text log must have lines, got {len(block)} bytes without ({place})")
-                end = block.rfind(b"\r")
+        end = block.rfind(newline)
+        while width == 2 and end >= 0 and end % 2:  # a newline's bytes across two characters
+            end = block.rfind(newline, 0, end + 1)
+        if end < 0 and len(data) == _CHUNK:
+            if b"\r" not in block or width == 2:
+                raise UnreadableFile(f"a text log must have lines, got {len(block)} bytes without ({place})")
+            end = block.rfind(b"\r")
+        if end >= 0:
             block, rest = block[: end + width], block[end + width :]
+            yield number, block, False
+            number += block.count(newline) or block.count(b"\r")
         else:
-            rest = b""
-        text = block.decode(encoding, errors="replace")
-        if "\r" in text:
-            text = text.replace("\r\n", "\n").replace("\r", "\n")
-        open_end = not text.endswith("\n")
-        lines = text.split("\n")
-        if not open_end:
-            lines.pop()
-        if number == 1 and lines:
-            lines[0] = lines[0].lstrip("\ufeff")
-        yield number, lines, open_end
-        number += len(lines)
+            rest = block
+    if rest:
+        yield number, rest, not rest.endswith(b"\r")
+
+
+def _lines(block: bytes, layout: Layout) -> list[str]:
+    """Return the lines of a block without their ends."""
+    text = block.decode(layout.encoding, errors="replace").lstrip("\ufeff")
+    if "\r" in text:
+        text = text.replace("\r\n", "\n").replace("\r", "\n")
+    return text.removesuffix("\n").split("\n")
+
+
+@dataclass
+class _Parser:
+    """Reads blocks in which each row has plain numbers in the chosen columns by pyarrow, where it is installed.
+
+    `first`: whether no block was read; `usable`: whether the log can have such blocks: its first block is one; `width`:
+    cells in a row of the last block.
+    """
+
+    layout: Layout
+    choice: ColumnMap
+    usable: bool
+    first: bool = True
+    width: int = 0
+
+    @classmethod
+    def of(cls, file: BinaryIO, layout: Layout, choice: ColumnMap) -> _Parser:
+        """Return the parser of a log; small ones, whose time is that of the import, are not for it."""
+        plain = layout.encoding in ("utf-8", "utf-8-sig", "cp1252") and layout.delimiter != " "
+        large = os.fstat(file.fileno()).st_size >= _LARGE
+        return cls(layout, choice, plain and large and not layout.cell_units and find_spec("pyarrow") is not None)
+
+    def values(self, number: int, block: bytes) -> NDArray[np.float64] | None:
+        """Return the chosen columns (n, k) of a block from line `number` on, None where a row is another."""
+        if not self.usable:
+            return None
+        values = self._values(block.split(b"\n", max(0, self.layout.first_row + 1 - number))[-1])
+        self.usable, self.first = values is not None or not self.first, False
+        return values
+
+    def _values(self, block: bytes) -> NDArray[np.float64] | None:
+        from pyarrow import ArrowInvalid, csv, float64, py_buffer
+
+        layout, columns = self.layout, [column for column, _ in self.choice.columns]
+        self.width = width = block.partition(b"\n")[0].count(layout.delimiter.encode()) + 1
+        if any(mark in block for mark in _MARKS) or not max(columns) < width <= len(layout.labels):
+            return None
+        if b"\r" in block and block.count(b"\r") != block.count(b"\r\n"):
+            return None
+        names = [str(column) for column in range(width)]
+        try:
+            table = csv.read_csv(
+                py_buffer(block),
+                csv.ReadOptions(column_names=names, block_size=len(block)),
+                csv.ParseOptions(delimiter=layout.delimiter, quote_char=False),
+                csv.ConvertOptions(
+                    include_columns=[names[column] for column in columns],
+                    column_types={names[column]: float64() for column in columns},
+                    null_values=["", "NaN", *MISSING],
+                    decimal_point=layout.decimal,
+                ),
+            )
+        except ArrowInvalid:
+            return None
+        values = np.empty((table.num_rows, len(columns)), order="F")
+        for index, column in enumerate(table.columns):
+            values[:, index] = column.to_numpy()
+        return None if np.isinf(values).any() else values
 
 
 def _rows(lines: list[str], numbers: Sequence[int], layout: Layout, cut: bool, place: str) -> list[list[str]]:
@@ -189,10 +251,19 @@ class _Loose:
 
 def _row_blocks(
     file: BinaryIO, layout: Layout, choice: ColumnMap, place: str, loose: _Loose
-) -> Iterator[tuple[list[list[str]], Sequence[int], bool]]:
-    """Yield blocks of rows with a cell in each chosen column, their lines' numbers, whether the last is cut short."""
+) -> Iterator[tuple[list[list[str]] | NDArray[np.float64], Sequence[int], bool]]:
+    """Yield blocks of rows with a cell in each chosen column, their lines' numbers, whether the last is cut short.
+
+    A block in which each row has plain numbers there is yielded as these, (n, k).
+    """
     least, usual = max(column for column, _ in choice.columns) + 1, 0
-    for number, lines, cut in _blocks(file, layout.encoding, place):
+    parser = _Parser.of(file, layout, choice)
+    for number, block, cut in _blocks(file, layout.encoding, place):
+        if not cut and (values := parser.values(number, block)) is not None:
+            usual = parser.width
+            yield values, range(number, number + len(values)), False
+            continue
+        lines = _lines(block, layout)
         skip = max(0, layout.first_row + 1 - number)
         blank = " " if layout.delimiter == "\t" else None  # tabs alone are a row of missing samples
         kept = [
@@ -206,7 +277,6 @@ def _row_blocks(
             continue
         numbers: Sequence[int] = [number + i for i in kept]
         rows = _rows([lines[i] for i in kept], numbers, layout, cut, place)
-        usual = len(rows[-2]) if len(rows) > 1 else usual
         if cut and len(rows[-1]) < usual and _HALF_A_NUMBER.fullmatch(rows[-1][-1]):
             # a last line without an end was not written whole: half a number and what follows it are missing
             rows[-1] = [*rows[-1][:-1], *[""] * (least - len(rows[-1]) + 1)]
@@ -228,11 +298,16 @@ class _Columns:
         self._dated = False
         self.total = 0
 
-    def take(self, rows: list[list[str]], numbers: Sequence[int], cut: bool) -> None:
+    def take(self, rows: list[list[str]] | NDArray[np.float64], numbers: Sequence[int], cut: bool) -> None:
         """Read more rows; `cut`: whether the last one was not written whole."""
         layout, choice, place = self._layout, self.choice, self.place
         self.total += len(rows)
         check_size(self.total, len(choice.columns), place)
+        if isinstance(rows, np.ndarray):
+            self._stamped = False
+            for part, odd, values in zip(self._parts, self._words, rows.T, strict=True):
+                part.append(odd.passed(values))
+            return
         for part, odd, (column, time) in zip(self._parts, self._words, choice.columns, strict=True):
             cells = [row[column] for row in rows]
             if unit := layout.cell_units.get(column):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,12 +11,11 @@ from math import isfinite
 from sealscope.errors import InputError
 
 _RULE = "a formula of a map must be a constant plus columns times factors, such as ch2*0.0625-0.625 bar"
-_LONGEST, _DEEPEST = 400, 20
-#: A number, the name of a column (`PG_1`, `Rig.p`, `#2`, or any text between backquotes), a sign.
-_TOKEN = re.compile(
-    r"\s*(?:(?P<number>(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?)(?![\w.])|(?P<name>#\d+|[^\W\d][\w.]*|`[^`]+`)"
-    r"|(?P<sign>[-+*/()]))"
-)
+_LONGEST = 400
+#: The name of a column: `PG_1`, `Rig.p`, `#2`, or any text between backquotes; its number in the syntax tree.
+_NAME, _COLUMN = re.compile(r"`([^`]+)`|(#\d+|(?<![\w.])[^\W\d][\w.]*)"), "column{}"
+#: Where a formula may end and its unit begin.
+_END = re.compile(r"\s+(?=\S)|(?=\[)|$")
 
 
 @dataclass(frozen=True)
@@ -30,79 +30,53 @@ class Formula:
     def parse(cls, text: str) -> Formula:
         """Parse sums, products with numbers, quotients by numbers and brackets; the rest of the text is the unit.
 
-        Nothing is evaluated as Python. Raises InputError for any other text, such as a product of two columns.
+        Only the syntax is Python's: nothing is evaluated. The longest beginning of the text that is a formula is taken.
+        Raises InputError for any other text, such as a product of two columns.
         """
         if len(text) > _LONGEST:
             raise InputError(f"{_RULE}, got {len(text)} signs")
-        reader = _Reader(text)
-        value = reader.sum(0)
-        unit = text[reader.at :].strip()
-        unit = unit[1:-1].strip() if unit.startswith("[") and unit.endswith("]") else unit
-        if unit and not text[reader.at].isspace() and text[reader.at] != "[":
-            raise reader.error()
-        if not value.factors or not all(map(isfinite, (value.constant, *value.factors.values()))):
-            raise reader.error()
-        return cls(value.factors, value.constant, unit or None)
+        for end in sorted({match.start() for match in _END.finditer(text)}, reverse=True):
+            names: list[str] = []
 
-    def plus(self, other: Formula) -> Formula:
-        """Return the sum of two formulas."""
-        names = dict.fromkeys((*self.factors, *other.factors))
-        factors = {name: self.factors.get(name, 0.0) + other.factors.get(name, 0.0) for name in names}
-        return Formula(factors, self.constant + other.constant)
+            def column(match: re.Match[str], names: list[str] = names) -> str:
+                names.append(match[1] or match[2])
+                return _COLUMN.format(len(names) - 1)
 
-    def times(self, factor: float) -> Formula:
-        """Return the formula times a number."""
-        return Formula({name: factor * own for name, own in self.factors.items()}, factor * self.constant)
+            try:
+                tree = ast.parse(_NAME.sub(column, text[:end].strip()), mode="eval").body
+                value = _linear(tree, names)
+            except (SyntaxError, ValueError, ArithmeticError, RecursionError, MemoryError):
+                continue
+            unit = text[end:].strip()
+            unit = unit[1:-1].strip() if unit.startswith("[") and unit.endswith("]") else unit
+            if value.factors and all(map(isfinite, (value.constant, *value.factors.values()))):
+                return cls(value.factors, value.constant, unit or None)
+        raise InputError(f"{_RULE}, got {text[:80]!r}")
+
+    def plus(self, other: Formula, times: float = 1.0) -> Formula:
+        """Return the sum of this formula and `times` another."""
+        factors = dict(self.factors)
+        for name, factor in other.factors.items():
+            factors[name] = factors.get(name, 0.0) + times * factor
+        return Formula(factors, self.constant + times * other.constant)
 
 
-class _Reader:
-    """Reads a formula from the left by recursive descent; `at`: where what is read ends."""
-
-    def __init__(self, text: str) -> None:
-        self.text, self.at = text, 0
-
-    def error(self) -> InputError:
-        return InputError(f"{_RULE}, got {self.text[:80]!r}")
-
-    def sign(self, signs: str) -> str:
-        """Return the next sign where it is one of these, and go behind it; empty otherwise."""
-        match = _TOKEN.match(self.text, self.at)
-        if match is None or not match["sign"] or match["sign"] not in signs:
-            return ""
-        self.at = match.end()
-        return match["sign"]
-
-    def sum(self, depth: int) -> Formula:
-        value = self.product(depth)
-        while sign := self.sign("+-"):
-            value = value.plus(self.product(depth).times(-1.0 if sign == "-" else 1.0))
-        return value
-
-    def product(self, depth: int) -> Formula:
-        value = self.factor(depth)
-        while sign := self.sign("*/"):
-            other = self.factor(depth)
-            if sign == "*" and not value.factors:
-                value, other = other, value
-            if other.factors or (sign == "/" and other.constant == 0.0):
-                raise self.error()
-            value = value.times(other.constant if sign == "*" else 1.0 / other.constant)
-        return value
-
-    def factor(self, depth: int) -> Formula:
-        if depth > _DEEPEST:
-            raise self.error()
-        if sign := self.sign("+-("):
-            if sign != "(":
-                return self.factor(depth + 1).times(-1.0 if sign == "-" else 1.0)
-            value = self.sum(depth + 1)
-            if not self.sign(")"):
-                raise self.error()
-            return value
-        match = _TOKEN.match(self.text, self.at)
-        if match is None or match["sign"]:
-            raise self.error()
-        self.at = match.end()
-        if match["number"]:
-            return Formula({}, float(match["number"]))
-        return Formula({match["name"].strip("`"): 1.0})
+def _linear(tree: ast.expr, names: list[str]) -> Formula:
+    """Return the formula of a syntax tree; raise ValueError where it is not linear in the columns."""
+    zero = Formula({})
+    match tree:
+        case ast.Name(id=name):
+            return Formula({names[int(name.removeprefix("column"))]: 1.0})
+        case ast.Constant(value=float() | int() as value) if not isinstance(value, bool):
+            return Formula({}, float(value))
+        case ast.UnaryOp(op=ast.UAdd() | ast.USub() as sign, operand=inner):
+            return zero.plus(_linear(inner, names), -1.0 if isinstance(sign, ast.USub) else 1.0)
+        case ast.BinOp(left=left, op=ast.Add() | ast.Sub() as sign, right=right):
+            return _linear(left, names).plus(_linear(right, names), -1.0 if isinstance(sign, ast.Sub) else 1.0)
+        case ast.BinOp(left=left, op=ast.Mult() | ast.Div() as sign, right=right):
+            product, other = _linear(left, names), _linear(right, names)
+            if isinstance(sign, ast.Mult) and not product.factors:
+                product, other = other, product
+            if not other.factors:
+                return zero.plus(product, other.constant if isinstance(sign, ast.Mult) else 1.0 / other.constant)
+    raise ValueError("not linear")

@@ -6,7 +6,6 @@ units, or of a table as pandas writes it (`orient`: split, table, columns, index
 
 from __future__ import annotations
 
-import codecs
 import json
 import re
 from array import array
@@ -31,19 +30,14 @@ from sealscope.recordings.formats.table import Choose, RawTable, check_size, che
 from sealscope.recordings.formats.text_layout import MISSING, SNIFF, encoding_of, is_number, ungrouped
 
 #: Largest document, or member of a stream, that is read as a whole [characters], and most arrays and objects in it.
-LARGEST_DOCUMENT = 2**26
-_MOST_PARTS = 2**22
+LARGEST_DOCUMENT, _MOST_PARTS = 2**26, 2**22
 _CHUNK = 2**20
 #: Most names that records may have, deepest nesting of a record, and longest vector in one.
 _MOST_NAMES, _DEEPEST, _LONGEST_VECTOR = 1024, 4, 256
 _BEGINS = re.compile(r'\{\s{0,1000}["}]|\[\s{0,1000}[\[{\]"\d\-nN]')
 #: What stands between the members of a stream: white space, commas, and RFC 7464's mark of a record.
-_BETWEEN = re.compile(r"[\s,\x1e]*")
-_SPACE = re.compile(r"\s*")
-#: Errors of a text that ends too early are this near to its end, or say so.
-_NEAR_END = 16
-_VALUE_KEYS = ("value", "val", "v")
-_UNIT_KEYS = ("unit", "units", "uom", "einheit")
+_BETWEEN, _SPACE = re.compile(r"[\s,\x1e]*"), re.compile(r"\s*")
+_VALUE_KEYS, _UNIT_KEYS = ("value", "val", "v"), ("unit", "units", "uom", "einheit")
 _NAME_KEYS = ("columns", "names", "header", "headers", "fields", "channels", "labels")
 _ROW_KEYS = ("data", "rows", "values", "records")
 _decoder = json.JSONDecoder()
@@ -52,9 +46,7 @@ _decoder = json.JSONDecoder()
 def is_json(head: bytes) -> bool:
     """Return whether a file that begins with `head` is JSON: an object, or an array, but no heading in brackets."""
     encoding = encoding_of(head)
-    if encoding is None:
-        return False
-    text = head.decode(encoding, errors="replace").lstrip("\ufeff \t\r\n\x1e")
+    text = "" if encoding is None else head.decode(encoding, errors="replace").lstrip("\ufeff \t\r\n\x1e")
     if not _BEGINS.match(text):
         return False
     first, newline, _ = text.partition("\n")
@@ -80,8 +72,7 @@ def read_json(path: Path, choose: Choose) -> RawTable:
     if len(begin) == 1 and isinstance(begin[0], Mapping) and not _is_flat(begin[0]):
         values = _plain(begin[0], place)
         about = entries((name, value) for name, value in begin[0].items() if isinstance(value, str | int | float))
-        series = list(series_in(values if isinstance(values, Mapping) else {"data": values}))
-        rows, long = 0, None
+        series, rows, long = list(series_in(values)), 0, None
     else:
         records = _Records(place)
         for member in chain(begin, members):
@@ -105,16 +96,15 @@ def _long(
         return None
     try:
         choose(labels, None)
-        return None
     except InputError:
-        pass
-    columns = [column.values(records.rows) for column in records.columns.values()]
-    names = [str(cell) for cell in columns[shape.name].tolist()]
-    units = [""] * len(names) if shape.unit is None else [str(cell) for cell in columns[shape.unit].tolist()]
-    values = columns[shape.value]
-    if values.dtype.kind != "f":
-        values = from_text(["" if cell is None else str(cell) for cell in values.tolist()], False, "value", place)
-    return pivoted(list(zip(names, units, strict=True)), columns[shape.time], values, labels[shape.time], place)
+        columns = [column.values(records.rows) for column in records.columns.values()]
+        names = [str(cell) for cell in columns[shape.name].tolist()]
+        units = [""] * len(names) if shape.unit is None else [str(cell) for cell in columns[shape.unit].tolist()]
+        values = columns[shape.value]
+        if values.dtype.kind != "f":
+            values = from_text(["" if cell is None else str(cell) for cell in values.tolist()], False, "value", place)
+        return pivoted(list(zip(names, units, strict=True)), columns[shape.time], values, labels[shape.time], place)
+    return None
 
 
 def _is_flat(member: Mapping[str, Any]) -> bool:
@@ -133,75 +123,54 @@ class _Stream:
     cut: bool = False
 
     def __iter__(self) -> Iterator[Any]:
-        inside, line, count, least = False, 1, 0, 0
-        rest, pieces = "", [""]
-        for text, ended in self._texts():
-            pieces.append(text)
-            if not ended and sum(map(len, pieces)) < least:
-                continue
-            rest, at, least = "".join(pieces), 0, 0
-            if len(rest) > _MOST_PARTS and rest.count("{") + rest.count("[") > _MOST_PARTS:
-                raise UnreadableFile(f"JSON must have at most {_MOST_PARTS} parts in one value ({self.place})")
+        with self.path.open("rb") as head:
+            encoding = encoding_of(head.read(SNIFF))
+        if encoding is None:
+            raise UnreadableFile(f"JSON must be text, got binary data ({self.place})")
+        with self.path.open(encoding=encoding, errors="replace") as file:
+            text, at, line, inside, count, ended = file.read(_CHUNK).lstrip("\ufeff"), 0, 1, False, 0, False
             while True:
-                at = _end(_BETWEEN, rest, at)
-                inner = _end(_SPACE, rest, at + 1)
-                if at == len(rest):
-                    break
-                if inner >= len(rest) and not ended and len(rest) - at <= LARGEST_DOCUMENT:
-                    least = min(2 * (len(rest) - at), LARGEST_DOCUMENT + 1)  # it is parsed anew then
-                    break
-                if inside and rest[at] == "]":
+                at = self._end(_BETWEEN, text, at)
+                inner = self._end(_SPACE, text, at + 1)
+                error: json.JSONDecodeError | None = None
+                if inside and text[at : at + 1] == "]":
                     inside, at = False, at + 1
                     continue
-                if not inside and rest[at] == "[" and rest[inner : inner + 1] in ("[", "{", "]"):
+                if not inside and text[at : at + 1] == "[" and text[inner : inner + 1] in ("[", "{", "]"):
                     inside, at = True, inner
                     continue
-                try:
-                    member, end = _decoder.raw_decode(rest, at)
-                except json.JSONDecodeError as error:
-                    unfinished = error.msg.startswith("Unterminated") or error.pos >= len(rest) - _NEAR_END
-                    if unfinished and not ended and len(rest) - at <= LARGEST_DOCUMENT:
-                        least = min(
-                            2 * (len(rest) - at), LARGEST_DOCUMENT + 1
-                        )  # a value is parsed anew when twice as much of it is read
-                        break
-                    if unfinished and ended and count:
-                        self.cut = True
-                        return
-                    what = (
-                        error.msg
-                        if len(rest) - at <= LARGEST_DOCUMENT
-                        else f"over {LARGEST_DOCUMENT} signs in one, write a record a line"
-                    )
-                    where = line + rest.count("\n", 0, error.pos)
-                    raise UnreadableFile(f"JSON must be whole, got: {what} (line {where}, {self.place})") from None
-                except (ValueError, RecursionError) as error:
-                    raise UnreadableFile(f"JSON must be plain, got: {str(error)[:80]} ({self.place})") from None
-                count += 1
-                yield member
-                at = end
-            line += rest.count("\n", 0, at)
-            pieces = [rest[at:]]
+                if inner < len(text) or (ended and at < len(text)):
+                    try:
+                        member, end = _decoder.raw_decode(text, at)
+                    except json.JSONDecodeError as wrong:
+                        error = wrong
+                    except (ValueError, RecursionError) as wrong:
+                        raise UnreadableFile(f"JSON must be plain, got: {str(wrong)[:80]} ({self.place})") from None
+                    else:
+                        count += 1
+                        yield member
+                        at = end
+                        continue
+                if not ended and len(text) - at <= LARGEST_DOCUMENT:  # a value is parsed anew with twice as much of it
+                    line += text.count("\n", 0, at)
+                    more = file.read(max(_CHUNK, len(text) - at))
+                    text, at, ended = text[at:] + more, 0, not more
+                    if len(text) > _MOST_PARTS and text.count("{") + text.count("[") > _MOST_PARTS:
+                        raise UnreadableFile(f"JSON must have at most {_MOST_PARTS} parts in one value ({self.place})")
+                    continue
+                if error is None:
+                    return
+                if ended and count and (error.msg.startswith("Unterminated") or error.pos >= len(text) - 16):
+                    self.cut = True
+                    return
+                what = error.msg if ended else f"over {LARGEST_DOCUMENT} signs in one, write a record a line"
+                line += text.count("\n", 0, error.pos)
+                raise UnreadableFile(f"JSON must be whole, got: {what} (line {line}, {self.place})")
 
-    def _texts(self) -> Iterator[tuple[str, bool]]:
-        """Yield (text, whether it is the last) in blocks."""
-        with self.path.open("rb") as file:
-            encoding = encoding_of(file.read(SNIFF))
-            if encoding is None:
-                raise UnreadableFile(f"JSON must be text, got binary data ({self.place})")
-            file.seek(0)
-            decoder = codecs.getincrementaldecoder(encoding)(errors="replace")
-            begun = False
-            while data := file.read(_CHUNK):
-                text = decoder.decode(data)
-                yield (text if begun else text.lstrip("\ufeff")), False
-                begun = True
-            yield decoder.decode(b"", True), True
-
-
-def _end(pattern: re.Pattern[str], text: str, at: int) -> int:
-    match = pattern.match(text, at)
-    return at if match is None else match.end()
+    @staticmethod
+    def _end(pattern: re.Pattern[str], text: str, at: int) -> int:
+        match = pattern.match(text, at)
+        return at if match is None else match.end()
 
 
 class _Column:
@@ -210,28 +179,24 @@ class _Column:
     def __init__(self) -> None:
         self.unit: str | None = None
         self.at, self.numbers = array("q"), array("d")
-        self.text_at: list[int] = []
-        self.texts: list[str] = []
+        self.texts: dict[int, str] = {}
 
     def add(self, row: int, value: object, name: str, place: str) -> None:
-        if value is None:
-            return
         if isinstance(value, str) and is_number(value, "."):
             value = float(ungrouped(value.strip(), ".").lower().replace("d", "e"))
         if isinstance(value, str):
             if value.strip().casefold() not in MISSING:
                 check_texts(len(self.texts) + 1, len(value), name, place)
-                self.text_at.append(row)
-                self.texts.append(value)
-            return
-        try:
-            number = float(value)  # type: ignore[arg-type]
-        except OverflowError:
-            number = np.inf
-        if np.isinf(number):
-            raise UnreadableFile(f"a sample must be a finite number, got {name} = {str(value)[:40]} ({place})")
-        self.at.append(row)
-        self.numbers.append(number)
+                self.texts[row] = value
+        elif value is not None:
+            try:
+                number = float(value)  # type: ignore[arg-type]
+            except OverflowError:
+                number = np.inf
+            if np.isinf(number):
+                raise UnreadableFile(f"a sample must be a finite number, got {name} = {str(value)[:40]} ({place})")
+            self.at.append(row)
+            self.numbers.append(number)
 
     def values(self, rows: int) -> NDArray[Any]:
         """Return the samples (rows,), missing ones as NaN; texts where the numbers are in texts, too."""
@@ -239,10 +204,8 @@ class _Column:
         numbers[np.frombuffer(self.at, dtype=np.int64)] = np.frombuffer(self.numbers)
         if not self.texts:
             return numbers
-        texts = np.full(rows, "", dtype=object)
-        known = np.isfinite(numbers)
-        texts[known] = [repr(value) for value in numbers[known].tolist()]
-        texts[self.text_at] = self.texts
+        texts = np.where(np.isnan(numbers), "", numbers.astype(str)).astype(object)
+        texts[list(self.texts)] = list(self.texts.values())
         return texts
 
 
@@ -259,7 +222,10 @@ class _Records:
         """Add a member: one row of samples, or as many as the arrays of a block have."""
         if isinstance(member, Mapping):
             if (length := _block_length(member)) is not None:
-                self._add_block(member, length)
+                for name, cells in member.items():
+                    for row, cell in enumerate(cells if isinstance(cells, list) else (), start=self.rows):
+                        self._add(row, "", name, cell, _DEEPEST)
+                self.rows += length
                 return
             self._add(self.rows, "", "", member, 0)
         elif isinstance(member, list):
@@ -280,26 +246,15 @@ class _Records:
             )
         self.rows += 1
 
-    def _add_block(self, member: Mapping[str, Any], length: int) -> None:
-        for name, cells in member.items():
-            if isinstance(cells, list):
-                for row, cell in enumerate(cells, start=self.rows):
-                    self._add(row, "", name, cell, _DEEPEST)
-        self.rows += length
-
     def _add(self, row: int, group: str, name: str, value: Any, depth: int) -> None:
         """Add a value of a record, or what is in it, called by the names on the way to it."""
         if isinstance(value, Mapping) and depth < _DEEPEST:
-            keys = {key.casefold(): key for key in value}
-            held, unit = (
-                next((keys[key] for key in names if key in keys), None) for names in (_VALUE_KEYS, _UNIT_KEYS)
-            )
+            held, unit = _key_of(value, _VALUE_KEYS), _key_of(value, _UNIT_KEYS)
             if name and held is not None and unit is not None and not isinstance(value[held], Mapping | list):
-                column = self._column(group, name)
-                given = value[unit]
+                column, given = self._column(group, name), value[unit]
                 if isinstance(given, str) and column.unit not in (None, given):
                     raise UnreadableFile(
-                        f"{name} must have one unit, got {column.unit[:40]} and {given[:40]} "  # type: ignore[index]
+                        f"{name} must have one unit, got {str(column.unit)[:40]} and {given[:40]} "
                         f"(row {row + 1}, {self.place})"
                     )
                 column.unit = given if isinstance(given, str) else column.unit
@@ -317,12 +272,9 @@ class _Records:
             self._column(group, name).add(row, value, name, self.place)
 
     def _column(self, group: str, name: str) -> _Column:
-        column = self.columns.get((group, name))
-        if column is None:
-            if len(self.columns) == _MOST_NAMES:
-                raise UnreadableFile(f"records must have at most {_MOST_NAMES} names, got more ({self.place})")
-            column = self.columns[group, name] = _Column()
-        return column
+        if (group, name) not in self.columns and len(self.columns) == _MOST_NAMES:
+            raise UnreadableFile(f"records must have at most {_MOST_NAMES} names, got more ({self.place})")
+        return self.columns.setdefault((group, name), _Column())
 
     def series(self) -> list[Series]:
         """Return a series a name, each with a sample in every row."""
@@ -330,6 +282,16 @@ class _Records:
             Series(group, Label.parse(name, column.unit), self.rows, partial(column.values, self.rows))
             for (group, name), column in self.columns.items()
         ]
+
+    def texts_or_numbers(self) -> dict[str, NDArray[Any]]:
+        """Return name -> samples (n,) as the tree of signals has them."""
+        check_size(self.rows, len(self.columns), self.place)
+        return {name: _as_held(column, self.rows) for (_, name), column in self.columns.items()}
+
+
+def _as_held(column: _Column, rows: int) -> NDArray[Any]:
+    values = column.values(rows)
+    return values.astype(str) if values.dtype == object else values
 
 
 def _key_of(value: Mapping[str, Any], names: Sequence[str]) -> str | None:
@@ -340,27 +302,43 @@ def _key_of(value: Mapping[str, Any], names: Sequence[str]) -> str | None:
 
 def _block_length(member: Mapping[str, Any]) -> int | None:
     """Return how many samples a block of columns holds: arrays of one length, one of which is the time."""
-    lengths = {len(value) for value in member.values() if isinstance(value, list)}
-    timed = any(isinstance(value, list) and is_time(Label.parse(name)) for name, value in member.items())
-    return lengths.pop() if len(lengths) == 1 and timed else None
+    lists = {name: len(value) for name, value in member.items() if isinstance(value, list)}
+    timed = len(set(lists.values())) == 1 and any(is_time(Label.parse(name)) for name in lists)
+    return next(iter(lists.values())) if timed else None
 
 
 def _plain(value: Any, place: str, depth: int = 0) -> Any:
     """Return a document's value as the tree of signals has them: arrays for lists, tables as columns by name."""
     if isinstance(value, Mapping):
-        table = _table(value, place)
-        if table is not None:
+        if (table := _table(value, place)) is not None or depth == 8:
             return table
-        return {key: _plain(member, place, depth + 1) for key, member in value.items()} if depth < 8 else None
+        return {key: _plain(member, place, depth + 1) for key, member in value.items()}
     if not isinstance(value, list):
         return value
-    if value and all(isinstance(member, Mapping) for member in value):
-        if all(_is_flat(member) for member in value):
-            return _by_column(value, None, place)
-        return {f"({number})": _plain(member, place, depth + 1) for number, member in enumerate(value, start=1)}
-    if value and all(isinstance(member, list) for member in value):
+    rows = value and all(isinstance(member, list) for member in value)
+    if rows or (value and all(isinstance(member, Mapping) and _is_flat(member) for member in value)):
         return _by_column(value, None, place)
+    if value and all(isinstance(member, Mapping) for member in value):
+        return {f"({number})": _plain(member, place, depth + 1) for number, member in enumerate(value, start=1)}
     return _vector(value, place)
+
+
+def _vector(cells: Sequence[Any], place: str) -> NDArray[Any] | None:
+    """Return an array (n,) of numbers or texts; None for cells of another kind."""
+    if not all(isinstance(cell, str | int | float | None) for cell in cells):
+        return None
+    column = _Column()
+    for row, cell in enumerate(cells):
+        column.add(row, cell, "an array", place)
+    return _as_held(column, len(cells))
+
+
+def _by_column(rows: Sequence[Any], heads: Sequence[Any] | None, place: str) -> dict[str, NDArray[Any]]:
+    """Return name -> samples (n,) of rows that are records or arrays under their `heads`."""
+    records = _Records(place, heads=None if heads is None else [str(head) for head in heads])
+    for row in rows:
+        records.add(row)
+    return records.texts_or_numbers()
 
 
 def _list_of(value: Mapping[str, Any], names: Sequence[str]) -> list[Any]:
@@ -369,45 +347,13 @@ def _list_of(value: Mapping[str, Any], names: Sequence[str]) -> list[Any]:
     return held if isinstance(held, list) else []
 
 
-def _vector(cells: Sequence[Any], place: str) -> NDArray[Any] | None:
-    """Return an array (n,) of numbers or texts; None for cells of another kind."""
-    if not all(isinstance(cell, str | int | float | None) for cell in cells):
-        return None
-    if not any(isinstance(cell, str) for cell in cells):
-        try:
-            numbers = np.array(cells, dtype=np.float64)  # None is NaN
-        except OverflowError:
-            numbers = np.full(len(cells), np.inf)
-        if np.isinf(numbers).any():
-            raise UnreadableFile(f"a sample must be a finite number, got an infinite one in an array ({place})")
-        return numbers
-    column = _Column()
-    for row, cell in enumerate(cells):
-        column.add(row, cell, "an array", place)
-    values = column.values(len(cells))
-    return values.astype(str) if values.dtype == object else values
-
-
-def _by_column(rows: Sequence[Any], heads: Sequence[Any] | None, place: str) -> dict[str, NDArray[Any]]:
-    """Return name -> samples (n,) of rows that are records or arrays under their `heads`."""
-    records = _Records(place, heads=None if heads is None else [str(head) for head in heads])
-    for row in rows:
-        records.add(row)
-    check_size(records.rows, len(records.columns), place)
-    columns = {name: column.values(records.rows) for (_, name), column in records.columns.items()}
-    return {name: values.astype(str) if values.dtype == object else values for name, values in columns.items()}
-
-
 def _table(value: Mapping[str, Any], place: str) -> dict[str, Any] | None:
     """Return name -> samples of a table that names and rows, or objects by row or column, make; None for any other."""
-    heads, rows = _list_of(value, _NAME_KEYS), _list_of(value, _ROW_KEYS)
+    heads, rows, index = (_list_of(value, names) for names in (_NAME_KEYS, _ROW_KEYS, ("index",)))
     if heads and rows and isinstance(rows[0], list) and len(rows[0]) == len(heads):
         names = [head.get("name", "") if isinstance(head, Mapping) else head for head in heads]
-        table = _by_column(rows, names, place)
-        index = value.get("index")
-        if isinstance(index, list) and len(index) == len(rows) and index != list(range(len(rows))):
-            return {"t": _vector(index, place), **table}
-        return dict(table)
+        timed = len(index) == len(rows) and index != list(range(len(rows)))
+        return {**({"t": _vector(index, place)} if timed else {}), **_by_column(rows, names, place)}
     members = list(value.values())
     if not members or not all(isinstance(member, Mapping) and member and _is_flat(member) for member in members):
         return None
@@ -419,7 +365,4 @@ def _table(value: Mapping[str, Any], place: str) -> dict[str, Any] | None:
     if not (inner[0][:1].isdigit() and inner[-1][:1].isdigit()):
         return None
     columns: dict[str, Any] = {name: _vector(list(member.values()), place) for name, member in value.items()}
-    if inner == [str(row) for row in range(len(inner))]:
-        return columns
-    numbers = all(re.fullmatch(r"-?\d{1,20}(\.\d{1,20})?", key) for key in inner)
-    return {"t": _vector([float(key) for key in inner] if numbers else inner, place), **columns}
+    return columns if inner == [str(row) for row in range(len(inner))] else {"t": _vector(inner, place), **columns}

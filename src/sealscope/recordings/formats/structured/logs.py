@@ -41,7 +41,7 @@ def read_text(path: Path, choose: Choose) -> RawTable:
         except InputError:
             if not _fits(layout, choose):
                 raise
-    return text.read_text(path, choose, layout)
+    return text.read_table(path, choose, layout)
 
 
 def is_one_table(path: Path) -> bool:
@@ -92,7 +92,7 @@ def _each_on_its_clock(path: Path, choose: Choose, layout: Layout, times: Sequen
     wanted = [values[column] for column, _ in choice.columns if column < len(values)]
     owner = {column: max(time for time in times if time < column) for column in wanted}
     read = [(column, column in times) for column in sorted({*wanted, *owner.values()})]
-    table = text.read_text(path, lambda *_: _Several(None, None, {}, wanted=tuple(read)), layout)
+    table = text.read_table(path, lambda *_: _Several(None, None, {}, wanted=tuple(read)), layout)
     samples = dict(zip((column for column, _ in read), table.columns, strict=True))
     start = exported_from(layout.about)
     clocks = {time: _clock(samples[time], labels[time], time, start) for time in set(owner.values())}
