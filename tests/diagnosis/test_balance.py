@@ -41,7 +41,7 @@ def changed(recording: Recording, **changes: Callable[[Mapping[str, np.ndarray]]
 def judged(recording: Recording) -> tuple[StepTest, Blocks]:
     made = blocks_of(recording, RIG)
     assert made is not None
-    blocks, columns = made
+    blocks, _, columns = made
     test = step_test(information(blocks, columns, columns[0].leak))
     assert test is not None
     return test, blocks

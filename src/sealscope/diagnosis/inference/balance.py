@@ -281,8 +281,11 @@ def shortest(rate: float) -> int:
     return FEWEST * max(SPAN, round(SHORTEST / STRIDE)) * stride + (SPAN - 1) * stride + 1
 
 
-def blocks_of(recording: Recording, rig: Rig) -> tuple[Blocks, tuple[Columns, ...]] | None:
-    """Return the blocks of a recording and where their columns stand; None where its channels allow no balance."""
+def blocks_of(recording: Recording, rig: Rig) -> tuple[Blocks, Blocks, tuple[Columns, ...]] | None:
+    """Return the blocks of a recording and where their columns stand; None where its channels allow no balance.
+
+    They come twice: about the zero of p_A - p_B that a change of the leak needs, and as recorded.
+    """
     names = [name for name in recording.channels if name in _READ]
     balances = equations(rig, frozenset(names))
     if not balances:
@@ -292,17 +295,18 @@ def blocks_of(recording: Recording, rig: Rig) -> tuple[Blocks, tuple[Columns, ..
     samples = whole_samples(recording, needed)
     seconds = min(LONGEST, max(SHORTEST, recording.duration / WANTED))
     zero = 0.0
-    blocks: Blocks | None = None
+    blocks, plain = None, None
     for _ in range(TURNS):
         stream = BlockStream(balances, recording.rate, seconds, None, float(recording.t[0]), zero)
         blocks = stream.push(samples, last=True)
         if blocks is None:
             return None
+        plain = blocks if plain is None else plain
         blocks = about_zero(blocks, stream.columns)
         zero, before = float(blocks.zero[0]), zero
         if abs(zero - before) < NEAR * priors()["zero"]["pressure"].value:
             break
-    return None if blocks is None else (blocks.merged(), stream.columns)
+    return None if blocks is None or plain is None else (blocks.merged(), plain.merged(), stream.columns)
 
 
 _READ = ("u", "omega", "theta", "q_pump", "x", "p_1", "p_2", "p_A", "p_B")

@@ -52,13 +52,18 @@ class StepHypothesis(NamedTuple):
 
 
 def hypotheses(
-    blocks: Blocks, balances: Sequence[Equation], columns: Sequence[Columns], lost: Mapping[str, StepTest]
+    blocks: Blocks,
+    plain: Blocks,
+    balances: Sequence[Equation],
+    columns: Sequence[Columns],
+    lost: Mapping[str, StepTest],
 ) -> tuple[StepHypothesis, ...]:
     """Return the test of every term's coefficient, the most likely first; steps of either sign but of a leak.
 
-    Oil that leaves the circuit empties the accumulator as well, by as much (`lost`).
+    A leak is tested about the zero of p_A - p_B that its change shows, what else may have stepped in the `plain`
+    blocks, whose zero is that of the sensors. Oil that leaves the circuit empties the accumulator as well (`lost`).
     """
-    coarse = blocks.merged(COARSE)
+    about, recorded = blocks.merged(COARSE), plain.merged(COARSE)
     tested = []
     for index, term in enumerate(balances[0].terms):
         if term.drift == "motion" and index in columns[0].motion and term.name.startswith("motion"):
@@ -68,9 +73,10 @@ def hypotheses(
         if lost and term.name == BIAS:
             continue  # an accumulator's pressure drives what leaves its circuit
         replaced = columns[0].leak if term.name == ORIFICE else None
+        coarse = about if term.name in (LEAK, ORIFICE, PUMP) else recorded
         tested.append((term.name, term.cause, information(coarse, columns, index, replaced)))
     orifice = columns[0].names.index(ORIFICE)
-    tested.append((SCALE, "sensor fault", information(_with_scale(coarse, columns, orifice), columns, orifice)))
+    tested.append((SCALE, "sensor fault", information(_with_scale(recorded, columns, orifice), columns, orifice)))
     stepped = []
     cost = cost_of_zero(zero_of(blocks, columns))
     for name, cause, own in tested:

@@ -67,7 +67,8 @@ class Size(NamedTuple):
 class RecordedBalance:
     """A recording's blocks with all that is asked of them.
 
-    `lost`: tests of a step of what leaves the circuit by the accumulator's own balance, by the term's name.
+    `lost`: tests of a step of what leaves the circuit by the accumulator's own balance, by the term's name; `plain`:
+    the blocks with the zero of p_A - p_B as recorded, where they are others.
     """
 
     blocks: Blocks
@@ -76,6 +77,7 @@ class RecordedBalance:
     rig: Rig
     recording: Recording
     lost: Mapping[str, StepTest] = field(default_factory=dict)
+    plain: Blocks | None = None
 
     @property
     def units(self) -> frozenset[tuple[str, str]]:
@@ -101,7 +103,7 @@ class RecordedBalance:
     @cached_property
     def hypotheses(self) -> tuple[StepHypothesis, ...]:
         """Tests of all terms' coefficients, the most likely first."""
-        return hypotheses(self.blocks, self.equations, self.columns, self.lost)
+        return hypotheses(self.blocks, self.plain or self.blocks, self.equations, self.columns, self.lost)
 
     @cached_property
     def other(self) -> OtherStep | None:

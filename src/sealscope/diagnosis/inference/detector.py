@@ -92,7 +92,7 @@ class VolumeBalance:
             return None
         zero = float(blocks[0].zero[0])
         lost = remembered(recording, ("lost oil", self.rig), lambda own: lost_beside(own, self.rig, zero), self.reads)
-        return RecordedBalance(blocks[0], balances, blocks[1], self.rig, recording, lost)
+        return RecordedBalance(blocks[0], balances, blocks[2], self.rig, recording, lost, blocks[1])
 
     def learn(self, recording: Recording) -> Lesson | None:
         """Return what a healthy recording teaches (`scatter.Taught`), by the terms of its balance.

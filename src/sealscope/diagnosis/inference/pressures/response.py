@@ -437,7 +437,8 @@ class Follower:
         follower.theta, follower.variance = first_fit(window, beliefs, total)
         covariance, states = follower.covariance, follower.states
         length = round(_BLOCK * recording.rate)
-        for first in range(0, round(_BEGINNING * recording.rate), length):  # led on once, to begin where that ends
+        taken = min(round(_BEGINNING * recording.rate), len(recording) - length + 1)
+        for first in range(0, taken, length):  # led on once, to begin where that ends
             follower.take(recording.samples(slice(first, first + length)))
         follower.covariance, follower.states, follower.last = covariance, states, math.nan
         return follower
