@@ -157,7 +157,7 @@ def _lines(block: bytes, layout: Layout) -> list[str]:
 
 
 @dataclass
-class _Parser:
+class _FormulaParser:
     """Reads blocks in which each row has plain numbers in the chosen columns by pyarrow, where it is installed.
 
     `first`: whether no block was read; `usable`: whether the log can have such blocks: its first block is one; `width`:
@@ -171,7 +171,7 @@ class _Parser:
     width: int = 0
 
     @classmethod
-    def of(cls, file: BinaryIO, layout: Layout, choice: ColumnMap) -> _Parser:
+    def of(cls, file: BinaryIO, layout: Layout, choice: ColumnMap) -> _FormulaParser:
         """Return the parser of a log; small ones, whose time is that of the import, are not for it."""
         plain = layout.encoding in ("utf-8", "utf-8-sig", "cp1252") and layout.delimiter != " "
         large = os.fstat(file.fileno()).st_size >= _LARGE
@@ -257,7 +257,7 @@ def _row_blocks(
     A block in which each row has plain numbers there is yielded as these, (n, k).
     """
     least, usual = max(column for column, _ in choice.columns) + 1, 0
-    parser = _Parser.of(file, layout, choice)
+    parser = _FormulaParser.of(file, layout, choice)
     for number, block, cut in _blocks(file, layout.encoding, place):
         if not cut and (values := parser.values(number, block)) is not None:
             usual = parser.width
