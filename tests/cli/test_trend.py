@@ -86,7 +86,7 @@ def test_files_without_a_time_ask_for_every(call, days: Path, tmp_path: Path) ->
         (("--healthy", "0"), "healthy recordings must be 1 or more"),
         (("--years", "0"), "machine-years"),
         (("--fail-on", "rust"), "--fail-on must be leak, no leak or cannot tell"),
-        (("-o", "trend.docx"), "the page of a trend must be a file"),
+        (("-o", "trend.docx"), "a page must be a file"),
     ],
 )
 def test_wrong_options_are_refused_in_a_line(call, days: Path, words: tuple[str, ...], complaint: str) -> None:

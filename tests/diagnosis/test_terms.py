@@ -35,7 +35,7 @@ def step_of(channels: Mapping[str, Array], rig: Rig) -> StepTest:
     """Return the test of a step of the leak."""
     made = blocks_of(recording(channels), rig)
     assert made is not None
-    blocks, columns = made
+    blocks, _, columns = made
     test = step_test(information(blocks, columns, columns[0].leak))
     assert test is not None
     return test
@@ -110,7 +110,7 @@ def test_the_zero_of_a_pressure_changes_neither_leak_nor_chance(rig: Rig, leakin
     width = priors()["zero"]["pressure"].value
     shifted = {**read, "p_A": read["p_A"] + width}
     assert step_of(shifted, rig).fitted[0] == pytest.approx(LEAK, rel=0.05)
-    blocks, columns = blocks_of(recording(shifted), rig) or pytest.fail("no blocks")
+    blocks, _, columns = blocks_of(recording(shifted), rig) or pytest.fail("no blocks")
     assert zero_of(blocks, columns) == pytest.approx(width, rel=0.1)
     mean = np.abs(np.diff([leaking["p_B"], leaking["p_A"]], axis=0)).mean()
     assert blocks.driving(zero_of(blocks, columns)).mean() == pytest.approx(mean, rel=0.05)
