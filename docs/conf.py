@@ -47,7 +47,7 @@ napoleon_preprocess_types = True
 nitpicky = True
 _OUTSIDE = "array_like|callable|iterable|iterator|mapping|ndarray|path|path-like|sequence|JSON value"
 _OUTSIDE += "|pair|floats|two floats"  # `pair of floats`
-_OUTSIDE += r"|shape .*|(?:pandas|xarray|pathlib)\..*"
+_OUTSIDE += r"|shape .*|(?:pandas|xarray|pathlib|matplotlib)\..*"
 nitpick_ignore_regex = [("py:class", f"(?:{_OUTSIDE})"), ("py:obj", "True|False")]
 
 os.environ.setdefault("COLUMNS", "84")  # of what commands print in the tutorials

@@ -85,10 +85,10 @@ def test_a_kill_changes_no_row(tmp_path):
             run(settings)
         finally:
             os._exit(0)
-    until(lambda: store.blocks_kept("press 1") >= 20)
+    until(lambda: store.last_number(store.tables.blocks, "press 1") >= 20)
     os.kill(child, signal.SIGKILL)
     assert os.WIFSIGNALED(os.waitpid(child, 0)[1])
-    assert store.blocks_kept("press 1") < 75
+    assert store.last_number(store.tables.blocks, "press 1") < 75
     service = run(settings)
     assert rows_of(settings.database) == rows_of(whole.database)
     assert service.actuators.counters == {}

@@ -31,7 +31,7 @@ class Learnt:
         Sampling rate [Hz], and length [s].
     start_s : float or None
         When its first sample was taken [s since 1970].
-    lessons : mapping of str to Lesson
+    lessons : mapping of str to mapping
         By the names of the detectors that could use the recording.
     """
 

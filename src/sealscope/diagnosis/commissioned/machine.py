@@ -227,7 +227,7 @@ def commission(
 
     Parameters
     ----------
-    paths : path-like, or several
+    paths : path-like or sequence of path-like
         A folder of healthy recordings, or their files.
     rig : Rig, str or path-like, optional
         What is stated of the machine, as for `sealscope.diagnose`.

@@ -174,7 +174,7 @@ class Diagnosis(Evidence):
 
     @property
     def state(self) -> MachineState:
-        """State of the machine as NAMUR NE 107 names it: failure where the leak is surely over the repair limit."""
+        """State of the machine as NAMUR NE 107 names it, a failure where the leak is surely over the repair limit."""
         condition = _condition(self.verdict, self.known_healthy, self.detector == LEAST_SPECIFIC)
         if self.severity is not None and self.severity.level == "repair":
             condition = "leak over the limit"
