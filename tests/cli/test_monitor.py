@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import json
+import sqlite3
+
+import numpy as np
+
+import sealscope as ss
 
 from ..diagnosis.balance_machine import machine, step
 from ..monitor.plant import write_files
@@ -20,6 +25,24 @@ def test_files_of_a_folder_end_in_one_alarm(call, tmp_path, monkeypatch):
     (event,) = [json.loads(line) for line in again.out.splitlines()]
     assert (event["event"], event["alarm"]["actuator"]) == ("raised", "press 1")
     assert (tmp_path / "monitor.db").exists()
+
+
+def test_a_machine_s_file_beside_the_settings_says_how_its_logs_are_read(call, tmp_path):
+    """Wherever the monitor is started: a log with headers of its own is taken in by the machine's file alone."""
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    run = ss.simulate(command="3 sin(4t)", duration="20 s", seed=1)
+    rows = np.column_stack([run.t, run["p_A"] / 1e5, run["p_B"] / 1e5, run["x"] * 1e3, run["omega"] * 30.0 / np.pi])
+    header = "time_s,p_bottom_bar,p_rod_bar,stroke_mm,motor_rpm"
+    np.savetxt(logs / "press.csv", rows, "%.9g", ",", header=header, comments="")
+    ss.write_machine(ss.commission(logs, rig="thesis", map="auto"), tmp_path / "press.toml")
+    file = tmp_path / "monitor.toml"
+    file.write_text('[[actuator]]\nname = "press"\nfolder = "logs"\nrig = "press.toml"\n')
+    done = call("monitor", file, "--once")
+    assert (done.status, done.err) == (0, "")
+    with sqlite3.connect(tmp_path / "monitor.db") as database:
+        assert database.execute("SELECT count(*) FROM refused").fetchone() == (0,)
+    assert ss.load_rig(tmp_path / "press.toml").channel_map == {"*": "auto"}
 
 
 def test_what_exists_is_not_overwritten(call, tmp_path):

@@ -28,6 +28,10 @@ def _database(name: str, info: ValidationInfo) -> str:
     return name if "://" in name else str(_in_folder(Path(name), info))
 
 
+def _rig(rig: str, info: ValidationInfo) -> str:
+    return str(_in_folder(Path(rig), info)) if rig.endswith(".toml") else rig
+
+
 _File = Annotated[Path, AfterValidator(_in_folder)]
 
 
@@ -38,7 +42,7 @@ class _Part(BaseModel):
 class WatchSettings(_Part):
     """How an actuator is watched."""
 
-    rig: _Text = "thesis"
+    rig: Annotated[_Text, AfterValidator(_rig)] = "thesis"
     false_alarms_per_1000_h: float = Field(default=1.0, gt=0)
     learn_hours: float = Field(default=8.0, gt=0, le=1000)
     warning_lpm: float = Field(default=0.0, ge=0, allow_inf_nan=False)
@@ -57,7 +61,7 @@ class WatchSettings(_Part):
     @property
     def learned_with(self) -> str:
         """The settings that a baseline depends on."""
-        return f"{self.rig}, {self.learn_hours:g} h"
+        return f"{Path(self.rig).name}, {self.learn_hours:g} h"
 
 
 class SimulateSettings(_Part):

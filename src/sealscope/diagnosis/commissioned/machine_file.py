@@ -24,7 +24,7 @@ from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
 from sealscope.parameters import Rig
 from sealscope.parameters.load import OF_MACHINES
-from sealscope.recordings.formats.columns import check_call
+from sealscope.recordings.formats.columns import REST, check_call
 from sealscope.storage.atomic import atomic_write
 from sealscope.storage.toml_file import read_toml
 
@@ -93,10 +93,8 @@ def _tree(machine: CommissionedMachine) -> dict[str, Any]:
     head["written"] = datetime.now(UTC).isoformat(timespec="seconds")
     head |= {name: value for name in ("rate", "limit") if (value := getattr(machine, name)) is not None}
     tree: dict[str, Any] = {"machine": head}
-    if machine.channel_map == "auto":
-        head["map"] = "auto"
-    elif machine.channel_map:
-        tree["map"] = dict(machine.channel_map)
+    if columns := machine.channel_map:
+        tree["map"] = {REST: columns} if isinstance(columns, str) else dict(columns)
     if machine.rig is not None:
         tree |= machine.rig.as_dict()
     learnt = tree["learnt"] = {"problems": summary.problems, "noise": dict(summary.noise)}
@@ -195,8 +193,8 @@ def load_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
     if head.get("format") != FORMAT:
         raise InputError(f"machine.format must be {FORMAT}, got {head.get('format')!r} ({place})")
     name = _part(head, "name", str, place)
-    channel_map: Any = head.get("map") or (_part(tree, "map", dict, place) if "map" in tree else {})
-    if isinstance(channel_map, dict) and not all(isinstance(column, str) for column in channel_map.values()):
+    channel_map = _part(tree, "map", dict, place) if "map" in tree else {}
+    if not all(isinstance(column, str) for column in channel_map.values()):
         raise InputError(f"map must be a table of channels and their columns, got {channel_map!r:.80} ({place})")
     rate = _part(head, "rate", float, place) if "rate" in head else None
     limit = _part(head, "limit", str, place) if "limit" in head else None
