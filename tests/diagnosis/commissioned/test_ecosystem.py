@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -39,10 +41,13 @@ def test_the_estimator_is_cloned(folder):
 
 
 def test_a_diagnosis_is_a_row_of_a_table(machine, leaking):
+    """Columns are the same with and without a leak, and whatever channels were not used."""
     pandas = pytest.importorskip("pandas", reason="pandas is not installed")
-    frame = pandas.concat([machine.diagnose(leaking).to_frame() for _ in range(2)])
-    assert len(frame) == 2
-    row = frame.iloc[0]
+    leak = machine.diagnose(leaking)
+    healthy = replace(leak, verdict="no leak", onset_interval_s=None, leak_interval_lpm=None, unused=("p_x", "p_y"))
+    frames = [diagnosis.to_frame() for diagnosis in (leak, healthy)]
+    assert list(frames[0]) == list(frames[1])
+    row = pandas.concat(frames).iloc[0]
     assert row["verdict"] == "leak"
     assert row["leak_interval_lpm_low"] < row["leak_lpm"] < row["leak_interval_lpm_high"]
 

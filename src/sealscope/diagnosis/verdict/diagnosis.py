@@ -26,6 +26,11 @@ if TYPE_CHECKING:
 
 #: What a file may call the name of the machine.
 _MACHINE = ("machine", "actuator", "asset", "serial number", "serial", "rig", "test rig", "maschine", "prüfstand")
+#: Columns of a table of diagnoses, beside those of the intervals.
+_FIGURES = (
+    *("file", "start", "machine", "verdict", "reason", "onset_s", "leak_lpm", "bound_lpm", "score", "threshold"),
+    *("chance", "odds", "false_alarm_probability", "cause", "summary", "next_check"),
+)
 
 
 def next_check(verdict: Verdict, cause: Cause | None, *, healthy: bool = False, coarse: bool = False) -> str:
@@ -253,12 +258,10 @@ class Diagnosis(Evidence):
             import pandas
         except ImportError:
             raise MissingExtra("a table needs pandas: pip install 'sealscope[io]'") from None
-        row: dict[str, Any] = {}
-        for name, value in self.as_dict().items():
-            if isinstance(value, list) and len(value) == len(("low", "high")) and not isinstance(value[0], dict):
-                row |= dict(zip((f"{name}_low", f"{name}_high"), value, strict=True))
-            elif not isinstance(value, list | dict):
-                row[name] = value
+        whole = self.as_dict()
+        row = {name: whole[name] for name in _FIGURES}
+        for name in ("onset_interval_s", "leak_interval_lpm"):
+            row[f"{name}_low"], row[f"{name}_high"] = whole[name] or (None, None)
         return pandas.DataFrame([row])
 
     def plot(self, ax: matplotlib.axes.Axes | None = None) -> matplotlib.axes.Axes:
