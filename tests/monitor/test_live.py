@@ -76,6 +76,18 @@ def test_nothing_is_kept_of_what_nobody_looks_at_and_little_of_what_somebody_doe
     assert not live._windows
 
 
+def test_what_is_stored_never_takes_the_place_of_what_comes_meanwhile():
+    newer, stored = moving(2.0, start=100.0, x=None), moving(2.0)
+
+    def recall(name: str) -> list[Recording]:
+        live.take(name, newer)
+        return [stored]
+
+    live = LiveSamples(recall)
+    with live.looked_at("press"):
+        assert live.picture("press")["t"] == newer.t[-1]
+
+
 @settings(deadline=None, max_examples=25)
 @given(st.lists(st.integers(1, len(SENT) - 1), max_size=8))
 def test_the_picture_does_not_depend_on_how_samples_are_cut(cuts: list[int]):

@@ -87,12 +87,15 @@ class LiveSamples:
                 room = True
                 self._lookers[name] += 1
                 first = name not in self._windows
-                self._windows.setdefault(name, _Window())
+                window = self._windows.setdefault(name, _Window())
         try:
             if room and first:
                 with suppress(Exception):  # what comes from now on is shown without what is stored
-                    for samples in self._recall(name):
-                        self.take(name, samples)
+                    stored = self._recall(name)
+                    with self._lock:
+                        if not window.version:  # else newer samples have come meanwhile
+                            for samples in stored:
+                                window.add(samples)
             yield room
         finally:
             if room:

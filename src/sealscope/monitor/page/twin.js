@@ -48,8 +48,10 @@ function showTwin(live) {
   }
   byId("twin-missing").textContent = missing.join(" ");
   byId("twin-scale-most").textContent = `${twin.most} bar`;
+  // what is said and what is drawn change together, not the drawing a frame later
+  cancelAnimationFrame(twin.frame);
+  moved(performance.now());
   described();
-  if (!twin.frame) twin.frame = requestAnimationFrame(moved);
 }
 
 const between = (values, k, share) =>
@@ -57,7 +59,7 @@ const between = (values, k, share) =>
 
 function state() {
   const motion = twin.motion;
-  if (!motion) return null;
+  if (!motion) return { x: null, p_A: null, p_B: null, rpm: null, flow: null };
   const past = twin.at - twin.end;
   let k = 0;
   while (k < motion.t.length - 2 && motion.t[k + 1] <= past) k += 1;
@@ -75,8 +77,8 @@ function moved(now) {
   twin.frame = 0;
   const passed = Math.min(0.1, Math.max(0, (now - twin.seen) / 1000));
   twin.seen = now;
-  if (!twin.motion || document.hidden) return;
-  const newest = twin.end + twin.motion.t[twin.motion.t.length - 1];
+  if (document.hidden) return;
+  const newest = twin.motion ? twin.end + twin.motion.t[twin.motion.t.length - 1] : twin.at;
   if (!still.matches) twin.at = Math.min(newest, twin.at + passed);
   const is = state();
   const half = (BORE.right - BORE.left - BORE.piston) / 2;
@@ -91,7 +93,7 @@ function moved(now) {
     const pressure = is[`p_${side}`];
     const tone = pressure === null ? 0 : Math.max(0, Math.min(1, pressure / twin.most));
     for (const part of document.querySelectorAll(`[data-side="${side}"]`)) part.setAttribute("opacity", (0.06 + 0.94 * tone).toFixed(3));
-    byId(`twin-p-${side.toLowerCase()}`).textContent = pressure === null ? "not recorded" : `${bar(pressure)} bar`;
+    byId(`twin-p-${side.toLowerCase()}`).textContent = pressure === null ? (twin.motion ? "not recorded" : "–") : `${bar(pressure)} bar`;
   }
   byId("twin-x").textContent = is.x === null ? "x –" : `x ${is.x.toFixed(1)} mm`;
   const still_ = is.flow === null || Math.abs(is.flow) < 1e-3;
@@ -113,10 +115,8 @@ function moved(now) {
 function described() {
   const is = state();
   const parts = ["The actuator as it moves"];
-  if (is) {
-    for (const side of ["A", "B"]) if (is[`p_${side}`] !== null) parts.push(`p_${side} ${bar(is[`p_${side}`])} bar`);
-    if (is.x !== null) parts.push(`piston at ${is.x.toFixed(0)} mm`);
-  }
+  for (const side of ["A", "B"]) if (is[`p_${side}`] !== null) parts.push(`p_${side} ${bar(is[`p_${side}`])} bar`);
+  if (is.x !== null) parts.push(`piston at ${is.x.toFixed(0)} mm`);
   if (twin.leak) parts.push(byId("twin-leak-text").textContent);
   byId("twin").setAttribute("aria-label", parts.join(", "));
 }
