@@ -2,8 +2,9 @@
 
     python benchmarks/wrong_use.py [--seeds N]
 
-A machine is commissioned on five healthy recordings of 20 s, and judges recordings of another actuator, of a logger
-whose scale, offset or unit has changed, of warmer and colder oil, and of other duties; each with N seeds.
+A machine is commissioned on five healthy recordings of 20 s of one day, and judges recordings of another day: of
+another actuator, of a logger whose scale, offset or unit has changed, of warmer and colder oil, and of other duties;
+each with N seeds.
 """
 
 from __future__ import annotations
@@ -41,9 +42,14 @@ CASES: dict[str, tuple[dict, dict[str, tuple[float, float]]]] = {
 
 
 def logged(recording: ss.Recording, changes: dict[str, tuple[float, float]]) -> ss.Recording:
-    """Return the recording as another logger has it."""
+    """Return the recording of another day, as another logger has it."""
     changed = {name: factor * recording[name] + offset for name, (factor, offset) in changes.items()}
-    return replace(recording, channels={**recording.channels, **changed})
+    return dated(replace(recording, channels={**recording.channels, **changed}), "2026-03-02")
+
+
+def dated(recording: ss.Recording, day: str) -> ss.Recording:
+    """Return the recording of a day."""
+    return replace(recording, provenance={**recording.provenance, "start": f"{day}T08:00:00"})
 
 
 def main() -> None:
@@ -51,7 +57,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=8)
     seeds = range(100, 100 + parser.parse_args().seeds)
     rig = load_rig("thesis")
-    runs = [ss.simulate(command=DUTY, duration=SECONDS, set=HEALTHY, seed=seed) for seed in range(1, 6)]
+    runs = [
+        dated(ss.simulate(command=DUTY, duration=SECONDS, set=HEALTHY, seed=seed), "2026-03-01") for seed in range(1, 6)
+    ]
     healthy = tuple(learn(run, rig, f"run{k + 1}")[0] for k, run in enumerate(runs))
     machine = ss.CommissionedMachine("actuator 7", healthy, rig)
     print("| used with | leak | cannot tell | no leak | named as another machine |\n| --- | --- | --- | --- | --- |")

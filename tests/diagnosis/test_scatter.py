@@ -62,8 +62,67 @@ def risen(random: np.random.Generator, count: int, scatter: float, leak: float =
 
 def beyond(judged: Blocks, healthy: Sequence[Blocks]) -> Rise:
     """The rise of a recording beyond healthy ones."""
-    sums = [Taught.of(own, (COLUMNS,)).sums for own in healthy]
-    return rise(Taught.of(judged, (COLUMNS,)), sums, (COLUMNS,))
+    return rise(Taught.of(judged, (COLUMNS,)), [Taught.of(own, (COLUMNS,)) for own in healthy], (COLUMNS,))
+
+
+DAY = 86400.0
+
+
+def fleet(random: np.random.Generator, days: Sequence[int], viscosity: float, within: float) -> list[Taught]:
+    """Recordings of these days: leakage goes with the inverse of each day's viscosity (deviation of its logarithm)."""
+    thin = dict(zip(dict.fromkeys(days), np.exp(viscosity * random.standard_normal(len(days))), strict=False))
+    level = 20.0 * BELIEVED
+    return [
+        Taught.of(recording(random, level * thin[day] + within * random.normal()), (COLUMNS,), DAY * day)
+        for day in days
+    ]
+
+
+@pytest.mark.parametrize("days", [(1, 1, 1, 2), (1, 1, 2, 2, 3, 3, 3, 4), (1, 1, 2, 2, 2, 2)])
+def test_a_day_of_other_oil_is_no_leak(days: Sequence[int]) -> None:
+    """Between two days the viscosity differs as far as it is believed to."""
+    random, draws = np.random.default_rng(len(days)), 100
+    viscosity = 0.5 * np.log(priors()["oil"]["warmest"].value) / np.sqrt(2.0)
+    chances = []
+    for _ in range(draws):
+        *healthy, judged = fleet(random, days, viscosity, BELIEVED)
+        chances.append(rise(judged, healthy, (COLUMNS,)).chance)
+    for level in (0.1, 0.01):
+        assert np.sum(np.array(chances) < level) <= binom.ppf(0.999, draws, level)
+
+
+def test_recordings_without_a_date_are_of_one_day() -> None:
+    random = np.random.default_rng(3)
+    *healthy, judged = fleet(random, (1, 1, 1, 1), 0.0, BELIEVED)
+    undated = [own._replace(start_s=None) for own in (*healthy, judged)]
+    alike, later = rise(judged, healthy, (COLUMNS,)), judged._replace(start_s=DAY * 2)
+    assert rise(undated[-1], undated[:-1], (COLUMNS,)) == alike
+    assert rise(later, healthy, (COLUMNS,)).value == pytest.approx(alike.value)
+    assert rise(later, healthy, (COLUMNS,)).deviation > 5.0 * alike.deviation
+
+
+def test_a_known_temperature_of_the_oil_takes_off_what_it_makes_of_the_level() -> None:
+    """Twice the leakage in oil that is 17 K warmer is no leak, and as much at the same temperature is."""
+    random, level = np.random.default_rng(5), 20.0 * BELIEVED
+    twice = np.exp(priors()["oil"]["per_kelvin"].value * 17.3)
+    healthy = [Taught.of(recording(random, level), (COLUMNS,), DAY * 1, 40.0) for _ in range(4)]
+
+    def risen(day: int, warm: float) -> Rise:
+        return rise(Taught.of(recording(random, twice * level), (COLUMNS,), DAY * day, warm), healthy, (COLUMNS,))
+
+    assert abs(risen(1, 57.3).value) < 0.1 * level < risen(1, 40.0).value
+    assert risen(2, 57.3).chance > 0.1
+    assert risen(2, 40.0).chance < 1e-3
+
+
+def test_days_that_are_known_narrow_what_another_day_may_be() -> None:
+    random = np.random.default_rng(4)
+
+    def deviation(days: int) -> float:
+        made = [fleet(random, [*np.repeat(range(days), 2), days], 0.01, BELIEVED) for _ in range(10)]
+        return float(np.median([rise(judged, healthy, (COLUMNS,)).deviation for *healthy, judged in made]))
+
+    assert deviation(1) > 1.2 * deviation(6) > 1.2**2 * deviation(30)
 
 
 def believed_scatter(random: np.random.Generator) -> float:

@@ -255,8 +255,8 @@ def _lesson(name: str, lessons: Mapping[str, Any], place: str) -> dict[str, Any]
             lesson[key] = _array(_part(lesson, key, list, place), kind, key, place)
         else:
             lesson[key] = _part(lesson, key, float, place)
-    if "start_s" in lesson:
-        _part(lesson, "start_s", float, place)
+    for key in {"start_s", "oil_degC"} & lesson.keys():
+        _part(lesson, key, float, place)
     if name == "volume balance" and lesson["sums"].shape[1:] != (size := (len(lesson["terms"]) + 1,) * 2):
         raise InputError(f"sums must be of the shape (E, {size[0]}, {size[1]}), got {lesson['sums'].shape} ({place})")
     return lesson

@@ -16,7 +16,7 @@ from sealscope.diagnosis.inference.scatter import Rise
 from sealscope.diagnosis.inference.terms import ATMOSPHERE, equations
 from sealscope.diagnosis.inspection import Inspection
 from sealscope.diagnosis.verdict.machine import unstated
-from sealscope.recordings.formats.headings.oil_temperature import stated_oil_temperature
+from sealscope.recordings.oil import oil_temperature
 from sealscope.recordings.recording import Array, Recording
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 #: Probability with which the smallest leak is found, and of a false alarm for which it is stated.
 POWER, FALSE_ALARM = 0.9, 0.01
-#: Numbers of recordings that are tried for half of the smallest leak.
-_MORE = (3, 5, 7, 10, 15, 20, 30, 50)
+#: How many times as many recordings are tried for half of the smallest leak.
+_REPEATED = (2, 3, 5, 10)
 _BALANCE = VolumeBalance.name
 #: Columns of a terminal.
 WIDTH = 80
@@ -47,8 +47,8 @@ class TermEstimate(NamedTuple):
 class Smallest(NamedTuple):
     """The smallest leak that the next recording shows.
 
-    `lpm` [L/min], None where the machine's size is not stated, and `share` of the pump's flow; `halved_by`: healthy
-    recordings after which it is half as large, None where none of a reasonable number does.
+    `lpm` [L/min], None where the machine's size is not stated, and `share` of the pump's flow; `halved_by`: how many
+    times as many healthy recordings, of as many more days, make it half as large, None where ten times do not.
     """
 
     lpm: float | None
@@ -92,7 +92,7 @@ class Summary:
         ]
         if self.smallest is not None:
             rows.append(("smallest leak", _smallest_text(self.smallest)))
-            rows.append(("half of that", _half_text(self.smallest, len(healthy))))
+            rows.append(("half of that", _half_text(self.smallest, len(healthy), bool(dates))))
         rows += [("check", problem) for problem in self.problems]
         indent = " " * 16
         return "\n".join(
@@ -127,10 +127,8 @@ def about_recording(recording: Recording, inspection: Inspection) -> dict[str, A
     part, about = inspection.part, dict[str, Any]()
     if {"p_A", "p_B"} <= set(part.channels) and part.units["p_A"] == "Pa":
         about["pressure_bar"] = _rounded(float(np.mean(np.abs(part["p_A"] - part["p_B"]))) / 1e5)
-    if "T_oil" in recording and np.any(known := np.isfinite(recording["T_oil"])):
-        about["oil_degC"] = _rounded(float(recording["T_oil"][known].mean()) - 273.15)
-    elif (stated := stated_oil_temperature(recording.provenance)) is not None:
-        about["oil_degC"] = _rounded(stated)
+    if (oil := oil_temperature(recording)) is not None:
+        about["oil_degC"] = _rounded(oil)
     about["noise"] = {name: noise for name in part.channels if (noise := _noise(part[name])) > 0.0}
     about["wrong"] = [
         *(own.text for own in inspection.findings if own.severity != "note"),
@@ -165,7 +163,7 @@ def summarised(healthy: Sequence[Learnt], rig: Rig | None, about: About, left_ou
     if len(alike) > 1:
         rises = VolumeBalance(rig).rises(lessons, channels)
         problems += _unlike(alike, rises)
-        smallest = _smallest(rises, lessons)
+        smallest = _smallest(VolumeBalance(rig), lessons, channels)
     return Summary(terms, noise, smallest, problems)
 
 
@@ -203,24 +201,21 @@ def _unlike(healthy: Sequence[Learnt], rises: Sequence[Rise]) -> list[str]:
     ]
 
 
-def _smallest(rises: Sequence[Rise], lessons: Sequence[Mapping[str, Any]]) -> Smallest | None:
-    """Return the smallest leak that the next recording shows, of the duties of the healthy ones.
+def _smallest(balance: VolumeBalance, lessons: Sequence[Mapping[str, Any]], channels: frozenset[str]) -> Smallest:
+    """Return the smallest leak that a recording of another day shows, of the duties of the healthy ones.
 
-    A rise is found where it passes the threshold of Student's t; half is reached where the count of recordings takes
-    the threshold, the deviation of their mean, and nothing of their scatter, there.
+    A rise is found where it passes the threshold of Student's t; half is reached where the days are repeated so often
+    that the threshold and the deviation of their mean, and nothing of their scatter, take it there.
     """
     from scipy.special import ndtri
 
-    count, freedom = len(rises), rises[0].freedom  # against count - 1 others
-    between = float(np.median([own.deviation for own in rises])) / np.sqrt(1.0 + 1.0 / (count - 1))
-
-    def findable(recordings: int) -> float:
-        law = Rise(0.0, 1.0, freedom + recordings - (count - 1))
-        return float((law.threshold(FALSE_ALARM) + ndtri(POWER)) * between * np.sqrt(1.0 + 1.0 / recordings))
+    def findable(repeated: int) -> float:
+        coming = balance.next_rise(lessons, channels, repeated)
+        return float((coming.threshold(FALSE_ALARM) + ndtri(POWER)) * coming.deviation)
 
     pressure, flow = (float(np.median([own[name] for own in lessons])) for name in ("pressure", "flow"))
-    scale, own = float(np.median([lesson["scale"] for lesson in lessons])), findable(count)
-    halved = next((more for more in _MORE if more > count and findable(more) <= 0.5 * own), None)
+    scale, own = float(np.median([lesson["scale"] for lesson in lessons])), findable(1)
+    halved = next((times for times in _REPEATED if findable(times) <= 0.5 * own), None)
     share = own * pressure / flow if flow > 0.0 else float("nan")
     return Smallest(own * pressure * scale / LITRE_PER_MINUTE if scale > 0.0 else None, share, halved)
 
@@ -229,9 +224,10 @@ def _smallest_text(smallest: Smallest) -> str:
     return f"the next recording shows {smallest} ({POWER:.0%} of the time)"
 
 
-def _half_text(smallest: Smallest, count: int) -> str:
+def _half_text(smallest: Smallest, count: int, dated: bool) -> str:
     if smallest.halved_by is not None:
-        return f"{smallest.halved_by} healthy recordings instead of {count}"
+        days = ", of as many more days" if dated else ""
+        return f"{smallest.halved_by * count} healthy recordings instead of {count}{days}"
     return "twice the pressure difference at the same flow; more recordings alone do not"
 
 

@@ -35,6 +35,8 @@ from sealscope.diagnosis.verdict.evidence import (
     Passage,
     RelativeLeak,
 )
+from sealscope.recordings.joining import start_seconds
+from sealscope.recordings.oil import oil_temperature
 from sealscope.recordings.recording import Array, Recording
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -104,6 +106,12 @@ class RecordedBalance:
     def hypotheses(self) -> tuple[StepHypothesis, ...]:
         """Tests of all terms' coefficients, the most likely first."""
         return hypotheses(self.blocks, self.plain or self.blocks, self.equations, self.columns, self.lost)
+
+    @cached_property
+    def taught(self) -> Taught:
+        """What the recording says of a healthy machine."""
+        dated, oil = start_seconds(self.recording), oil_temperature(self.recording)
+        return Taught.of(self.blocks, self.columns, dated, oil)
 
     @cached_property
     def other(self) -> OtherStep | None:
@@ -206,13 +214,10 @@ def _area(balance: RecordedBalance, motion: list[int]) -> _Area:
     return _Area(value, value - half, value + half, float(shares @ stated))
 
 
-def judge(balance: RecordedBalance, probability: float, baseline: Sequence[Array] = ()) -> Evidence:
-    """Return the evidence of a balance at a false-alarm probability, against healthy recordings where there are any.
-
-    `baseline`: the sums that each of them has taught (`scatter.Taught`).
-    """
+def judge(balance: RecordedBalance, probability: float, baseline: Sequence[Taught] = ()) -> Evidence:
+    """Return the evidence of a balance at a false-alarm probability, against what healthy recordings have taught."""
     test = balance.test
-    against = rise(Taught.of(balance.blocks, balance.columns), baseline, balance.columns) if baseline else None
+    against = rise(balance.taught, baseline, balance.columns) if baseline else None
     if test is None and against is None:
         return Evidence("cannot tell", "p_A and p_B hardly differ, or too few samples are whole: no leak would show")
     questions = _questions(balance, against, probability)

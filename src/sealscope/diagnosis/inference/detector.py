@@ -19,7 +19,7 @@ from sealscope.diagnosis.inference.weak_form import STRIDE, stride_samples
 from sealscope.diagnosis.learnt import Healthy, Lesson, lessons_of
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.recordings.recording import Array, Recording, remembered
+from sealscope.recordings.recording import Recording, remembered
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -30,6 +30,7 @@ _NO_BALANCE = {
     False: "no loop brings the piston back or holds it under a pressure difference, for long enough in {:.3g} s, so "
     "that what leaks moves it: record its position x",
 }
+_AGES = 1e11  # seconds
 #: Fewest samples between neighbouring test functions.
 RESOLVED = 2
 
@@ -103,17 +104,25 @@ class VolumeBalance:
         if own is None:
             return None
         scale = own.size.scale if own.size.stated else 0.0
-        return {"terms": list(own.columns[0].names), "scale": scale, **Taught.of(own.blocks, own.columns)._asdict()}
+        known = {name: value for name, value in own.taught._asdict().items() if value is not None}
+        return {"terms": list(own.columns[0].names), "scale": scale, **known}
 
     def rises(self, lessons: Sequence[Lesson], channels: frozenset[str]) -> list[Rise]:
         """Return how far each of several healthy recordings of the same channels is above the others."""
-        balances = equations(self.rig, channels)
-        columns = [Columns(equation) for equation in balances]
-        sums = [np.asarray(lesson["sums"], dtype=float) for lesson in lessons]
-        return [
-            rise(Taught(own, lesson["flow"], lesson["pressure"]), sums[:k] + sums[k + 1 :], columns)
-            for k, (own, lesson) in enumerate(zip(sums, lessons, strict=True))
-        ]
+        columns, taught = self._columns(channels), [_taught(lesson) for lesson in lessons]
+        return [rise(own, taught[:k] + taught[k + 1 :], columns) for k, own in enumerate(taught)]
+
+    def next_rise(self, lessons: Sequence[Lesson], channels: frozenset[str], repeated: int = 1) -> Rise:
+        """Return the rise of a healthy recording like these on a later day, as after `repeated` times as many days."""
+        taught = [_taught(lesson) for lesson in lessons]
+        later = [own._replace(start_s=_later(own, k)) for k in range(repeated) for own in taught]
+        flow, pressure = (float(np.median([lesson[of] for lesson in lessons])) for of in ("flow", "pressure"))
+        middle = Taught(taught[0].sums, flow, pressure, oil_degC=taught[0].oil_degC)
+        dated = next((own for own in taught if own.start_s is not None), middle)
+        return rise(middle._replace(start_s=_later(dated, repeated)), later, self._columns(channels))
+
+    def _columns(self, channels: frozenset[str]) -> list[Columns]:
+        return [Columns(equation) for equation in equations(self.rig, channels)]
 
     def examine(self, recording: Recording, baseline: Sequence[Healthy], false_alarm_probability: float) -> Evidence:
         """Return the evidence of a step of the leakage, and of its rise against the baseline."""
@@ -122,7 +131,7 @@ class VolumeBalance:
             return Evidence("cannot tell", _NO_BALANCE["x" in recording].format(recording.duration), usable=False)
         names = list(own.columns[0].names)
         lessons = [lesson for lesson in lessons_of(self, baseline) if lesson["terms"] == names]
-        healthy = [np.asarray(lesson["sums"], dtype=float) for lesson in lessons]
+        healthy = [_taught(lesson) for lesson in lessons]
         evidence, rows = judge(own, false_alarm_probability, healthy), own.blocks.rows
         if own.equations[0].name != CYLINDER and len(own.columns) == 1:
             return evidence
@@ -133,10 +142,19 @@ class VolumeBalance:
         return replace(evidence, share=float(rows.mean() / max(rows.max(), 1.0)))
 
 
-def _of_another_machine(own: RecordedBalance, healthy: Sequence[Array], probability: float) -> str:
+def _later(taught: Taught, times: int) -> float | None:
+    """Return the date of a recording as many times later as no recordings of one machine are apart."""
+    return None if taught.start_s is None else taught.start_s + times * _AGES
+
+
+def _taught(lesson: Lesson) -> Taught:
+    sums = np.asarray(lesson["sums"], dtype=float)
+    return Taught(sums, lesson["flow"], lesson["pressure"], lesson.get("start_s"), lesson.get("oil_degC"))
+
+
+def _of_another_machine(own: RecordedBalance, healthy: Sequence[Taught], probability: float) -> str:
     """Return in words that motion takes another flow than in the healthy recordings, empty where it does not."""
-    sums = Taught.of(own.blocks, own.columns).sums[0]
-    change = motion_change(sums, [of[0] for of in healthy], own.columns[0])
+    change = motion_change(own.taught.sums[0], [of.sums[0] for of in healthy], own.columns[0])
     if abs(change.score) <= change.threshold(0.5 * probability):
         return ""
     return (
