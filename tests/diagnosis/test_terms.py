@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -197,3 +198,16 @@ def test_a_zero_that_is_far_off_leaves_a_single_rod_s_leak_as_it_is(bar: float) 
     low, high = diagnosis.leak_interval_lpm or pytest.fail("no interval")
     assert low <= 0.05 <= high
     assert ("p_A - p_B reads" in diagnosis.reason) and (("too much" in diagnosis.reason) == (bar > 0.0))
+
+
+@pytest.mark.parametrize("samples", [-2, 0, 2])
+def test_a_position_recorded_late_is_named_and_changes_no_size(samples: int) -> None:
+    experiment = Experiment.of(command="3 sin(4t)", duration=40, leak="0.05 L/min from 20 s", seed=3)
+    own = simulate_with_truth(experiment).recording
+    shifted = replace(own, channels={**own.channels, "x": np.roll(own["x"], samples)}).between(0.1, 39.9)
+    diagnosis = diagnose(shifted, rig=load_rig("thesis"), quick=True)
+    assert diagnosis.verdict == "leak" and diagnosis.leak_lpm == pytest.approx(0.05, rel=0.03)
+    named = re.search(r"x is recorded (\S+) ms (later|earlier)", diagnosis.reason)
+    assert (named is None) == (samples == 0)
+    if named is not None:
+        assert float(named[1]) == pytest.approx(4.0, rel=0.02) and named[2] == ("later" if samples > 0 else "earlier")

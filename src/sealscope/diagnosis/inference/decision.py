@@ -24,7 +24,7 @@ from sealscope.diagnosis.inference.causes import stepped as stepped_cause
 from sealscope.diagnosis.inference.onset import Course, Information, Interval, StepTest, course, step_test
 from sealscope.diagnosis.inference.other_steps.step import OtherStep, other_step
 from sealscope.diagnosis.inference.scatter import Rise, Taught, rise
-from sealscope.diagnosis.inference.terms import ORIFICE, PUMP, Equation, priors
+from sealscope.diagnosis.inference.terms import LAG, ORIFICE, PUMP, Equation, priors
 from sealscope.diagnosis.verdict.evidence import (
     LEAKS,
     NO_RIG,
@@ -122,6 +122,17 @@ class RecordedBalance:
     def zero(self) -> float:
         """Zero of p_A - p_B [Pa], as a change of the leak shows it."""
         return zero_of(self.blocks, self.columns)
+
+    @cached_property
+    def delay(self) -> tuple[float, float] | None:
+        """How much later x is recorded than the pump's flow [s], by the lag's share of the motion, and its deviation."""
+        column = self.columns[0]
+        motion = [k for k in column.motion if column.names[k].startswith("motion")]
+        if LAG not in column.names or not motion:
+            return None
+        area = _area(self, motion).measured
+        value, deviation = mean_of(self.blocks, column, {column.names.index(LAG): 1.0})
+        return (value / area, deviation / area) if area > 0.0 else None
 
     def mean(self, column: int, since: float = -np.inf) -> float:
         """Return a mean over the blocks whose middle is at `since` or later, of pressures about their zero."""
@@ -489,6 +500,8 @@ def _reason(balance: RecordedBalance, evidence: Evidence, bound: float, question
         text += f"; displacement over area is {size.ratio.value:.3g} times the assumed one: flows lie between both"
     if abs(balance.zero) > 2.0 * _95 * priors()["zero"]["pressure"].value:
         text += f"; p_A - p_B reads {abs(balance.zero) / 1e5:.2g} bar too {'much' if balance.zero > 0.0 else 'little'}"
+    if (late := balance.delay) is not None and abs(late[0]) > 1.0 / balance.recording.rate + _95 * late[1]:
+        text += f"; x is recorded {1e3 * abs(late[0]):.3g} ms {'later' if late[0] > 0.0 else 'earlier'} than the flow"
     if evidence.verdict != "leak" and evidence.cause is not None:
         text += f"; what stepped is rather {evidence.cause}"
     return text

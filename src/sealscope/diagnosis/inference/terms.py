@@ -379,7 +379,9 @@ def _made_up(side: str) -> Term:
     )
 
 
-_LAG = Term("lag", "dv", "m^2 s", lambda s: s.acceleration_step(), "sensor fault", "motion", needs=("x",))
+#: A delay between position and flow.
+LAG = "lag"
+_LAG = Term(LAG, "dv", "m^2 s", lambda s: s.acceleration_step(), "sensor fault", "motion", needs=("x",))
 _BIAS = Term(BIAS, "dt", "m^3/s", lambda s: s.dt, "sensor fault", "bias")
 _PUMP = Term(
     PUMP,
