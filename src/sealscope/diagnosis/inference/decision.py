@@ -125,7 +125,7 @@ class RecordedBalance:
 
     @cached_property
     def delay(self) -> tuple[float, float] | None:
-        """How much later x is recorded than the pump's flow [s], by the lag's share of the motion, and its deviation."""
+        """How much later x is recorded than the flow [s], by the share of its lag in the motion, with its deviation."""
         column = self.columns[0]
         motion = [k for k in column.motion if column.names[k].startswith("motion")]
         if LAG not in column.names or not motion:
