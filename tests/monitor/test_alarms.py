@@ -16,7 +16,7 @@ from scipy.special import ndtr
 
 from sealscope.errors import InputError
 from sealscope.monitor.alarms import MARKS, AlarmJudge, Thresholds
-from sealscope.monitor.memory.store import MonitorStore
+from sealscope.monitor.memory.store import MonitorStore, StoredRows
 from sealscope.monitor.outputs.lines import EventLines
 from sealscope.monitor.stream.estimates import BlockEstimate, WatchedLeak
 
@@ -142,8 +142,10 @@ def test_a_shelved_alarm_keeps_its_changes_to_itself(tmp_path: Path):
 
     def kept(kind: str) -> None:
         assert judge.alarm is not None
+        rows = StoredRows()
+        rows.add_alarm(judge.alarm, kind, judge.alarm.updated_s)
         with store.writing() as connection:
-            store.keep_event(connection, judge.alarm, kind, judge.alarm.updated_s)
+            store.keep_rows(connection, rows)
         lines.pass_on()
 
     through(judge, [0.003] * 2)

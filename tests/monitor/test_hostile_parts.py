@@ -33,7 +33,7 @@ from sealscope.monitor.sources.source_block import (
 )
 from sealscope.monitor.sources.sparkplug_host import SparkplugHost
 from sealscope.monitor.sparkplug import BIRTH_SEQUENCE, INT64, SparkplugMetric, SparkplugPayload, encoded
-from sealscope.monitor.supervisor import Outages
+from sealscope.monitor.supervisor import PartAway
 from sealscope.recordings import write
 
 from ..recordings.test_packed_files import rows, workbook
@@ -273,25 +273,23 @@ def watched(tmp_path: Path) -> Iterator[Service]:
 @pytest.mark.parametrize(
     "answer", [b"SSH-2.0-x\r\n", b"", b"\xff\x00" * 9, b"HTTP/1.1 2x4 ?\r\n\r\n", b"HTTP/1.1 200\r\n" * 500]
 )
-def test_a_webhook_that_speaks_no_http_is_an_outage_and_asked_again(watched: Service, monkeypatch, answer):
-    monkeypatch.setattr("sealscope.monitor.outputs.webhook.FIRST_PAUSE_S", 0.02)
-    server, outages = OddServer((answer, 0.0)), Outages(lambda: None)
-    hook = Webhook(watched.store, server.url, timeout=2.0, outages=outages)
-    hook.pass_on()
-    assert [outage["part"] for outage in outages.plain()] == ["webhook"]
-    time.sleep(0.05)
-    hook.pass_on()
-    assert outages.plain() == []
+def test_a_webhook_that_speaks_no_http_is_an_outage_and_asked_again(watched: Service, answer):
+    server = OddServer((answer, 0.0))
+    part = watched.supervisor.part("webhook")
+    hook = Webhook(watched.store, server.url, timeout=2.0)
+    assert not part.attempt(hook.pass_on)
+    assert [outage["part"] for outage in watched.outages.plain()] == ["webhook"]
+    assert part.attempt(hook.pass_on, at_once=True)
+    assert watched.outages.plain() == []
     assert watched.store.position("webhook") == watched.store.events_since(0)[-1][0]
     assert server.got == 2
 
 
 def test_a_webhook_that_drips_has_one_deadline(watched: Service):
-    server, outages = OddServer(DRIP), Outages(lambda: None)
-    began = time.monotonic()
-    Webhook(watched.store, server.url, timeout=0.4, outages=outages).pass_on()
+    server, began = OddServer(DRIP), time.monotonic()
+    with pytest.raises(PartAway, match=r"no answer within 0.4 s"):
+        Webhook(watched.store, server.url, timeout=0.4).pass_on()
     assert time.monotonic() - began < 2.0
-    assert [outage["reason"] for outage in outages.plain()] == ["no answer within 0.4 s"]
     assert watched.store.position("webhook") == 0
 
 

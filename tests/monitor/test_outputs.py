@@ -7,17 +7,16 @@ import json
 import logging
 import re
 import threading
-import time
 from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import pytest
 
 from sealscope.errors import InputError
 from sealscope.monitor.memory.export import ESTIMATE_COLUMNS, export_labels
-from sealscope.monitor.outputs import webhook as webhook_module
 from sealscope.monitor.outputs.grafana import dashboard
 from sealscope.monitor.outputs.prometheus import metrics_text
 from sealscope.monitor.outputs.webhook import Webhook
+from sealscope.monitor.supervisor import PartAway
 
 from ..diagnosis.balance_machine import machine, step
 from .plant import lines_of, served, settings_in
@@ -59,14 +58,12 @@ def watched(tmp_path_factory):
     return service
 
 
-def test_events_are_posted_in_order_until_they_are_taken(watched, caplog, monkeypatch):
-    monkeypatch.setattr(webhook_module, "FIRST_PAUSE_S", 0.01)
+def test_events_are_posted_in_order_until_they_are_taken(watched, caplog):
     receiver = Receiver([500, 503])
     hook = Webhook(watched.store, receiver.url, "secret token")
     with caplog.at_level(logging.DEBUG, "sealscope"):
-        for _ in range(40):
-            hook.pass_on()
-            time.sleep(0.01)
+        for _ in range(4):
+            watched.supervisor.part("webhook").attempt(hook.pass_on, at_once=True)
     posted = [(headers["Idempotency-Key"], body["event"]) for headers, body in receiver.got]
     events = watched.store.events_since(0)
     first = (str(events[0][0]), events[0][1]["event"])
@@ -84,7 +81,8 @@ def test_a_redirect_is_not_followed_and_carries_no_token(watched):
     elsewhere = Receiver()
     receiver = Receiver([307, 307], location=elsewhere.url)
     watched.store.keep_position("webhook", 0)
-    Webhook(watched.store, receiver.url, "secret").pass_on()
+    with pytest.raises(PartAway, match="status 307"):
+        Webhook(watched.store, receiver.url, "secret").pass_on()
     assert len(receiver.got) == 1
     assert elsewhere.got == []
     assert watched.store.position("webhook") == 0  # it waits

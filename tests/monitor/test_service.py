@@ -269,21 +269,10 @@ def test_other_settings_begin_a_new_baseline(tmp_path):
 
 
 def test_a_fleet_shares_its_budget_and_keeps_its_baselines(tmp_path):
-    """Another rate, as where an actuator is added to a budget, moves thresholds only; old tables are taken over."""
+    """Another rate, as where an actuator is added to a budget, moves thresholds only."""
     settings = settings_in(tmp_path)
     service, _ = served(settings, LINES)
     shown = service.actuators.plain()
-    with service.store.writing() as connection:
-        connection.exec_driver_sql("ALTER TABLE estimates DROP COLUMN oil_celsius")
-        connection.exec_driver_sql("ALTER TABLE actuators ADD COLUMN summary TEXT NOT NULL DEFAULT ''")
-        of = "SELECT summary FROM summaries WHERE summaries.actuator = actuators.actuator"
-        connection.exec_driver_sql(f"UPDATE actuators SET summary = ({of})")
-        connection.exec_driver_sql("DELETE FROM summaries")
-        for table, column in (("alarms", "alarm"), ("events", "alarm"), ("actuators", "checkpoint")):
-            words = f"""UPDATE {table} SET {column} = REPLACE({column}, '"new"', '"unacknowledged"')"""
-            connection.exec_driver_sql(words)
-        connection.exec_driver_sql("UPDATE alarms SET state = 'unacknowledged'")
-        connection.exec_driver_sql("UPDATE facts SET value = '1' WHERE name = 'schema'")
     before = service.actuators._actuators["press 1"].watch.baseline
     assert before is not None
     file = tmp_path / "monitor.toml"

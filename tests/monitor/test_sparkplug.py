@@ -38,6 +38,7 @@ from sealscope.monitor.sources.source_block import (
 )
 from sealscope.monitor.sources.sparkplug_host import GAPS, SparkplugHost
 from sealscope.monitor.sparkplug import SparkplugMetric, SparkplugPayload, decoded_payload, encoded
+from sealscope.monitor.supervisor import Supervisor
 from sealscope.recordings.recording import Recording
 
 from .plant import CHANNELS, message, rows_of, served, settings_in, until
@@ -69,7 +70,7 @@ def test_bytes_by_hand():
 def test_the_schema_is_the_published_one():
     """Every field has number, type and label of the descriptor that a third party compiled."""
     theirs = pytest.importorskip("pysparkplug._protobuf").Payload.DESCRIPTOR
-    ours = sparkplug._payload_class().DESCRIPTOR
+    ours = sparkplug.payload_class().DESCRIPTOR
     names = ("Metric", "PropertySet", "PropertyValue")
     parts = [(ours.file.message_types_by_name[name], theirs.nested_types_by_name[name]) for name in names]
     count = 0
@@ -455,8 +456,7 @@ def run_node(
     watched = service.actuators
     node = SparkplugNode(watched.store, watched.plain, watched.count, BrokerSettings(), SparkplugSettings(every_s=0.1))
     stopping = threading.Event()
-    thread = threading.Thread(target=node.run, args=(stopping,))
-    thread.start()
+    thread = Supervisor(service.outages, stopping).repeat("node", node.pass_on, 0.1, last=node.end)
     try:
         until(lambda: len(client.sent) >= first)
         act(client)

@@ -103,7 +103,7 @@ def test_a_step_is_taken_at_the_end_though_its_part_pauses():
         steps.append(1)
         raise OSError("full")
 
-    thread = supervised.repeat("output", step, 0.01, at_the_end=True)
+    thread = supervised.repeat("output", step, 0.01, last=step)
     until(lambda: steps, 5.0)
     stopping.set()
     thread.join(5.0)

@@ -14,7 +14,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection
 from sqlalchemy.exc import IntegrityError
 
 from sealscope.diagnosis.verdict.states import LEAKING, state_of
@@ -263,8 +262,7 @@ class WatchedActuators:
             try:
                 lost, estimates = self._stored(fresh)
             except _Repeated:
-                with self.store.engine.connect() as connection:
-                    known = self.store.known(connection, new)
+                known = self.store.known(new)
                 fresh = [block for block in fresh if (block.actuator, block.identity) not in known]
                 lost, estimates = self._stored(fresh)
         except BaseException:
@@ -303,7 +301,7 @@ class WatchedActuators:
             for block, actuator in mine:
                 actuator.taken += 1
                 if block.samples is not None:
-                    estimates += self._taken(connection, rows, actuator, block.samples, block.follows)
+                    estimates += self._taken(rows, actuator, block.samples, block.follows)
             self.store.keep_rows(connection, rows)
         return lost, estimates
 
@@ -312,17 +310,12 @@ class WatchedActuators:
             self._actuators[name] = self._restored(self.settings[name])
         return self._actuators[name]
 
-    def _taken(
-        self, connection: Connection, rows: StoredRows, actuator: _Actuator, samples: Recording, follows: bool
-    ) -> list[BlockEstimate]:
+    def _taken(self, rows: StoredRows, actuator: _Actuator, samples: Recording, follows: bool) -> list[BlockEstimate]:
         name = actuator.settings.name
         estimates, happened = actuator.judged(samples, follows)
         rows.add_estimates(name, estimates, actuator.oil_celsius)
         for alarm, kind, t in happened:
-            if kind:
-                self.store.keep_event(connection, alarm, kind, t)
-        for alarm in {alarm.id: alarm for alarm, _, _ in happened}.values():
-            self.store.keep_alarm(connection, alarm)
+            rows.add_alarm(alarm, kind, t)
         actuator.pending += 1
         actuator.bytes += bytes_of(samples)
         turn = (actuator.taken + zlib.crc32(name.encode())) % PENDING_BLOCKS  # not all actuators at the same instant
@@ -375,9 +368,8 @@ class WatchedActuators:
                         actuator.watch.dismiss()
                     elif mark == "repaired":
                         actuator.watch.relearn()
-                    self.store.keep_alarm(connection, alarm)
-                    self.store.keep_event(connection, alarm, mark, at, by_whom, text)
                     rows = StoredRows()
+                    rows.add_alarm(alarm, mark, at, by_whom, text)
                     self._checkpoint(actuator, rows)
                     self.store.keep_rows(connection, rows)
             except InputError:

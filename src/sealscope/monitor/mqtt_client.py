@@ -45,3 +45,15 @@ def check_running(client: Client) -> None:
     """Raise RuntimeError where the thread of a client has ended, as after a packet that paho does not understand."""
     if getattr(client, "_thread", client) is None:  # there is no public way to ask
         raise RuntimeError("the thread of the connection to the broker has ended")
+
+
+def published(
+    client: Client, topic: str, payload: bytes | str, timeout_s: float, qos: int = 0, retain: bool = False
+) -> bool:
+    """Publish a message; return whether it went out in time, to the broker's knowledge with a `qos` of 1."""
+    message = client.publish(topic, payload, qos=qos, retain=retain)
+    try:
+        message.wait_for_publish(timeout_s)
+    except (RuntimeError, ValueError):  # the connection is lost, or its queue is full
+        return False
+    return bool(message.is_published())

@@ -33,16 +33,15 @@ from sealscope.monitor.sources.source_block import (
     SourceBlock,
     bytes_of,
 )
-from sealscope.monitor.supervisor import DATABASE, WEBHOOK, Supervisor
+from sealscope.monitor.supervisor import DATABASE, OPCUA, WEBHOOK, Supervisor
 from sealscope.monitor.waiting import Waiting
 from sealscope.storage.folders import locked
 
 _log = logging.getLogger(__name__)
 #: Blocks that wait to be stored and their bytes, at most; sources wait beyond.
 _WAITING, _WAITING_BYTES = 512, 256_000_000
-#: How often lines are written [s], the longest pause after an error of the database, and how
-#: long what is under way at the end is waited for, all together.
-_LINES_S, _LONGEST_PAUSE_S, _END_S = 0.2, 5.0, 2.5
+#: How often outputs look for events [s], and how long what is under way at the end is waited for, all together.
+_LOOK_S, _END_S = 0.2, 2.5
 #: Blocks that are stored in one transaction, at most, and how long the first one waits for others [s].
 _TOGETHER, _GATHER_S = 256, 0.02
 #: What a block is counted under that raised an error.
@@ -191,7 +190,7 @@ class Service:
         if self.settings.opcua is not None:
             from sealscope.monitor.sources.opcua import opcua_of
 
-            sources.append(("OPC UA client", opcua_of(self.settings.opcua)))
+            sources.append((OPCUA, opcua_of(self.settings.opcua)))
         return sources
 
     def _started(self, name: str, source: Source) -> threading.Thread:
@@ -204,23 +203,22 @@ class Service:
 
     def _outputs(self) -> list[threading.Thread]:
         """Start what sends, and what renews the share in the actuators."""
-        supervisor = self.supervisor
-        threads = [supervisor.repeat("standard output", self._pass_on, _LINES_S, at_the_end=True)]
+        repeat = self.supervisor.repeat
+        threads = [repeat("standard output", self._pass_on, _LOOK_S, last=self._pass_on)]
         if self._share is not None:
-            supervisor.repeat("share", self.actuators.renew, self._share.lease_s / 4.0)
-        if (node := self.settings.sparkplug) is not None and (broker := self.settings.mqtt) is not None:
+            repeat("share", self.actuators.renew, self._share.lease_s / 4.0)
+        if (settings := self.settings.sparkplug) is not None and (broker := self.settings.mqtt) is not None:
             from sealscope.monitor.outputs.sparkplug_node import SparkplugNode
 
             password = secret_of(broker.password_file, "mqtt.password_file")
-            alarms = SparkplugNode(self.store, self.actuators.plain, self.count, broker, node, password)
-            threads.append(supervisor.start("Sparkplug node", partial(alarms.run, self.stopping)))
+            node = SparkplugNode(self.store, self.actuators.plain, self.count, broker, settings, password)
+            threads.append(repeat("Sparkplug node", node.pass_on, _LOOK_S, last=node.end))
         if (hook := self.settings.webhook) is not None:
             from sealscope.monitor.outputs.webhook import Webhook
 
             token = secret_of(hook.token_file, "webhook.token_file")
-            self.outages.expect(WEBHOOK)
-            webhook = Webhook(self.store, hook.url, token, hook.timeout_s, self.outages)
-            threads.append(supervisor.start("posts to the webhook", partial(webhook.run, self.stopping)))
+            webhook = Webhook(self.store, hook.url, token, hook.timeout_s)
+            threads.append(repeat(WEBHOOK, webhook.pass_on, _LOOK_S, last=webhook.pass_on))
         return threads
 
     def _store_next(self) -> None:
@@ -242,37 +240,34 @@ class Service:
         self.stopping.set()
 
     def _store(self, blocks: list[_Kept], keep: Callable[[list[_Kept]], object]) -> None:
-        """Keep blocks in one transaction, again and again while the database is locked, full or away; acknowledge them.
+        """Keep blocks in one transaction and acknowledge them; raises where the database is locked, full or away.
 
         Where something else fails they are kept one by one, and the one that fails is dropped, for it would fail
         again: the others must not wait for it.
         """
-        pause = 0.1
-        while blocks and not self.stopping.is_set():
-            try:
-                keep(blocks)
-            except Exception as error:
-                reason = away(error)
-                if reason is not None:
-                    self.count("waits for the database")
-                    self._blocked = True
-                    self.outages.lost(DATABASE, reason)
-                    self.stopping.wait(pause)
-                    pause = min(2.0 * pause, _LONGEST_PAUSE_S)
-                    continue
-                if len(blocks) > 1:
-                    for block in blocks:
-                        self._store([block], keep)
-                    return
-                self.count(_DROPPED)
-                if _worth_a_line(self.actuators.counters[_DROPPED]):
-                    _log.exception("a block is dropped: %s", str(getattr(blocks[0], "actuator", blocks[0]))[:60])
-            else:
-                self._blocked = False
-                self.outages.back(DATABASE)
-            for block in blocks:
-                self.supervisor.part("acknowledgements").attempt(block.done, at_once=True)
+        if not blocks:
             return
+        try:
+            keep(blocks)
+        except Exception as error:
+            if away(error) is not None:
+                self.count("waits for the database")
+                self._blocked = True
+                raise
+            if len(blocks) > 1:
+                for block in blocks:
+                    self._store([block], keep)
+                return
+            self.count(_DROPPED)
+            if _worth_a_line(self.actuators.counters[_DROPPED]):
+                _log.exception("a block is dropped: %s", str(getattr(blocks[0], "actuator", blocks[0]))[:60])
+        else:
+            self._blocked = False
+            self.outages.back(DATABASE)
+        stored = set(map(id, blocks))
+        self._at_hand = [block for block in self._at_hand if id(block) not in stored]
+        for block in blocks:
+            self.supervisor.part("acknowledgements").attempt(block.done, at_once=True)
 
     def _pass_on(self) -> None:
         self._lines.pass_on()

@@ -7,8 +7,7 @@ use for (data sets, templates, files, metadata) is passed over when it is read.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -31,7 +30,6 @@ _FIELD_OF_TYPE = {
     **dict.fromkeys((4, 8, 13), "long_value"),
     **{9: "float_value", 10: "double_value", 11: "boolean_value"},
     **dict.fromkeys((12, 14, 15), "string_value"),
-    **dict.fromkeys(_ARRAYS, "bytes_value"),
 }
 #: Metrics of a message, at most.
 _MOST_METRICS = 100_000
@@ -66,6 +64,19 @@ class SparkplugMetric:
     timestamp: int | None = None
     unit: str | None = None
 
+    def typed(self, datatype: int) -> SparkplugMetric:
+        """Return it with the value that its field means as one of a type; None for types that are passed over."""
+        value = self.value
+        if isinstance(value, bytes):
+            kind = _ARRAYS.get(datatype)
+            if kind is not None and len(value) % np.dtype(kind).itemsize:
+                raise ValueError(f"an array of type {datatype} must have whole values, got {len(value)} bytes")
+            value = None if kind is None else np.frombuffer(value, dtype=kind).astype(np.float64)
+        elif datatype in _SIGNED and isinstance(value, int):
+            half = 1 << (_SIGNED[datatype] - 1)
+            value = (value + half) % (2 * half) - half
+        return replace(self, value=value, datatype=datatype)
+
 
 @dataclass(frozen=True)
 class SparkplugPayload:
@@ -73,12 +84,16 @@ class SparkplugPayload:
 
     timestamp: int | None
     metrics: tuple[SparkplugMetric, ...]
-    seq: int | None
+    seq: int | None = None
+
+    def named(self, name: str) -> SparkplugMetric | None:
+        """Return the first metric of a name, None where there is none."""
+        return next((metric for metric in self.metrics if metric.name == name), None)
 
 
 @cache
-def _payload_class() -> Any:
-    """Return the class of payloads, made from the schema in a pool of its own."""
+def payload_class() -> Any:
+    """Return the class of payloads in protobuf; raises MissingExtra where that library is not installed."""
     try:
         from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
     except ImportError:
@@ -103,102 +118,58 @@ def _payload_class() -> Any:
     return message_factory.GetMessageClass(pool.FindMessageTypeByName("sparkplug.Payload"))
 
 
-def check_sparkplug() -> None:
-    """Raise MissingExtra where the library for Sparkplug B is not installed."""
-    _payload_class()
-
-
 def encoded(payload: SparkplugPayload) -> bytes:
     """Return the bytes of a payload; each metric has one of the types named above, or an array of doubles (31)."""
-    message = _payload_class()()
-    if payload.timestamp is not None:
-        message.timestamp = payload.timestamp
-    if payload.seq is not None:
-        message.seq = payload.seq
+    message = payload_class()(timestamp=payload.timestamp, seq=payload.seq)  # protobuf leaves out what is None
     for metric in payload.metrics:
-        entry = message.metrics.add()
-        if metric.name is not None:
-            entry.name = metric.name
-        if metric.alias is not None:
-            entry.alias = metric.alias
-        if metric.timestamp is not None:
-            entry.timestamp = metric.timestamp
-        entry.datatype = metric.datatype
+        fields: dict[str, Any] = {name: getattr(metric, name) for name in ("name", "alias", "timestamp", "datatype")}
+        value, kind = metric.value, metric.datatype
+        if value is None:
+            fields["is_null"] = True
+        elif kind in _ARRAYS:
+            fields["bytes_value"] = np.asarray(value, dtype=_ARRAYS[kind]).tobytes()
+        else:
+            fields[_FIELD_OF_TYPE[kind]] = value % (1 << max(32, _SIGNED[kind])) if kind in _SIGNED else value
         if metric.unit is not None:
-            entry.properties.keys.append(_UNIT)
-            entry.properties.values.add(type=STRING, string_value=metric.unit)
-        if metric.value is None:
-            entry.is_null = True
-            continue
-        value = metric.value
-        if metric.datatype in _ARRAYS:
-            value = np.asarray(value, dtype=_ARRAYS[metric.datatype]).tobytes()
-        elif metric.datatype in _SIGNED:
-            bits = 64 if metric.datatype == INT64 else 32
-            value %= 1 << bits
-        setattr(entry, _FIELD_OF_TYPE[metric.datatype], value)
+            fields["properties"] = {"keys": [_UNIT], "values": [{"type": STRING, "string_value": metric.unit}]}
+        message.metrics.add(**fields)
     return bytes(message.SerializeToString())
 
 
 def decoded_payload(data: bytes) -> SparkplugPayload:
     """Return the payload that bytes hold; raises ValueError of one line where they hold none.
 
-    A value stays as its field has it where the metric states no type: `typed` gives it its meaning.
+    A value stays as its field has it where the metric states no type: `SparkplugMetric.typed` gives it its meaning.
     """
     from google.protobuf.message import DecodeError
 
-    message = _payload_class()()
+    message = payload_class()()
     try:
         message.ParseFromString(data)
         if len(message.metrics) > _MOST_METRICS:
             raise ValueError(f"got {len(message.metrics)} metrics")
-        metrics = tuple(_metric(entry) for entry in message.metrics)
+        seq = _stated(message, "seq")
+        if seq is not None and seq > 255:
+            raise ValueError(f"seq must be 0 to 255, got {seq}")
+        return SparkplugPayload(_stated(message, "timestamp"), tuple(map(_metric, message.metrics)), seq)
     except (DecodeError, ValueError, RecursionError) as error:  # UnicodeDecodeError is a ValueError
         raise ValueError(f"it must be a payload of Sparkplug B: {' '.join(str(error).split())[:80]}") from None
-    seq = int(message.seq) if message.HasField("seq") else None
-    if seq is not None and seq > 255:
-        raise ValueError(f"seq must be 0 to 255, got {seq}")
-    return SparkplugPayload(int(message.timestamp) if message.HasField("timestamp") else None, metrics, seq)
+
+
+def _stated(message: Any, field: str) -> Any:
+    return getattr(message, field) if message.HasField(field) else None
 
 
 def _metric(entry: Any) -> SparkplugMetric:
     field = None if entry.is_null else entry.WhichOneof("value")
-    for text in (entry.name, entry.string_value):
-        if not isinstance(text, str):  # as damaged text is returned
-            raise ValueError("a text must be UTF-8")
-    metric = SparkplugMetric(
-        entry.name if entry.HasField("name") else None,
-        None if field is None else getattr(entry, field),
-        int(entry.datatype),
-        int(entry.alias) if entry.HasField("alias") else None,
-        int(entry.timestamp) if entry.HasField("timestamp") else None,
-        _unit_of(entry.properties) if entry.HasField("properties") else None,
-    )
-    return typed(metric, metric.datatype) if metric.datatype else metric
-
-
-def _unit_of(properties: Any) -> str | None:
-    for key, value in zip(properties.keys, properties.values, strict=False):
-        if key == _UNIT and isinstance(value.string_value, str) and value.HasField("string_value"):
-            return value.string_value[:40]
-    return None
-
-
-def typed(metric: SparkplugMetric, datatype: int) -> SparkplugMetric:
-    """Return a metric with the value that its field means as a value of a type; None for types that are passed over."""
-    value = metric.value
-    if isinstance(value, bytes):
-        try:
-            value = np.frombuffer(value, dtype=_ARRAYS[datatype]).astype(np.float64) if datatype in _ARRAYS else None
-        except ValueError:
-            raise ValueError(
-                f"an array must have whole values of its type {datatype}, got {len(value)} bytes"
-            ) from None
-    elif datatype in _SIGNED and isinstance(value, int):
-        bits = _SIGNED[datatype]
-        value %= 1 << bits
-        value -= (1 << bits) if value >> (bits - 1) else 0
-    return SparkplugMetric(metric.name, value, datatype, metric.alias, metric.timestamp, metric.unit)
+    value = None if field is None else getattr(entry, field)
+    if not isinstance(entry.name, str) or (field == "string_value" and not isinstance(value, str)):
+        raise ValueError("a text must be UTF-8")  # damaged text is returned as bytes
+    properties = zip(entry.properties.keys, entry.properties.values, strict=False)
+    unit = next((str(value.string_value)[:40] for key, value in properties if key == _UNIT), None)
+    alias, timestamp = _stated(entry, "alias"), _stated(entry, "timestamp")
+    metric = SparkplugMetric(_stated(entry, "name"), value, 0, alias, timestamp, unit or None)
+    return metric.typed(int(entry.datatype)) if entry.datatype else metric
 
 
 def number_of(value: Any) -> float:
@@ -213,13 +184,3 @@ def number_of(value: Any) -> float:
 def topic_of(group: str, kind: str, node: str, device: str | None = None) -> str:
     """Return the topic of a message of a kind, such as ``NBIRTH``."""
     return "/".join([NAMESPACE, group, kind, node, *([] if device is None else [device])])
-
-
-def after(seq: int) -> int:
-    """Return the sequence number after another one."""
-    return (seq + 1) % 256
-
-
-def named(metrics: Iterable[SparkplugMetric], name: str) -> SparkplugMetric | None:
-    """Return the first metric of a name, None where there is none."""
-    return next((metric for metric in metrics if metric.name == name), None)

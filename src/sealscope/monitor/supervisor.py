@@ -8,7 +8,6 @@ starts again after a pause that doubles. An error of the database is the databas
 from __future__ import annotations
 
 import logging
-import math
 import threading
 import time
 import traceback
@@ -106,7 +105,7 @@ class SupervisedPart:
 
     def __init__(self, name: str, outages: Outages, away: Away) -> None:
         self.name, self._outages, self._away = name, outages, away
-        self._pause, self._due, self._failed = 0.0, 0.0, -math.inf
+        self._pause = self._due = 0.0
         self._out = False
 
     @property
@@ -114,13 +113,16 @@ class SupervisedPart:
         """How long the part still pauses [s]."""
         return max(0.0, self._due - time.monotonic())
 
-    def attempt(self, work: Callable[[], object], *, at_once: bool = False) -> bool:
-        """Run work, unless the part pauses; return whether it ended without an error. `at_once`: without the pause."""
+    def attempt(self, work: Callable[[], object], *, at_once: bool = False, lasting: bool = False) -> bool:
+        """Run work, unless the part pauses; return whether it ended without an error.
+
+        `at_once`: without the pause; `lasting`: it counts as reached when it has run for `_SOUND_S`.
+        """
         if self.pause_s and not at_once:
             return False
-        sound = threading.Timer(_SOUND_S, self._works)
+        sound = threading.Timer(_SOUND_S, self.works)
         sound.daemon = True
-        if self._out:
+        if self._pause and lasting:
             sound.start()
         try:
             work()
@@ -131,22 +133,22 @@ class SupervisedPart:
             self._note(error)
             return False
         sound.cancel()
-        self._works()
+        self.works()
         return True
 
-    def _works(self) -> None:
+    def works(self) -> None:
+        """State that the part is reached."""
+        self._pause = 0.0
         if self._out:
             self._out = False
             self._outages.back(self.name)
 
     def _note(self, error: BaseException) -> None:
         """Set the pause after an error, and state the outage."""
-        now, reason = time.monotonic(), self._away(error)
-        if now - self._failed > 2.0 * self._pause + _SOUND_S:  # it has worked since
-            self._pause = 0.0
+        reason = self._away(error)
         longest = LONGEST_PAUSE_S if reason is None else DATABASE_PAUSE_S
         self._pause = min(max(2.0 * self._pause, FIRST_PAUSE_S), longest)
-        self._failed, self._due = now, now + self._pause
+        self._due = time.monotonic() + self._pause
         if reason is not None:
             self._outages.lost(DATABASE, reason)
             return
@@ -182,23 +184,23 @@ class Supervisor:
         part = self.part(name)
 
         def keep() -> None:
-            while not part.attempt(work) and again and not self._stopping.wait(part.pause_s):
+            while not part.attempt(work, lasting=True) and again and not self._stopping.wait(part.pause_s):
                 pass
             ended()
 
         return _started(keep, name)
 
     def repeat(
-        self, name: str, step: Callable[[], object], every_s: float, *, at_the_end: bool = False
+        self, name: str, step: Callable[[], object], every_s: float, *, last: Callable[[], object] | None = None
     ) -> threading.Thread:
-        """Start a thread that runs a step every so many seconds; `at_the_end`: once more when `stopping` is set."""
+        """Start a thread that runs a step every so many seconds, and `last` when `stopping` is set."""
         part = self.part(name)
 
         def keep() -> None:
             while not self._stopping.wait(max(every_s, part.pause_s)):
                 part.attempt(step)
-            if at_the_end:
-                part.attempt(step, at_once=True)
+            if last is not None:
+                part.attempt(last, at_once=True)
 
         return _started(keep, name)
 

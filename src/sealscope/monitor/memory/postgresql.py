@@ -11,10 +11,9 @@ from __future__ import annotations
 import time
 from collections.abc import Generator
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from sqlalchemy import URL, Engine
+from sqlalchemy import URL, Engine, event
 
 #: How long a connection may take, how long an answer, and how long the server may work at one statement [s].
 CONNECT_S, ANSWER_S, STATEMENT_S = 5, 10.0, 8.0
@@ -47,8 +46,6 @@ def engine_options(url: URL) -> dict[str, Any]:
 
 def limit_answers(engine: Engine) -> None:
     """Give each answer of PostgreSQL to an engine's connections a deadline, where the driver is psycopg 3."""
-    from sqlalchemy import event
-
     if engine.dialect.driver == "psycopg":
         event.listen(engine, "do_connect", _connected)
 

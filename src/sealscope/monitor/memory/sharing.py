@@ -11,12 +11,11 @@ import logging
 import math
 import time
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+
+from sqlalchemy import Connection, delete, func, select, text, update
+from sqlalchemy.exc import IntegrityError
 
 from sealscope.monitor.memory.store import MonitorStore
-
-if TYPE_CHECKING:
-    from sqlalchemy import Connection
 
 _log = logging.getLogger(__name__)
 #: The lease of what goes out (lines, messages, posts): one monitor sends for all.
@@ -30,8 +29,6 @@ class Share:
     """
 
     def __init__(self, store: MonitorStore, name: str, actuators: Sequence[str], lease_s: float) -> None:
-        from sqlalchemy.exc import IntegrityError
-
         self._store, self.name, self.lease_s = store, name, lease_s
         self._names = sorted({*actuators, OUTPUTS})
         self.held: frozenset[str] = frozenset()
@@ -48,13 +45,11 @@ class Share:
 
         Return what was gained and what was lost. Raises what the database raises.
         """
-        from sqlalchemy import func, select, update
-
         monitors, leases = self._store.tables.monitors, self._store.tables.leases
         with self._store.writing() as connection:
             now = self._now(connection)
             until = now + self.lease_s
-            self._store.put(connection, monitors, {"name": self.name}, {"until": until})
+            self._store.put(connection, monitors, [{"name": self.name, "until": until}])
             live = connection.execute(select(func.count()).where(monitors.c.until > now)).scalar() or 1
             rows = connection.execute(select(leases).where(leases.c.actuator.in_(self._names))).all()
             fair = math.ceil(len(self._names) / live)
@@ -81,8 +76,6 @@ class Share:
 
     def holds(self, connection: Connection, actuator: str) -> bool:
         """Whether this monitor may store a block of an actuator; nobody takes its lease before the transaction ends."""
-        from sqlalchemy import select
-
         leases = self._store.tables.leases
         query = select(leases.c.holder, leases.c.until).where(leases.c.actuator == actuator).with_for_update()
         row = connection.execute(query).first()
@@ -90,18 +83,14 @@ class Share:
 
     def give_back(self) -> None:
         """Give everything back at once, as a monitor that ends does."""
-        from sqlalchemy import delete, update
-
         monitors, leases = self._store.tables.monitors, self._store.tables.leases
         with self._store.writing() as connection:
             connection.execute(update(leases).where(leases.c.holder == self.name).values(until=0.0))
             connection.execute(delete(monitors).where(monitors.c.name == self.name))
         self.held = frozenset()
 
-    def _now(self, connection: Any) -> float:
+    def _now(self, connection: Connection) -> float:
         """Return the clock of the database [s]: those of several machines differ."""
-        from sqlalchemy import text
-
         if self._store.engine.dialect.name != "postgresql":
             return time.time()
-        return float(connection.execute(text("select extract(epoch from clock_timestamp())")).scalar())
+        return float(connection.execute(text("select extract(epoch from clock_timestamp())")).scalar_one())

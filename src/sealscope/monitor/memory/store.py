@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import sqlalchemy as sa
 from sqlalchemy import bindparam, func, select
 from sqlalchemy.exc import DataError, DBAPIError, IntegrityError, ProgrammingError, SQLAlchemyError
@@ -22,7 +23,6 @@ from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sealscope.errors import InputError
 from sealscope.monitor.alarms import Alarm
 from sealscope.monitor.memory import tables
-from sealscope.monitor.memory.packing import packed, unpacked_samples
 from sealscope.monitor.memory.postgresql import engine_options, limit_answers
 from sealscope.monitor.stream.estimates import BlockEstimate
 from sealscope.recordings.recording import Recording
@@ -35,30 +35,11 @@ KEPT_IDENTITIES = 100_000
 KEPT_REFUSED = 1000
 #: How often the tables are tried to be made where several monitors begin at once.
 _ATTEMPTS = 10
-#: Words of alarms of version 3 -> of version 4.
-_RENAMED = {'"unacknowledged"': '"new"', '"returned"': '"new"', '"normal"': '"closed"', '"false"': '"invalid"'}
-#: What makes tables of a version those of the next.
-_CHANGES = {
-    "1": ("alter table estimates add column oil_celsius double precision",),
-    "2": (
-        "insert into summaries select actuator, summary from actuators",
-        "alter table actuators drop column summary",
-    ),
-    "3": (
-        *(
-            f"update {table} set {column} = replace({column}, '{old}', '{new}')"
-            for table, column in (("alarms", "alarm"), ("events", "alarm"), ("actuators", "checkpoint"))
-            for old, new in _RENAMED.items()
-        ),
-        *(f"update alarms set state = {new} where state = {old}".replace('"', "'") for old, new in _RENAMED.items()),
-        "update events set kind = 'invalid' where kind = 'false'",
-    ),
-}
 
 
 @dataclass
 class StoredRows:
-    """Rows that blocks add to the tables beside themselves, gathered to be stored at once.
+    """Rows that a transaction adds to the tables beside the blocks themselves, gathered to be stored at once.
 
     By actuator: `checkpoints`, settings and state; `summaries`; and `old`, the numbers up to which blocks and estimates
     are deleted.
@@ -66,6 +47,8 @@ class StoredRows:
 
     estimates: list[dict[str, Any]] = field(default_factory=list)
     pending: list[dict[str, Any]] = field(default_factory=list)
+    events: list[dict[str, Any]] = field(default_factory=list)
+    alarms: dict[str, Alarm] = field(default_factory=dict)
     checkpoints: dict[str, tuple[str, dict[str, Any]]] = field(default_factory=dict)
     summaries: dict[str, dict[str, Any]] = field(default_factory=dict)
     old: dict[str, tuple[int, int]] = field(default_factory=dict)
@@ -80,7 +63,14 @@ class StoredRows:
 
     def add_pending(self, actuator: str, number: int, samples: Recording, follows: bool) -> None:
         """Add samples that a restart goes through once more after the checkpoint."""
-        self.pending.append({"actuator": actuator, "number": number, "samples": packed(samples, follows)})
+        self.pending.append({"actuator": actuator, "number": number, "samples": _packed(samples, follows)})
+
+    def add_alarm(self, alarm: Alarm, kind: str, t: float, by_whom: str = "", text: str = "") -> None:
+        """Add an alarm as it is now, and what happened to it, or what a person said of it, unless `kind` is empty."""
+        self.alarms[alarm.id] = alarm
+        if kind:
+            own = {"actuator": alarm.actuator, "alarm_id": alarm.id, "alarm": json.dumps(alarm.plain())}
+            self.events.append({"t": t, "kind": kind, "by_whom": by_whom, "text": text, **own})
 
     def add_checkpoint(self, actuator: str, settings: str, state: dict[str, Any]) -> None:
         """Add the state of an actuator, which takes the place of the samples since the last one."""
@@ -118,19 +108,13 @@ class MonitorStore:
             raise InputError(f"the monitor's database must have version {tables.SCHEMA}, got {known} ({database})")
 
     def _prepared(self) -> str | None:
-        """Make the tables and columns that are missing, and return the version of those that were there."""
+        """Make the tables where they are missing, and return the version of those that were there."""
         facts = tables.facts
         with self.engine.begin() as connection:
             tables.metadata.create_all(connection)
-            version = facts.c.name == "schema"
-            known = connection.execute(select(facts.c.value).where(version)).scalar()
+            known = connection.execute(select(facts.c.value).where(facts.c.name == "schema")).scalar()
             if known is None:
                 connection.execute(facts.insert().values(name="schema", value=str(tables.SCHEMA)))
-            while known in _CHANGES:
-                for change in _CHANGES[known]:
-                    connection.execute(sa.text(change))
-                known = str(int(known) + 1)
-                connection.execute(facts.update().where(version).values(value=known))
         return None if known is None else str(known)
 
     @contextmanager
@@ -148,22 +132,21 @@ class MonitorStore:
         with self.engine.connect() as connection:
             return int(connection.execute(query).scalar() or 0)
 
-    def known(self, connection: sa.Connection, blocks: Iterable[tuple[str, str]]) -> set[tuple[str, str]]:
+    def known(self, blocks: Iterable[tuple[str, str]]) -> set[tuple[str, str]]:
         """Return which of some blocks are stored; a block is an actuator and an identity."""
         # a query for each: SQLite goes through the whole table for a list of pairs
         table = tables.blocks
         chosen = (table.c.actuator == bindparam("of")) & (table.c.identity == bindparam("identity"))
         query = select(table.c.number).where(chosen)
-        return {
-            block
-            for block in blocks
-            if connection.execute(query, {"of": block[0], "identity": block[1]}).first() is not None
-        }
+        with self.engine.connect() as connection:
+            rows = {
+                block: connection.execute(query, {"of": block[0], "identity": block[1]}).first() for block in blocks
+            }
+        return {block for block, row in rows.items() if row is not None}
 
     def is_known(self, actuator: str, identity: str) -> bool:
-        """Return whether a block is stored, by a connection of its own."""
-        with self.engine.connect() as connection:
-            return bool(self.known(connection, [(actuator, identity)]))
+        """Return whether a block is stored."""
+        return bool(self.known([(actuator, identity)]))
 
     def keep_blocks(self, connection: sa.Connection, blocks: Iterable[tuple[str, str, int]]) -> None:
         """Store blocks: actuator, identity, and number among those of the actuator.
@@ -174,26 +157,46 @@ class MonitorStore:
         connection.execute(tables.blocks.insert(), [dict(zip(names, block, strict=True)) for block in blocks])
 
     def keep_rows(self, connection: sa.Connection, rows: StoredRows) -> None:
-        """Store the rows of blocks, each table's at once."""
+        """Store rows, each table's at once."""
         of = bindparam("of", type_=sa.String)
-        states = {
-            name: {"settings": settings, "checkpoint": json.dumps(state, allow_nan=False)}
+        states = [
+            {"actuator": name, "settings": settings, "checkpoint": json.dumps(state, allow_nan=False)}
             for name, (settings, state) in rows.checkpoints.items()
-        }
+        ]
         if states:
             before = tables.pending.delete().where(tables.pending.c.actuator == of)
-            connection.execute(before, [{"of": name} for name in states])
-        for table, values in ((tables.estimates, rows.estimates), (tables.pending, rows.pending)):
-            if values:
-                connection.execute(table.insert(), values)
-        self._put_all(connection, tables.actuators, states)
-        shown = {name: {"summary": json.dumps(summary)} for name, summary in rows.summaries.items()}
-        self._put_all(connection, tables.summaries, shown)
+            connection.execute(before, [{"of": row["actuator"]} for row in states])
+        for name in ("estimates", "pending", "events"):
+            if values := getattr(rows, name):
+                connection.execute(getattr(tables, name).insert(), values)
+        shown = [{"actuator": name, "summary": json.dumps(summary)} for name, summary in rows.summaries.items()]
+        alarms = [
+            {"id": each.id, "actuator": each.actuator, "state": each.state, "alarm": json.dumps(each.plain())}
+            for each in rows.alarms.values()
+        ]
+        for table, changed in ((tables.actuators, states), (tables.summaries, shown), (tables.alarms, alarms)):
+            self.put(connection, table, changed)
         for table, place in ((tables.blocks, 0), (tables.estimates, 1)):
             old = [{"of": name, "last": numbers[place]} for name, numbers in rows.old.items() if numbers[place] > 0]
             if old:
                 chosen = (table.c.actuator == of) & (table.c.number <= bindparam("last"))
                 connection.execute(table.delete().where(chosen), old)
+
+    def put(self, connection: sa.Connection, table: sa.Table, rows: list[dict[str, Any]]) -> None:
+        """Change rows of a table by its primary key, or insert those that are missing."""
+        if not rows:
+            return
+        key = table.primary_key.columns.keys()
+        chosen = [table.c[name] == bindparam(f"of_{name}") for name in key]
+        values = [{f"of_{name}" if name in key else name: value for name, value in row.items()} for row in rows]
+        changed = connection.execute(table.update().where(*chosen), values)
+        if changed.rowcount == len(rows):
+            return
+        if len(rows) == 1:
+            connection.execute(table.insert(), rows)
+        else:
+            for row in rows:
+                self.put(connection, table, [row])
 
     def keep_refused(self, rows: Sequence[dict[str, Any]]) -> None:
         """Store what was refused, `KEPT_REFUSED` at most with those before, in a transaction of its own."""
@@ -208,31 +211,9 @@ class MonitorStore:
         table = tables.refused
         return [dict(row._mapping) for row in self._rows(select(table).order_by(table.c.number.desc()).limit(most))]
 
-    def _put_all(self, connection: sa.Connection, table: sa.Table, values: dict[str, dict[str, Any]]) -> None:
-        """Change the rows of actuators, or insert those that are missing."""
-        if not values:
-            return
-        statement = table.update().where(table.c.actuator == bindparam("of"))
-        changed = connection.execute(statement, [{"of": name, **row} for name, row in values.items()])
-        if changed.rowcount != len(values):
-            for name, row in values.items():
-                self.put(connection, table, {"actuator": name}, row)
-
     def last_number(self, table: sa.Table, actuator: str) -> int:
         """Return the number of an actuator's last row of a table, `tables.blocks` or `tables.estimates`."""
         return self._value(select(func.max(table.c.number)).where(table.c.actuator == actuator))
-
-    def keep_alarm(self, connection: sa.Connection, alarm: Alarm) -> None:
-        """Store an alarm as it is now."""
-        values = {"actuator": alarm.actuator, "state": alarm.state, "alarm": json.dumps(alarm.plain())}
-        self.put(connection, tables.alarms, {"id": alarm.id}, values)
-
-    def keep_event(
-        self, connection: sa.Connection, alarm: Alarm, kind: str, t: float, by_whom: str = "", text: str = ""
-    ) -> None:
-        """Append what happened to an alarm, or what a person said of it."""
-        own = {"actuator": alarm.actuator, "alarm_id": alarm.id, "alarm": json.dumps(alarm.plain())}
-        connection.execute(tables.events.insert().values(t=t, kind=kind, by_whom=by_whom, text=text, **own))
 
     def checkpoint(self, actuator: str) -> tuple[str, dict[str, Any], list[tuple[Recording, bool]]] | None:
         """Return settings and state as of the checkpoint, and the samples since then; None where there is none."""
@@ -246,7 +227,7 @@ class MonitorStore:
     def _pending(connection: sa.Connection, actuator: str) -> list[tuple[Recording, bool]]:
         pending = tables.pending
         query = select(pending.c.samples).where(pending.c.actuator == actuator).order_by(pending.c.number)
-        return [unpacked_samples(data) for (data,) in connection.execute(query)]
+        return [_unpacked(data) for (data,) in connection.execute(query)]
 
     def last_samples(self, actuator: str) -> list[Recording]:
         """Return the samples of an actuator since its last checkpoint."""
@@ -310,7 +291,7 @@ class MonitorStore:
     def keep_position(self, name: str, number: int) -> None:
         """Store how far an output is."""
         with self.writing() as connection:
-            self.put(connection, tables.facts, {"name": name}, {"value": str(number)})
+            self.put(connection, tables.facts, [{"name": name, "value": str(number)}])
 
     def pass_on(self, output: str, send: Callable[[dict[str, Any]], bool]) -> None:
         """Hand events to `send` in their order until it returns False, and store how far the output is after each."""
@@ -318,13 +299,6 @@ class MonitorStore:
             if not send(event):
                 return
             self.keep_position(output, number)
-
-    @staticmethod
-    def put(connection: sa.Connection, table: sa.Table, key: dict[str, Any], values: dict[str, Any]) -> None:
-        """Change the row of a key, or insert it."""
-        statement = table.update().where(*(table.c[name] == value for name, value in key.items()))
-        if connection.execute(statement.values(**values)).rowcount == 0:
-            connection.execute(table.insert().values(**key, **values))
 
 
 def away(error: BaseException) -> str | None:
@@ -337,6 +311,21 @@ def away(error: BaseException) -> str | None:
     if not isinstance(error, DBAPIError) or isinstance(error, DataError):
         return None
     return " ".join(str(error.orig).split())[:200]
+
+
+def _packed(samples: Recording, follows: bool) -> bytes:
+    """Return samples as one line of JSON and their numbers, little endian, the clock first."""
+    units = {name: samples.units[name] for name in samples.channels}
+    head = json.dumps({"units": units, "rate": samples.rate, "follows": follows})
+    return head.encode() + b"\n" + np.array([samples.t, *samples.channels.values()], dtype="<f8").tobytes()
+
+
+def _unpacked(data: bytes) -> tuple[Recording, bool]:
+    """Return the samples that `_packed` made bytes of, and whether they follow those before."""
+    line, _, numbers = data.partition(b"\n")
+    head = json.loads(line)
+    t, *channels = np.frombuffer(numbers, dtype="<f8").reshape(1 + len(head["units"]), -1)
+    return Recording(t, dict(zip(head["units"], channels, strict=True)), head["units"], head["rate"]), head["follows"]
 
 
 def _event(row: Any) -> dict[str, Any]:

@@ -15,13 +15,14 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from sealscope.monitor import sparkplug as spb
-from sealscope.monitor.memory.store import MonitorStore, away
-from sealscope.monitor.mqtt_client import KEEP_ALIVE_S, check_mqtt, check_running, client_of
+from sealscope.monitor.memory.store import MonitorStore
+from sealscope.monitor.mqtt_client import KEEP_ALIVE_S, check_mqtt, check_running, client_of, published
 from sealscope.monitor.settings import BrokerSettings, SparkplugSettings, topic_part
 
 _log = logging.getLogger(__name__)
 _NAME, _BIRTHS = "sparkplug", "sparkplug bdSeq"
-_LOOK_S, _SENT_S = 0.2, 5.0
+#: How long a message is waited for [s].
+_SENT_S = 5.0
 _Table = dict[str, tuple[int, str | None, tuple[str, ...]]]
 #: Metric of a device -> type, unit, and where it is in the summary of an actuator.
 _STATE: _Table = {
@@ -83,7 +84,7 @@ class SparkplugNode:
         password: str | None = None,
     ) -> None:
         check_mqtt()
-        spb.check_sparkplug()
+        spb.payload_class()
         self._store, self._summaries, self._count = store, summaries, count
         self._settings, self._broker = settings, broker
         name = f"{broker.client_id}-{settings.group}-{settings.node}"
@@ -91,53 +92,55 @@ class SparkplugNode:
         self._client.on_pre_connect = self._before_connection
         self._client.on_connect = self._connected
         self._client.on_message = self._message
+        self._online = False
         self._born = self._birth_number = 0  # bdSeq of the last birth, and of this connection
         self._seq = 255
         self._due = threading.Event()
         self._shown: dict[str, dict[str, Any]] = {}
         self._next = 0.0
 
-    def run(self, stopping: threading.Event) -> None:
-        """Send what happens until `stopping` is set; a monitor that does not send for all others is not connected."""
-        online = False
+    def pass_on(self) -> None:
+        """Send what has happened; a monitor that does not send for all others is not connected."""
+        if not self._store.sends:
+            self.close()
+            return
+        if not self._online:
+            self._born = self._store.position(_BIRTHS)
+            self._client.connect_async(self._broker.host, self._broker.port, KEEP_ALIVE_S, clean_start=True)
+            self._client.loop_start()
+            self._online = True
         try:
-            while True:
-                last = stopping.wait(_LOOK_S)
-                try:
-                    if self._store.sends and not online:
-                        self._born = self._store.position(_BIRTHS)
-                        self._client.connect_async(self._broker.host, self._broker.port, KEEP_ALIVE_S, clean_start=True)
-                        self._client.loop_start()
-                        online = True
-                    elif online and not self._store.sends:
-                        self._offline()
-                        online = False
-                    if online:
-                        check_running(self._client)
-                        if self._client.is_connected():
-                            self._pass_on()
-                except Exception as error:
-                    if away(error) is None:
-                        raise
-                if last:
-                    return
-        finally:
-            if online:
-                self._offline()
-
-    def _offline(self) -> None:
-        """Say that the node ends, which the will does where it ends otherwise."""
+            check_running(self._client)
+        except RuntimeError:
+            self.close()
+            raise
         if self._client.is_connected():
-            self._client.publish(self._topic("NDEATH"), self._death(), qos=1).wait_for_publish(_SENT_S)
-        self._client.disconnect()
-        self._client.loop_stop()
+            self._send_what_is_due()
+
+    def end(self) -> None:
+        """Send what is left, and end."""
+        try:
+            self.pass_on()
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """Say that the node ends, which the will does where it ends otherwise."""
+        if self._online:
+            self._online = False
+            if self._client.is_connected():
+                self._client.publish(self._topic("NDEATH"), self._death(), qos=1).wait_for_publish(_SENT_S)
+            self._client.disconnect()
+            self._client.loop_stop()
 
     def _topic(self, kind: str, device: str | None = None) -> str:
         return spb.topic_of(self._settings.group, kind, self._settings.node, device)
 
+    def _number(self) -> spb.SparkplugMetric:
+        return spb.SparkplugMetric(spb.BIRTH_SEQUENCE, self._birth_number, spb.INT64)
+
     def _death(self) -> bytes:
-        number = spb.SparkplugMetric(spb.BIRTH_SEQUENCE, self._birth_number, spb.INT64)
-        return spb.encoded(spb.SparkplugPayload(_now(), (number,), None))
+        return spb.encoded(spb.SparkplugPayload(_now(), (self._number(),)))
 
     def _before_connection(self, client: Any, userdata: Any) -> None:
         """Set the will of the connection to come; its number is the one after that of the last birth."""
@@ -155,7 +158,7 @@ class SparkplugNode:
         if message.qos:
             client.ack(message.mid, message.qos)
         try:
-            asked = spb.named(spb.decoded_payload(message.payload).metrics, spb.REBIRTH)
+            asked = spb.decoded_payload(message.payload).named(spb.REBIRTH)
         except ValueError as error:
             self._count("Sparkplug commands that are none")
             _log.info("a command that is none: %s", error)
@@ -163,7 +166,7 @@ class SparkplugNode:
         if asked is not None and asked.value is True:
             self._due.set()
 
-    def _pass_on(self) -> None:
+    def _send_what_is_due(self) -> None:
         """Send the births that are due, the events, and what has changed."""
         if self._due.is_set():
             self._due.clear()
@@ -176,54 +179,46 @@ class SparkplugNode:
         if time.monotonic() >= self._next:
             self._next = time.monotonic() + self._settings.every_s
             for actuator, summary in self._summaries().items():
-                self._show(actuator, summary)
+                if actuator not in self._shown:
+                    self._bear_device(actuator, summary, {})
+                    continue
+                shown = self._shown[actuator]
+                changed = {name: value for name, value in _values(_STATE, summary).items() if value != shown[name]}
+                if changed and self._send("DDATA", _metrics(_STATE, changed, _clock(summary["t"])), actuator):
+                    shown.update(changed)
 
     def _sent_event(self, event: dict[str, Any]) -> bool:
         alarm, at = event["alarm"], _clock(event["t"])
         if alarm["actuator"] not in self._shown:  # it is no longer in the settings
             return True
-        return self._send("DDATA", [*_metrics(_ALARM, alarm, at), *_metrics(_EVENT, event, at)], alarm["actuator"])
-
-    def _show(self, actuator: str, summary: dict[str, Any]) -> None:
-        """Send what has changed of an actuator, or the birth of one that was not there."""
-        shown = self._shown.get(actuator)
-        if shown is None:
-            self._bear_device(actuator, summary, {})
-            return
-        changed = {name: value for name, value in _values(_STATE, summary).items() if value != shown[name]}
-        if changed and self._send("DDATA", _of_values(_STATE, changed, _clock(summary["t"])), actuator):
-            shown.update(changed)
+        metrics = _metrics(_ALARM, _values(_ALARM, alarm), at) + _metrics(_EVENT, _values(_EVENT, event), at)
+        return self._send("DDATA", metrics, alarm["actuator"])
 
     def _bear(self) -> None:
         """Send the births of the node and of all devices, with everything as it is."""
         self._store.keep_position(_BIRTHS, self._birth_number)
         self._born = self._birth_number
-        summaries, latest = self._summaries(), _latest_alarms(self._store)
+        summaries = self._summaries()
+        latest = {alarm["actuator"]: alarm for alarm in reversed(self._store.alarms())}
         self._seq, self._shown = 255, {}
-        number = spb.SparkplugMetric(spb.BIRTH_SEQUENCE, self._birth_number, spb.INT64)
-        self._send("NBIRTH", [number, spb.SparkplugMetric(spb.REBIRTH, False, spb.BOOLEAN)])
+        self._send("NBIRTH", [self._number(), spb.SparkplugMetric(spb.REBIRTH, False, spb.BOOLEAN)])
         for actuator, summary in summaries.items():
             self._bear_device(actuator, summary, latest.get(actuator, {}))
 
     def _bear_device(self, actuator: str, summary: dict[str, Any], alarm: dict[str, Any]) -> None:
-        metrics = [
-            *_metrics(_STATE, summary, _clock(summary["t"])),
-            *_metrics(_ALARM, alarm, _clock(alarm.get("updated_s"))),
-            *_metrics(_EVENT, {}, _now()),
-        ]
+        shown = _values(_STATE, summary)
+        metrics = _metrics(_STATE, shown, _clock(summary["t"]))
+        metrics += _metrics(_ALARM, _values(_ALARM, alarm), _clock(alarm.get("updated_s")))
+        metrics += _metrics(_EVENT, _values(_EVENT, {}), _now())
         self._send("DBIRTH", metrics, actuator)
-        self._shown[actuator] = _values(_STATE, summary)
+        self._shown[actuator] = shown
 
     def _send(self, kind: str, metrics: list[spb.SparkplugMetric], actuator: str | None = None) -> bool:
         """Send a message with the next sequence number; return whether it went out."""
-        self._seq = spb.after(self._seq)
+        self._seq = (self._seq + 1) % 256
         topic = self._topic(kind, None if actuator is None else topic_part(actuator))
-        sent = self._client.publish(topic, spb.encoded(spb.SparkplugPayload(_now(), tuple(metrics), self._seq)), qos=0)
-        try:
-            sent.wait_for_publish(_SENT_S)
-        except (RuntimeError, ValueError):  # the connection is lost: births come with the next one
-            return False
-        return bool(sent.is_published())
+        payload = spb.SparkplugPayload(_now(), tuple(metrics), self._seq)
+        return published(self._client, topic, spb.encoded(payload), _SENT_S)
 
 
 def _now() -> int:
@@ -241,29 +236,16 @@ def _values(table: _Table, values: Mapping[str, Any]) -> dict[str, Any]:
     for name, (_, _, path) in table.items():
         value: Any = values
         for part in path:
-            if isinstance(value, Mapping):
-                value = value.get(part)
-            elif isinstance(value, (list, tuple)):
-                value = value[int(part)]
+            if value is not None:
+                value = value.get(part) if isinstance(value, Mapping) else value[int(part)]
         known[name] = value
     return known
 
 
-def _of_values(table: _Table, values: Mapping[str, Any], at: int) -> list[spb.SparkplugMetric]:
-    return [
-        spb.SparkplugMetric(name, value, table[name][0], timestamp=at, unit=table[name][1])
-        for name, value in values.items()
-    ]
-
-
 def _metrics(table: _Table, values: Mapping[str, Any], at: int) -> list[spb.SparkplugMetric]:
-    """Return the metrics of a table, of the time `at` [ms]."""
-    return _of_values(table, _values(table, values), at)
-
-
-def _latest_alarms(store: MonitorStore) -> dict[str, dict[str, Any]]:
-    """Return of each actuator the alarm that was raised last."""
-    latest: dict[str, dict[str, Any]] = {}
-    for alarm in store.alarms():
-        latest.setdefault(alarm["actuator"], alarm)
-    return latest
+    """Return metrics of a table with their values, of the time `at` [ms]."""
+    kinds = {name: table[name] for name in values}
+    return [
+        spb.SparkplugMetric(name, values[name], kind, timestamp=at, unit=unit)
+        for name, (kind, unit, _) in kinds.items()
+    ]

@@ -24,7 +24,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from sealscope.monitor.mqtt_client import KEEP_ALIVE_S, check_mqtt, check_running, client_of
+from sealscope.monitor.mqtt_client import KEEP_ALIVE_S, check_mqtt, check_running, client_of, published
 from sealscope.monitor.settings import BrokerSettings, secret_of, topic_part
 from sealscope.monitor.sources.source_block import BlockReceiver, RefusedMessage, SourceBlock, decoded
 from sealscope.monitor.sources.sparkplug_host import SparkplugHost
@@ -196,7 +196,7 @@ class _Connection:
             topic = ""
         block: SourceBlock | RefusedMessage | None
         try:
-            if self._host is None or not self._host.owns(topic):
+            if self._host is None or not topic.startswith(f"{NAMESPACE}/"):
                 block = decoded(message.payload, self._names.get(topic), done)
             else:
                 block = self._host.taken(topic, message.payload, done)
@@ -225,13 +225,7 @@ class _Connection:
     def _published(self, actuator: str, what: str, message: str) -> bool:
         """Publish a retained message of an actuator; return whether the broker has it."""
         topic = f"{self._settings.alarms_topic}/{topic_part(actuator)}/{what}"
-        sent = self._client.publish(topic, message, qos=1, retain=True)
-        try:
-            sent.wait_for_publish(timeout=_SENT_S)
-        except (RuntimeError, ValueError) as error:  # the connection is lost, or its queue is full
-            _log.warning("alarms wait for the broker: %s", str(error).splitlines()[0])
-            return False
-        return bool(sent.is_published())
+        return published(self._client, topic, message, _SENT_S, qos=1, retain=True)
 
 
 def _why(error: BaseException | None) -> str:

@@ -8,12 +8,12 @@ nobody is connected is lost, for OPC UA subscriptions end with their session.
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
+from queue import Empty, Full, Queue
 from typing import Any
 
 import numpy as np
@@ -22,15 +22,14 @@ from sealscope.errors import MissingExtra
 from sealscope.monitor.settings import OpcUaSettings, secret_of
 from sealscope.monitor.sources.gathering import ValueGatherer
 from sealscope.monitor.sources.source_block import BlockReceiver, SourceBlock, digest_of
-from sealscope.monitor.supervisor import OPCUA
+from sealscope.monitor.supervisor import OPCUA, PartAway
 from sealscope.recordings.recording import CHANNEL_UNITS, Recording
 from sealscope.units import to_si
 
-_log = logging.getLogger(__name__)
 #: Publications in a block, and blocks that wait for the service; more are dropped and counted.
 _PUBLICATIONS, _ROOM = 4, 256
-#: Pauses between two tries to connect [s], and how often the connection is looked at [s].
-_FIRST_PAUSE_S, _LONGEST_PAUSE_S, _LOOK_S = 0.5, 30.0, 0.5
+#: How often the connection is looked at [s].
+_LOOK_S = 0.5
 _NO_ROOM = "blocks of OPC UA that found no room"
 _NO_NUMBER = "OPC UA values that are no number"
 
@@ -42,7 +41,7 @@ def opcua_of(settings: OpcUaSettings) -> Callable[[BlockReceiver], None]:
     except ImportError:
         raise MissingExtra("OPC UA needs asyncua: pip install 'sealscope[opcua]'") from None
     password = secret_of(settings.password_file, "opcua.password_file")
-    return lambda service: asyncio.run(_OpcUaSession(settings, password, service).run())
+    return lambda service: _OpcUaSession(settings, password, service).run()
 
 
 class _OpcUaSession:
@@ -50,8 +49,7 @@ class _OpcUaSession:
 
     def __init__(self, settings: OpcUaSettings, password: str | None, service: BlockReceiver) -> None:
         self._settings, self._password, self._service = settings, password, service
-        service.outages.expect(OPCUA)
-        self._pause = _FIRST_PAUSE_S
+        self._server = service.supervisor.part(OPCUA)
         self._gatherers: dict[str, ValueGatherer] = {}
         self._scales: dict[tuple[str, str], Callable[[Any], Any]] = {}
         self._actuators = [actuator for actuator in service.settings.actuator if actuator.nodes]
@@ -66,38 +64,28 @@ class _OpcUaSession:
                 scale(np.zeros(1))
                 self._scales[actuator.name, channel] = scale
         self._channels: dict[Any, tuple[str, str]] = {}
-        self._waiting: asyncio.Queue[SourceBlock] = asyncio.Queue(_ROOM)
+        self._waiting: Queue[SourceBlock] = Queue(_ROOM)
 
-    async def run(self) -> None:
+    def run(self) -> None:
         """Hand blocks over until the service stops; after a lost connection a new one is made."""
-        handing = asyncio.create_task(self._hand())
+        stopping, supervisor = self._service.stopping, self._service.supervisor
+        handing = supervisor.start("OPC UA blocks", self._hand)
+        while not stopping.wait(self._server.pause_s):
+            self._server.attempt(lambda: asyncio.run(self._connect()))
+            for gatherer in self._gatherers.values():
+                gatherer.interrupted()
+        handing.join()
+
+    async def _connect(self) -> None:
+        """Stay connected until the service ends; raises PartAway where the server is not reached any more."""
         try:
-            while not self._service.stopping.is_set():
-                if handing.done():
-                    handing.result()
-                try:
-                    await self._connected(handing)
-                except Exception as error:  # whatever the library and the server make of a lost connection
-                    reason = " ".join(str(error).split()) or type(error).__name__
-                    self._service.outages.lost(OPCUA, f"{self._settings.url}: {reason}")
-                for gatherer in self._gatherers.values():
-                    gatherer.interrupted()
-                await self._rest(self._pause)
-                self._pause = min(2.0 * self._pause, _LONGEST_PAUSE_S)
-        finally:
-            handing.cancel()
-            with suppress(asyncio.CancelledError):
-                await handing
+            await self._connected()
+        except Exception as error:  # whatever the library and the server make of a lost connection
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise PartAway(f"{self._settings.url}: {reason}") from None
 
-    async def _rest(self, seconds: float) -> None:
-        """Wait, but not beyond the service's end."""
-        for _ in range(max(1, math.ceil(seconds / _LOOK_S))):
-            if self._service.stopping.is_set():
-                return
-            await asyncio.sleep(_LOOK_S)
-
-    async def _connected(self, handing: asyncio.Task[None]) -> None:
-        """Connect, subscribe, and stay until the connection is lost (which raises), or handing or the service ends."""
+    async def _connected(self) -> None:
+        """Connect, subscribe, and stay until the connection is lost, which raises, or the service ends."""
         from asyncua import Client
 
         client = Client(self._settings.url, timeout=self._settings.timeout_s)
@@ -119,9 +107,8 @@ class _OpcUaSession:
                 for (node, channel), answer in zip(nodes.items(), answers, strict=True):
                     if not isinstance(answer, int):
                         raise ConnectionError(f"{actuator.name}: {channel} is no node, got {node.nodeid} ({answer})")
-            self._service.outages.back(OPCUA)
-            self._pause = _FIRST_PAUSE_S
-            while not (self._service.stopping.is_set() or handing.done()):
+            self._server.works()
+            while not self._service.stopping.is_set():
                 await client.check_connection()
                 await asyncio.sleep(_LOOK_S)
 
@@ -143,14 +130,14 @@ class _OpcUaSession:
         for block in self._gatherers[name].take(channel, t, self._scales[name, channel](samples).tolist()):
             try:
                 self._waiting.put_nowait(SourceBlock(name, _identity(block), block))
-            except asyncio.QueueFull:
+            except Full:
                 self._service.count(_NO_ROOM)
 
-    async def _hand(self) -> None:
+    def _hand(self) -> None:
         """Hand blocks to the service, which may wait, while the connection lives on."""
-        while True:
-            block = await self._waiting.get()
-            await asyncio.to_thread(self._service.hand, block)
+        while not self._service.stopping.is_set():
+            with suppress(Empty):
+                self._service.hand(self._waiting.get(timeout=_LOOK_S))
 
 
 def _identity(block: Recording) -> str:

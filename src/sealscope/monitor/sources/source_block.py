@@ -251,9 +251,13 @@ def _channel(values: Any, name: str, units: Mapping[str, Any]) -> np.ndarray[Any
         raise RefusedMessage(NO_SAMPLES, f"channel {name} must be a list of numbers, got a list of lists")
     if np.isinf(array).any():
         raise RefusedMessage(NO_SAMPLES, f"channel {name} must have finite numbers, got infinity")
-    unit = units.get(name)
+    return _kept(in_si(array, units.get(name), name))
+
+
+def in_si(values: Any, unit: object, channel: str) -> Any:
+    """Return values of a channel in SI, in which they are without a unit; raises RefusedMessage for a wrong one."""
     try:
-        return _kept(array if unit is None else to_si(array, _brief(unit), CHANNEL_UNITS[name], name=name))
+        return values if unit is None else to_si(values, _brief(unit), CHANNEL_UNITS[channel], name=channel)
     except InputError as error:
         raise RefusedMessage(WRONG_UNITS, error) from None
 
