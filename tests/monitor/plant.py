@@ -21,6 +21,9 @@ from sealscope.monitor.settings import MonitorSettings, read_settings
 from sealscope.recordings import write
 from sealscope.recordings.recording import Recording
 
+from ..diagnosis.balance_machine import machine, step
+
+Rows = dict[str, list[tuple[Any, ...]]]
 SETTINGS = """
 database = "{database}"
 lines = true
@@ -64,6 +67,11 @@ def lines_of(recordings: dict[str, Recording], size: int) -> bytes:
     return "\n".join(lines).encode() + b"\n"
 
 
+WORN = machine(1, G=step(0.0, 3.0e-13, at=100.0), duration=130.0, rate=50.0)
+SOUND = machine(2, duration=130.0, rate=50.0)
+LINES = lines_of({"press 1": WORN, "press 2": SOUND}, 150)
+
+
 def served(settings: MonitorSettings, lines: bytes = b"") -> tuple[Service, str]:
     """A service that has taken all lines and files, and what it wrote."""
     out = io.StringIO()
@@ -72,7 +80,7 @@ def served(settings: MonitorSettings, lines: bytes = b"") -> tuple[Service, str]
     return service, out.getvalue()
 
 
-def rows_of(database: str) -> dict[str, list[tuple[Any, ...]]]:
+def rows_of(database: str) -> Rows:
     """All rows of a monitor's database but the positions of outputs and what was refused, without events' numbers."""
     url = database if "://" in database else f"sqlite:///{database}"
     engine = create_engine(url)

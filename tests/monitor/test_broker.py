@@ -9,7 +9,6 @@ import sqlite3
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -22,10 +21,9 @@ from sealscope.monitor.service import Service
 from sealscope.monitor.settings import MonitorSettings, PageSettings, read_settings
 from sealscope.monitor.sources.source_block import WRONG_ACTUATOR
 
-from .plant import rows_of, served, settings_in, until
+from .plant import LINES, rows_of, until
 from .servers import MOSQUITTO, Broker
 from .test_hostile_service import BRIEF, FORGED, UNKNOWN
-from .test_service import LINES
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(MOSQUITTO is None, reason="mosquitto is not installed")]
 SETTINGS = """
@@ -44,13 +42,6 @@ topic = "plant/press 1"
 name = "press 2"
 topic = "plant/press 2"
 """
-
-
-@pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Broker]:
-    broker = Broker(tmp_path)
-    yield broker
-    broker.stop()
 
 
 @pytest.fixture
@@ -86,10 +77,7 @@ def send(port: int, lines: list[bytes]) -> None:
     publish.multiple(messages, hostname="127.0.0.1", port=port, protocol=MQTTProtocolVersion.MQTTv5)
 
 
-def test_what_comes_while_the_monitor_is_away_is_stored_once(broker: Broker, port: int, tmp_path: Path):
-    plain = tmp_path / "plain"
-    plain.mkdir()
-    served(settings_in(plain), LINES)
+def test_what_comes_while_the_monitor_is_away_is_stored_once(undisturbed, broker: Broker, port: int, tmp_path: Path):
     file = tmp_path / "monitor.toml"
     file.write_text(SETTINGS.format(port=port))
     settings, lines = read_settings(file), LINES.splitlines()
@@ -107,7 +95,7 @@ def test_what_comes_while_the_monitor_is_away_is_stored_once(broker: Broker, por
     second.until(len(lines))
     until(lambda: second.service.store.position("mqtt") > 0)
     second.end()
-    assert rows_of(settings.database) == rows_of(str(plain / "monitor.db"))
+    assert rows_of(settings.database) == undisturbed
     retained = subscribe.simple("sealscope/press 1/alarm", hostname="127.0.0.1", port=port)
     alarm = json.loads(retained.payload)
     assert (alarm["id"], alarm["state"]) == ("press 1-1", "new")
@@ -117,10 +105,7 @@ def test_what_comes_while_the_monitor_is_away_is_stored_once(broker: Broker, por
     assert alarm["machine_state"] == second.service.states()["press 1"]
 
 
-def test_a_broker_that_restarts_loses_nothing(broker: Broker, tmp_path: Path):
-    plain = tmp_path / "plain"
-    plain.mkdir()
-    served(settings_in(plain), LINES)
+def test_a_broker_that_restarts_loses_nothing(undisturbed, broker: Broker, tmp_path: Path):
     file = tmp_path / "monitor.toml"
     file.write_text(SETTINGS.format(port=broker.port))
     lines = LINES.splitlines()
@@ -135,7 +120,7 @@ def test_a_broker_that_restarts_loses_nothing(broker: Broker, tmp_path: Path):
         broker.start()
     running.until(len(lines))
     running.end()
-    assert rows_of(running.service.settings.database) == rows_of(str(plain / "monitor.db"))
+    assert rows_of(running.service.settings.database) == undisturbed
     assert set(running.service.actuators.counters) <= {"blocks stored already"}
     reached, number, seconds = running.service.outages.totals()["broker"]
     assert reached
@@ -168,14 +153,11 @@ def test_a_broker_that_is_away_stands_on_page_and_metrics(broker: Broker, tmp_pa
 
 
 def test_while_the_database_is_away_the_connection_stays_and_the_broker_keeps_the_rest(
-    broker: Broker, tmp_path: Path, monkeypatch
+    undisturbed, broker: Broker, tmp_path: Path, monkeypatch
 ):
     """A locked database stops the storing for longer than the broker would wait for a client that is silent."""
     monkeypatch.setattr("sealscope.monitor.sources.broker.KEEP_ALIVE_S", 2)
     monkeypatch.setattr("sealscope.monitor.service._WAITING", 8)
-    plain = tmp_path / "plain"
-    plain.mkdir()
-    served(settings_in(plain), LINES)
     file = tmp_path / "monitor.toml"
     file.write_text(SETTINGS.format(port=broker.port))
     settings, lines = read_settings(file), LINES.splitlines()
@@ -201,16 +183,13 @@ def test_while_the_database_is_away_the_connection_stays_and_the_broker_keeps_th
     running.until(len(lines))
     until(lambda: counters.counters[dropped] + counters.counters.get(refused, 0) == 2000)
     running.end()
-    assert rows_of(settings.database) == rows_of(str(plain / "monitor.db"))
+    assert rows_of(settings.database) == undisturbed
 
 
-def test_a_broker_that_sends_more_than_agreed_is_asked_again(broker: Broker, tmp_path: Path, monkeypatch):
+def test_a_broker_that_sends_more_than_agreed_is_asked_again(undisturbed, broker: Broker, tmp_path: Path, monkeypatch):
     """The room is less than what the broker is asked for at a time."""
     monkeypatch.setattr("sealscope.monitor.sources.broker._ASSURED_ROOM", 20)
     monkeypatch.setattr("sealscope.monitor.service._WAITING", 1)
-    plain = tmp_path / "plain"
-    plain.mkdir()
-    served(settings_in(plain), LINES)
     file = tmp_path / "monitor.toml"
     file.write_text(SETTINGS.format(port=broker.port))
     settings, lines = read_settings(file), LINES.splitlines()
@@ -224,16 +203,13 @@ def test_a_broker_that_sends_more_than_agreed_is_asked_again(broker: Broker, tmp
     lock.close()
     running.until(len(lines))
     running.end()
-    assert rows_of(settings.database) == rows_of(str(plain / "monitor.db"))
+    assert rows_of(settings.database) == undisturbed
     assert running.service.actuators.counters["messages of QoS 1 that found no room and were asked for again"] > 20
     assert running.service.outages.totals()["broker"][:2] == (True, 0)
 
 
-def test_forged_messages_over_the_broker_are_counted(broker: Broker, tmp_path: Path):
+def test_forged_messages_over_the_broker_are_counted(undisturbed, broker: Broker, tmp_path: Path):
     """What names another actuator than its topic is refused; one that is too large does not come through."""
-    plain = tmp_path / "plain"
-    plain.mkdir()
-    served(settings_in(plain), LINES)
     file = tmp_path / "monitor.toml"
     file.write_text(SETTINGS.format(port=broker.port))
     settings, lines = read_settings(file), LINES.splitlines()
@@ -261,7 +237,7 @@ def test_forged_messages_over_the_broker_are_counted(broker: Broker, tmp_path: P
     running.end()
     assert running.service.actuators.counters == dict(sent)
     assert running.service.outages.totals()["broker"][:2] == (True, 0)
-    assert rows_of(settings.database) == rows_of(str(plain / "monitor.db"))
+    assert rows_of(settings.database) == undisturbed
 
 
 def topic_of(message: bytes) -> str:

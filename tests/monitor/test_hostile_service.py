@@ -36,8 +36,7 @@ from sealscope.monitor.sources.source_block import (
     WRONG_UNITS,
 )
 
-from .plant import message, rows_of, served, settings_in
-from .test_service import LINES, SOUND
+from .plant import LINES, SOUND, message, rows_of, served, settings_in
 
 UNKNOWN = "blocks of an actuator that is not in the settings"
 REPEATED = "blocks stored already"

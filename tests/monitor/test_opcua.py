@@ -14,14 +14,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sealscope.errors import InputError
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import read_settings
 from sealscope.monitor.sources.gathering import LATE, ValueGatherer
 
-from .plant import CHANNELS, rows_of, served, settings_in, until
+from .plant import CHANNELS, WORN, rows_of, until
 from .servers import free_port
-from .test_service import LINES, WORN
 
 
 def test_values_that_change_are_gathered_and_others_stay():
@@ -70,19 +68,6 @@ def test_values_in_portions_make_the_same_blocks():
     for other in made:
         for name, values in signal.items():
             np.testing.assert_array_equal(other[name], values[:500])
-
-
-def test_settings_of_opc_ua_are_checked(tmp_path: Path):
-    nodes = '[[actuator]]\nname = "press 3"\nnodes = {{ {} = "i=1" }}\n{}\n'
-    server = '[opcua]\nurl = "opc.tcp://localhost:4840"\n'
-    with pytest.raises(InputError, match=r"needs the table \[opcua\] and its rate, got 'press 3'"):
-        settings_in(tmp_path, nodes.format("x", "rate = 50.0"))
-    with pytest.raises(InputError, match=r"needs the table \[opcua\] and its rate"):
-        settings_in(tmp_path, nodes.format("x", "") + server)
-    with pytest.raises(InputError, match="nodes must be of x, theta"):
-        settings_in(tmp_path, nodes.format("valve", "rate = 50.0") + server)
-    with pytest.raises(InputError, match="url: String should match"):
-        settings_in(tmp_path, '[opcua]\nurl = "opc.tcp://user:secret@localhost"\n')
 
 
 class OpcUaServer:
@@ -154,11 +139,8 @@ def pieces() -> Iterator[tuple[float, dict[str, np.ndarray]]]:
 
 
 @pytest.mark.slow
-def test_a_server_that_restarts_is_said_and_its_samples_become_estimates(tmp_path: Path, caplog):
+def test_a_server_that_restarts_is_said_and_its_samples_become_estimates(undisturbed, tmp_path: Path, caplog):
     pytest.importorskip("asyncua")
-    plain = tmp_path / "plain"
-    plain.mkdir()
-    served(settings_in(plain), LINES)
     port = free_port()
     server = OpcUaServer(port)
     nodes = ", ".join(f'{name} = "ns={server.space};s=press 1.{name}"' for name in CHANNELS)
@@ -193,7 +175,7 @@ def test_a_server_that_restarts_is_said_and_its_samples_become_estimates(tmp_pat
         service.stop()
         thread.join()
     assert "the OPC UA server is reached again after" in caplog.text
-    ours, theirs = rows_of(service.settings.database), rows_of(str(plain / "monitor.db"))
+    ours, theirs = rows_of(service.settings.database), dict(undisturbed)
     theirs["estimates"] = [row for row in theirs["estimates"] if row[0] == "press 1"]
     # what is sent beyond the recording's end may complete one block more
     assert 0 <= len(ours["estimates"]) - len(theirs["estimates"]) <= 1

@@ -23,8 +23,7 @@ from sealscope.monitor.service import Service
 from sealscope.monitor.settings import MonitorSettings, PageSettings
 from sealscope.recordings.recording import Recording
 
-from .plant import lines_of, until
-from .test_service import SOUND, WORN
+from .plant import SOUND, WORN, lines_of, until
 
 HOSTILE = '<img src=x onerror="document.title=1">\\ \n&amp;'
 #: A browser that draws two frames a second, as where many look at many pages.

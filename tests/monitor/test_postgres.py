@@ -27,9 +27,8 @@ from sealscope.monitor.page.site import site
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import PageSettings
 
-from .plant import kill_often, lines_of, rows_of, served, settings_in, until
+from .plant import LINES, SOUND, WORN, kill_often, lines_of, rows_of, served, settings_in, until
 from .servers import NO_POSTGRESQL, PostgreSQL
-from .test_service import LINES, SOUND, WORN
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(NO_POSTGRESQL is not None, reason=NO_POSTGRESQL or "")]
 
@@ -49,17 +48,14 @@ def url(server: PostgreSQL) -> str:
     return server.url
 
 
-def test_kills_change_no_row_in_postgresql(url: str, tmp_path: Path):
-    plain = tmp_path / "plain"
-    plain.mkdir()
-    served(settings_in(plain), LINES)
+def test_kills_change_no_row_in_postgresql(undisturbed, url: str, tmp_path: Path):
     settings = settings_in(tmp_path, database=url)
     lines = tmp_path / "lines.jsonl"
     lines.write_bytes(LINES)
     assert kill_often(settings, lines, 6, seed=9) == 6
-    assert rows_of(url) == rows_of(str(plain / "monitor.db"))
+    assert rows_of(url) == undisturbed
     served(settings, LINES)
-    assert rows_of(url) == rows_of(str(plain / "monitor.db"))
+    assert rows_of(url) == undisturbed
 
 
 SHARED = '\n[share]\nname = "{name}"\nlease_s = 2.0\n'
@@ -143,13 +139,10 @@ def test_three_monitors_share_the_actuators_and_take_over_those_of_a_killed_one(
     engine.dispose()
 
 
-def test_while_postgresql_is_away_the_page_says_so_and_nothing_is_lost(server: PostgreSQL, tmp_path: Path):
+def test_while_postgresql_is_away_the_page_says_so_and_nothing_is_lost(undisturbed, server: PostgreSQL, tmp_path: Path):
     engine = create_engine(server.url)
     metadata.drop_all(engine)
     engine.dispose()
-    plain = tmp_path / "plain"
-    plain.mkdir()
-    served(settings_in(plain), LINES)
     settings = settings_in(tmp_path, "[page]\nport = 0\n", database=server.url)
     reading, writing = os.pipe()
     with os.fdopen(reading, "rb") as stream, os.fdopen(writing, "wb", buffering=0) as wire:
@@ -200,21 +193,20 @@ def test_while_postgresql_is_away_the_page_says_so_and_nothing_is_lost(server: P
             service.stop()
             wire.close()
             thread.join()
-    ours, theirs = rows_of(server.url), rows_of(str(plain / "monitor.db"))
+    ours, theirs = rows_of(server.url), undisturbed
     for table in theirs:
         assert ours[table] == theirs[table], table
 
 
-def test_a_postgresql_that_hangs_is_said_and_costs_nothing(server: PostgreSQL, tmp_path: Path, monkeypatch, caplog):
+def test_a_postgresql_that_hangs_is_said_and_costs_nothing(
+    undisturbed, server: PostgreSQL, tmp_path: Path, monkeypatch, caplog
+):
     """Its processes are stopped: connections are accepted, packets confirmed, and nothing is answered."""
     monkeypatch.setattr("sealscope.monitor.memory.postgresql.ANSWER_S", 1.0)
     monkeypatch.setattr("sealscope.monitor.memory.postgresql.CONNECT_S", 2)
     engine = create_engine(server.url)
     metadata.drop_all(engine)
     engine.dispose()
-    plain = tmp_path / "plain"
-    plain.mkdir()
-    served(settings_in(plain), LINES)
     settings = settings_in(tmp_path, database=server.url)
     reading, writing = os.pipe()
     with os.fdopen(reading, "rb") as stream, os.fdopen(writing, "wb", buffering=0) as wire:
@@ -250,7 +242,7 @@ def test_a_postgresql_that_hangs_is_said_and_costs_nothing(server: PostgreSQL, t
             before.close()
     assert service.outages.totals()["database"][0]
     assert "the database is not reached: " in caplog.text
-    ours, theirs = rows_of(server.url), rows_of(str(plain / "monitor.db"))
+    ours, theirs = rows_of(server.url), undisturbed
     for table in theirs:
         assert ours[table] == theirs[table], table
 

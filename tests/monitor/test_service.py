@@ -23,23 +23,11 @@ from sealscope.monitor.sources.source_block import digest_of
 from sealscope.monitor.stream.watch import STATE_VERSION
 from sealscope.simulation.simulate import simulate
 
-from ..diagnosis.balance_machine import machine, step
-from .plant import kill_often, lines_of, message, rows_of, served, settings_in, until, write_files
-
-WORN = machine(1, G=step(0.0, 3.0e-13, at=100.0), duration=130.0, rate=50.0)
-SOUND = machine(2, duration=130.0, rate=50.0)
-LINES = lines_of({"press 1": WORN, "press 2": SOUND}, 150)
+from .plant import LINES, WORN, kill_often, lines_of, rows_of, served, settings_in, until, write_files
 
 
-@pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, list[tuple[Any, ...]]], str]:
-    folder = tmp_path_factory.mktemp("undisturbed")
-    _, out = served(settings_in(folder), LINES)
-    return rows_of(str(folder / "monitor.db")), out
-
-
-def test_a_leak_becomes_one_alarm_with_litres_per_minute(undisturbed):
-    rows, out = undisturbed
+def test_a_leak_becomes_one_alarm_with_litres_per_minute(undisturbed_run):
+    rows, out = undisturbed_run
     events = [json.loads(line) for line in out.splitlines()]
     assert [event["event"] for event in events] == ["raised"]
     alarm = events[0]["alarm"]
@@ -54,15 +42,15 @@ def test_a_leak_becomes_one_alarm_with_litres_per_minute(undisturbed):
     assert len(rows["estimates"]) == 2 * 44
 
 
-def test_what_is_replayed_is_known(undisturbed, tmp_path):
+def test_what_is_replayed_is_known(undisturbed, undisturbed_run, tmp_path):
     settings = settings_in(tmp_path)
     served(settings, LINES[: len(LINES) // 2])  # the cut goes through a line, which holds no block
     service, out = served(settings, LINES)
-    assert rows_of(settings.database) == undisturbed[0]
+    assert rows_of(settings.database) == undisturbed
     assert service.actuators.counters["blocks stored already"] > 20
     _, again = served(settings, LINES)
-    assert rows_of(settings.database) == undisturbed[0]
-    assert (out, again) == (undisturbed[1], "")
+    assert rows_of(settings.database) == undisturbed
+    assert (out, again) == (undisturbed_run[1], "")
 
 
 def test_kills_at_random_instants_change_no_row(undisturbed, tmp_path):
@@ -70,7 +58,7 @@ def test_kills_at_random_instants_change_no_row(undisturbed, tmp_path):
     lines = tmp_path / "lines.jsonl"
     lines.write_bytes(LINES)
     assert kill_often(settings, lines, 2, seed=1) == 2
-    assert rows_of(settings.database) == undisturbed[0]
+    assert rows_of(settings.database) == undisturbed
 
 
 def test_an_actuator_without_a_position_is_stored_alike_whatever_the_restarts(tmp_path):
@@ -98,7 +86,7 @@ def test_many_kills_change_no_row(undisturbed, tmp_path, seed):
     lines = tmp_path / "lines.jsonl"
     lines.write_bytes(LINES)
     assert kill_often(settings, lines, 5, seed=seed) == 5
-    assert rows_of(settings.database) == undisturbed[0]
+    assert rows_of(settings.database) == undisturbed
 
 
 @pytest.mark.slow
@@ -116,7 +104,7 @@ def test_errors_of_the_database_change_no_row(undisturbed, tmp_path, monkeypatch
     monkeypatch.setattr(MonitorStore, "keep_rows", failing)
     monkeypatch.setattr("sealscope.monitor.service._TOGETHER", together)
     service, _ = served(settings, LINES)
-    assert rows_of(settings.database) == undisturbed[0]
+    assert rows_of(settings.database) == undisturbed
     assert service.actuators.counters["waits for the database"] > 5 / together
 
 
@@ -170,37 +158,6 @@ def test_a_file_that_is_being_written_is_waited_for(tmp_path):
     assert len(block.samples) == len(WORN)
     assert list(folder.blocks()) == []
     assert settings.settle_s == 0.4
-
-
-def test_lines_without_a_block_are_counted(tmp_path, caplog):
-    good = json.dumps(message("press 1", SOUND.samples(slice(0, 10))))
-    bad = [
-        b"{",
-        b"[1, 2]",
-        b'{"actuator": "press 1", "t": NaN, "rate": 500, "x": [1]}',
-        b'{"actuator": "press 1", "t": 0, "rate": -1, "x": [1]}',
-        b'{"actuator": "press 1", "t": 0, "rate": 500, "x": ["a"]}',
-        b'{"actuator": "press 1", "t": 0, "rate": 500, "x": [1], "p_A": [1, 2]}',
-        b'{"actuator": "press 1", "t": 0, "rate": 500, "x": [1], "units": {"x": "bar"}}',
-        b'{"t": 0, "rate": 500, "x": [1]}',
-        b'{"actuator": "press 1", "t": 0, "rate": 500, "x": [1], "valve": 3}',
-        b"\xff\xfe",
-        b'{"actuator": "press 1", "t": 0, "rate": 500, "x": [1], "id": "a\\u0000"}',
-        b'{"actuator": "press 1", "t": 0, "rate": 500, "x": [1], "id": "\\ud800"}',
-    ]
-    other = good.replace("press 1", "<script>alert(1)</script>").encode()
-    service, _ = served(settings_in(tmp_path), b"\n".join([*bad, other, b"", good.encode()]))
-    assert service.actuators.counters == {
-        "messages that are no JSON or CBOR": 5,
-        "messages that are no mapping of known names": 1,
-        "messages without a clock, a rate or a sound identity": 2,
-        "messages whose channels are no lists of numbers of one length": 2,
-        "messages with units of another dimension": 1,
-        "messages without an actuator, or with another one than their topic": 1,
-        "blocks of an actuator that is not in the settings": 1,
-    }
-    assert len(rows_of(service.settings.database)["blocks"]) == 1
-    assert 4 <= len(caplog.records) < len(bad)
 
 
 def test_the_oil_s_temperature_stands_beside_the_estimates(tmp_path):
@@ -349,6 +306,39 @@ def test_wrong_settings_are_one_clear_line(tmp_path: Path, change: tuple[str, st
         read_settings(file)
     assert "\n" not in str(raised.value)
     assert str(file) in str(raised.value)
+
+
+DEVICE = '[[actuator]]\nname = "{}"\nsparkplug = "{}"\n'
+NODES = '[[actuator]]\nname = "press 3"\nnodes = {{ {} = "i=1" }}\n{}\n'
+SERVER = '[opcua]\nurl = "opc.tcp://localhost:4840"\n'
+
+
+@pytest.mark.parametrize(
+    ("more", "place"),
+    [
+        ("[sparkplug]\n", r"\[mqtt\]"),
+        (DEVICE.format("a", "g/n") + DEVICE.format("b", "g/n") + "[mqtt]\n", "'g/n' twice"),
+        (DEVICE.format("a", "Sealscope/monitor/x") + "[mqtt]\n[sparkplug]\n", "actuators' nodes"),
+        (DEVICE.format("a/1", "g/n") + DEVICE.format("a#1", "g/m") + "[mqtt]\n[sparkplug]\n", "names that differ"),
+        *((DEVICE.format("a", path) + "[mqtt]\n", "sparkplug: ") for path in ("g", "g/+/d", "g//d", "g/n/d/e")),
+        (NODES.format("x", "rate = 50.0"), r"\[opcua\].* 'press 3'"),
+        (NODES.format("x", "") + SERVER, r"\[opcua\] and its rate"),
+        (NODES.format("valve", "rate = 50.0") + SERVER, "nodes must be of x, theta"),
+        ('[opcua]\nurl = "opc.tcp://user:secret@localhost"\n', "url: "),
+        *(
+            (f'[webhook]\nurl = "{url}"\n', "webhook.url")
+            for url in ("ftp://host/x", "http://user:password@host/", "file:///etc/passwd", "host")
+        ),
+    ],
+)
+def test_settings_that_do_not_fit_together_are_refused(tmp_path: Path, more: str, place: str):
+    with pytest.raises(InputError, match=place):
+        settings_in(tmp_path, more)
+
+
+def test_monitors_that_share_are_no_primary_host(tmp_path: Path):
+    with pytest.raises(InputError, match=r"mqtt\.host_id"):
+        settings_in(tmp_path, '[mqtt]\nhost_id = "a"\n[share]\nname = "a"\n', "postgresql://nowhere/monitor")
 
 
 def test_settings_that_nobody_edited_complain_once(tmp_path, caplog):

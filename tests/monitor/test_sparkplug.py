@@ -6,9 +6,7 @@ The decoders are the packages pysparkplug and mqtt-spb-wrapper (`pip install --n
 from __future__ import annotations
 
 import io
-import json
 import struct
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -17,11 +15,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sealscope.errors import InputError
 from sealscope.monitor import sparkplug
-from sealscope.monitor.outputs.sparkplug_node import SparkplugNode
 from sealscope.monitor.service import Service
-from sealscope.monitor.settings import ActuatorSettings, BrokerSettings, SparkplugSettings
+from sealscope.monitor.settings import ActuatorSettings
 from sealscope.monitor.sources import sparkplug_host
 from sealscope.monitor.sources.source_block import (
     NO_CLOCK,
@@ -38,11 +34,9 @@ from sealscope.monitor.sources.source_block import (
 )
 from sealscope.monitor.sources.sparkplug_host import GAPS, SparkplugHost
 from sealscope.monitor.sparkplug import SparkplugMetric, SparkplugPayload, decoded_payload, encoded
-from sealscope.monitor.supervisor import Supervisor
 from sealscope.recordings.recording import Recording
 
-from .plant import CHANNELS, message, rows_of, served, settings_in, until
-from .test_service import LINES, SOUND, WORN
+from .plant import CHANNELS, SOUND, WORN, message, rows_of, settings_in
 
 DOUBLES = 31
 UNITS = {"p_A": "Pa", "p_B": "Pa", "x": "m", "theta": "rad"}
@@ -215,12 +209,9 @@ def as_source(samples: dict[str, Recording], size: int) -> Callable[[BlockReceiv
     return hand
 
 
-def test_samples_by_sparkplug_are_samples(tmp_path):
+def test_samples_by_sparkplug_are_samples(undisturbed, tmp_path):
     """The same estimates and the same alarm as from JSON lines; times in whole milliseconds do no harm."""
-    for name in ("lines", "sparkplug"):
-        (tmp_path / name).mkdir()
-    served(settings_in(tmp_path / "lines"), LINES)
-    settings = settings_in(tmp_path / "sparkplug")
+    settings = settings_in(tmp_path)
     actuators = [
         actuator.model_copy(update={"sparkplug": f"plant/edge/{actuator.name}", "rate": 50.0})
         for actuator in settings.actuator
@@ -230,7 +221,7 @@ def test_samples_by_sparkplug_are_samples(tmp_path):
     service = Service(settings, once=True, stdin=io.BytesIO(), stdout=io.StringIO(), sources=[source])
     service.run()
     assert service.actuators.counters == {}
-    ours, theirs = rows_of(settings.database), rows_of(str(tmp_path / "lines" / "monitor.db"))
+    ours, theirs = rows_of(settings.database), undisturbed
     assert len(ours["blocks"]) == len(theirs["blocks"])
     for mine, other in zip(ours["estimates"], theirs["estimates"], strict=True):  # of 9 digits in the lines
         assert (mine[0], mine[1], mine[3]) == (other[0], other[1], other[3])
@@ -403,140 +394,3 @@ def test_mutated_payloads_are_blocks_or_refused(count):
     assert outcomes[UNREADABLE] > count // 20
     assert outcomes["block"] > count // 200
     assert sum(len(node.births) for node in plant.host._nodes.values()) <= 1
-
-
-class FakeClient:
-    """A client that is connected and keeps what is published."""
-
-    def __init__(self) -> None:
-        self.sent: list[tuple[str, SparkplugPayload]] = []
-        self.will: tuple[str, SparkplugPayload] | None = None
-        self.subscribed: list[str] = []
-
-    def publish(self, topic: str, payload: bytes, qos: int = 0, retain: bool = False) -> Any:
-        assert not retain
-        self.sent.append((topic, decoded_payload(payload)))
-
-        class Sent:
-            wait_for_publish = staticmethod(lambda timeout=None: None)
-            is_published = staticmethod(lambda: True)
-
-        return Sent
-
-    def will_set(self, topic: str, payload: bytes, qos: int, retain: bool) -> None:
-        assert (qos, retain) == (1, False)
-        self.will = topic, decoded_payload(payload)
-
-    def subscribe(self, topic: str, qos: int) -> None:
-        self.subscribed.append(topic)
-
-    def connect_async(self, *_: Any, clean_start: bool) -> None:
-        assert clean_start
-        self.on_pre_connect(self, None)  # type: ignore[attr-defined]
-        self.on_connect(self, None, None, type("Success", (), {"is_failure": False}), None)  # type: ignore[attr-defined]
-
-    def is_connected(self) -> bool:
-        return True
-
-    def loop_start(self) -> None: ...
-
-    loop_stop = disconnect = loop_start
-
-
-def values(payload: SparkplugPayload) -> dict[str, Any]:
-    return {str(metric.name): metric.value for metric in payload.metrics}
-
-
-def run_node(
-    service: Service, monkeypatch: pytest.MonkeyPatch, first: int, act: Callable[[FakeClient], None] = lambda _: None
-) -> FakeClient:
-    """Run a node over a client that keeps what is sent; `act` does something after the first messages."""
-    client = FakeClient()
-    monkeypatch.setattr("sealscope.monitor.outputs.sparkplug_node.client_of", lambda *_: client)
-    watched = service.actuators
-    node = SparkplugNode(watched.store, watched.plain, watched.count, BrokerSettings(), SparkplugSettings(every_s=0.1))
-    stopping = threading.Event()
-    thread = Supervisor(service.outages, stopping).repeat("node", node.pass_on, 0.1, last=node.end)
-    try:
-        until(lambda: len(client.sent) >= first)
-        act(client)
-    finally:
-        stopping.set()
-        thread.join()
-    return client
-
-
-def test_a_node_is_born_tells_and_dies(tmp_path, monkeypatch):
-    service, _ = served(settings_in(tmp_path), LINES)
-
-    def act(client: FakeClient) -> None:
-        service.actuators.mark("press 1", "acknowledged", by_whom="Ada")
-
-        def told() -> bool:
-            sent = [values(payload) for _, payload in client.sent]
-            return {"Status Word": 1} in sent and any(each.get("Alarm/Event") == "acknowledged" for each in sent)
-
-        until(told)
-        asked = encoded(SparkplugPayload(1, (SparkplugMetric("Node Control/Rebirth", True, sparkplug.BOOLEAN),), None))
-        for payload in (b"\xff\xff", asked):
-            client.on_message(client, None, type("Message", (), {"payload": payload, "qos": 0, "mid": 0}))  # type: ignore[attr-defined]
-        until(lambda: sum("DBIRTH" in topic for topic, _ in client.sent) == 4)
-
-    client = run_node(service, monkeypatch, 4, act)
-    base = "spBv1.0/Sealscope"
-    devices = [f"{base}/DBIRTH/monitor/press 1", f"{base}/DBIRTH/monitor/press 2"]
-    topics = [topic for topic, _ in client.sent]
-    first = [f"{base}/NBIRTH/monitor", *devices]
-    assert topics[:3] == first
-    assert client.subscribed == [f"{base}/NCMD/monitor/#"]
-    assert client.will is not None
-    assert client.will[0] == topics[-1] == f"{base}/NDEATH/monitor"
-    node, press, other = (values(payload) for _, payload in client.sent[:3])
-    assert node == {"bdSeq": 1, "Node Control/Rebirth": False}
-    assert values(client.will[1]) == values(client.sent[-1][1]) == {"bdSeq": 1}
-    assert (press["Alarm/State"], press["Alarm/Diagnostic Number"], press["Status Word"]) == ("new", 4101, 5)
-    assert press["Leak"] == pytest.approx(0.00195, rel=0.1)
-    assert press["Leak Low"] < press["Leak"] < press["Leak High"]
-    assert (other["Alarm/State"], other["Status Word"], other["Blocks"]) == (None, 0, 44)
-    assert (press["State"], press["State/Health"], press["State/Cause"]) == (
-        *("maintenance required", 4),
-        press["Alarm/Cause"],
-    )
-    assert (other["State"], other["State/Severity"]) == ("good", 0)
-    assert all(metric.datatype for _, payload in client.sent for metric in payload.metrics)
-    again = len(topics) - 1 - topics[::-1].index(first[0])
-    assert topics[again : again + 3] == first  # the rebirth, with the number of the connection
-    assert values(client.sent[again][1])["bdSeq"] == 1
-    assert values(client.sent[again + 1][1])["Alarm/State"] == "acknowledged"
-    between = [values(payload) for topic, payload in client.sent[3:again] if topic == f"{base}/DDATA/monitor/press 1"]
-    events = [(told["Alarm/Event Number"], told["Alarm/Event"]) for told in between if "Alarm/Event" in told]
-    assert [event for _, event in events] == ["raised", "acknowledged"]
-    assert {"Status Word": 1} in between  # only what has changed
-    for start, stop in ((0, again), (again, len(topics) - 1)):
-        numbers = [payload.seq for _, payload in client.sent[start:stop]]
-        assert numbers == [k % 256 for k in range(len(numbers))]
-    assert client.sent[-1][1].seq is None
-    assert service.actuators.counters["Sparkplug commands that are none"] == 1
-    second = run_node(service, monkeypatch, 3)
-    assert values(second.sent[0][1])["bdSeq"] == 2  # another connection, also after a restart
-    assert not [topic for topic, payload in second.sent if "Alarm/Event" in values(payload) and "DDATA" in topic]
-
-
-def test_settings_of_sparkplug_are_checked(tmp_path):
-    broker = "\n[mqtt]\n"
-    with pytest.raises(InputError, match=r"are no primary host of Sparkplug: leave mqtt.host_id out"):
-        settings_in(tmp_path, f'{broker}host_id = "a"\n[share]\nname = "a"\n', "postgresql://nowhere/monitor")
-    with pytest.raises(InputError, match=r"Sparkplug B, needs the table \[mqtt\]"):
-        settings_in(tmp_path, "[sparkplug]\n")
-    device = '[[actuator]]\nname = "{}"\nsparkplug = "{}"\n'
-    with pytest.raises(InputError, match="of its own, got 'g/n' twice"):
-        settings_in(tmp_path, device.format("a", "g/n") + device.format("b", "g/n") + broker)
-    with pytest.raises(InputError, match="must be none of the actuators' nodes"):
-        settings_in(tmp_path, device.format("a", "Sealscope/monitor/x") + broker + "[sparkplug]\n")
-    with pytest.raises(InputError, match="names that differ"):
-        settings_in(tmp_path, device.format("a/1", "g/n") + device.format("a#1", "g/m") + broker + "[sparkplug]\n")
-    for path in ("g", "g/+/d", "g//d", "g/n/d/e"):
-        with pytest.raises(InputError, match="sparkplug: String should match"):
-            settings_in(tmp_path, device.format("a", path) + broker)
-    settings = settings_in(tmp_path, device.format("a", "g/n/d") + broker + "[sparkplug]\n")
-    assert json.loads(settings.model_dump_json())["sparkplug"]["node"] == "monitor"

@@ -21,10 +21,9 @@ from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import read_settings
 
-from .plant import CHANNELS, rows_of, served, settings_in, until
+from .plant import CHANNELS, SOUND, WORN, rows_of, until
 from .servers import MOSQUITTO, NO_POSTGRESQL, Broker, PostgreSQL
-from .test_broker import Running, broker  # noqa: F401 (a fixture)
-from .test_service import LINES, SOUND, WORN
+from .test_broker import Running
 
 spb = pytest.importorskip("pysparkplug")
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(MOSQUITTO is None, reason="mosquitto is not installed")]
@@ -147,25 +146,17 @@ class EdgeNode:
             self._wire.publish(f"spBv1.0/plant/DDATA/edge/{device}", payload)
 
 
-@pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[tuple[Any, ...]]]:
-    """The rows of a monitor that has taken the same samples as lines."""
-    folder = tmp_path_factory.mktemp("plain")
-    served(settings_in(folder), LINES)
-    return rows_of(str(folder / "monitor.db"))
-
-
 @pytest.fixture
-def settings_file(broker: Broker, tmp_path: Path) -> Path:  # noqa: F811
+def settings_file(broker: Broker, tmp_path: Path) -> Path:
     file = tmp_path / "monitor.toml"
     file.write_text(SETTINGS.format(port=broker.port))
     return file
 
 
 def test_samples_and_alarms_over_sparkplug(
-    broker: Broker,  # noqa: F811
+    broker: Broker,
     settings_file: Path,
-    undisturbed: dict[str, list[tuple[Any, ...]]],
+    undisturbed,
 ):
     wire = Wire(broker.port)
     node = EdgeNode(wire)
@@ -190,9 +181,18 @@ def test_samples_and_alarms_over_sparkplug(
         rebirth = spb.Metric(timestamp=1, name="Node Control/Rebirth", datatype=spb.DataType.BOOLEAN, value=True)
         wire.publish("spBv1.0/Sealscope/NCMD/monitor", spb.NCmd(timestamp=1, metrics=(rebirth,)))
         births = wire.until("Sealscope/NBIRTH/monitor", 2)
+        wire.until("Sealscope/DBIRTH/monitor", 4)
+        wire._client.publish("spBv1.0/Sealscope/NCMD/monitor", b"\xff\xff")
+        until(lambda: running.service.actuators.counters)
     finally:
         running.end()
-    assert running.service.actuators.counters == {}
+    assert running.service.actuators.counters == {"Sparkplug commands that are none": 1}
+    born = values(wire.of("Sealscope/DBIRTH/monitor/press 1")[-1])
+    assert (born["State"], born["State/Health"], born["Alarm/State"]) == ("maintenance required", 4, "acknowledged")
+    assert (born["Alarm/Diagnostic Number"], born["Status Word"]) == (4101, 1)
+    assert born["Leak Low"] < born["Leak"] < born["Leak High"]
+    other = values(wire.of("Sealscope/DBIRTH/monitor/press 2")[-1])
+    assert (other["State"], other["Alarm/State"], other["Status Word"]) == ("good", None, 0)
     ours, theirs = rows_of(settings.database), undisturbed
     assert [row[:2] + row[3:4] for row in ours["estimates"]] == [row[:2] + row[3:4] for row in theirs["estimates"]]
     assert [values(birth) for birth in births] == 2 * [{"bdSeq": 1, "Node Control/Rebirth": False}]
@@ -227,9 +227,9 @@ def told_in_parts(node: EdgeNode, start: int, stop: int) -> None:
 
 @pytest.mark.skipif(NO_POSTGRESQL is not None, reason=NO_POSTGRESQL or "")
 def test_monitors_that_share_actuators_hear_sparkplug_and_go_on_for_each_other(
-    broker: Broker,  # noqa: F811
+    broker: Broker,
     tmp_path: Path,
-    undisturbed: dict[str, list[tuple[Any, ...]]],
+    undisturbed,
 ):
     """Of two monitors one ends halfway: no block is missing, none is stored twice, and one node states the alarm."""
     folder = tempfile.mkdtemp(prefix="sealscope-pg-")
@@ -268,7 +268,7 @@ def test_monitors_that_share_actuators_hear_sparkplug_and_go_on_for_each_other(
 
 
 def test_a_monitor_that_is_killed_dies_by_its_will_and_is_born_with_the_next_number(
-    broker: Broker,  # noqa: F811
+    broker: Broker,
     settings_file: Path,
 ):
     wire = Wire(broker.port)
@@ -290,7 +290,7 @@ def test_a_monitor_that_is_killed_dies_by_its_will_and_is_born_with_the_next_num
     wire.close()
 
 
-def test_a_broker_that_restarts_sees_a_new_birth(broker: Broker, settings_file: Path):  # noqa: F811
+def test_a_broker_that_restarts_sees_a_new_birth(broker: Broker, settings_file: Path):
     running = Running(read_settings(settings_file))
     try:
         first = Wire(broker.port)

@@ -20,8 +20,7 @@ from sealscope.monitor.sources.source_block import BlockReceiver, decoded
 from sealscope.monitor.supervisor import DATABASE, LimitedLines, Outages, PartAway, Supervisor
 from sealscope.units import to_si
 
-from .plant import rows_of, served, settings_in, until
-from .test_service import LINES
+from .plant import LINES, rows_of, served, settings_in, until
 
 FEW = b"\n".join(LINES.splitlines()[:40]) + b"\n"
 

@@ -10,7 +10,7 @@ import time
 import zlib
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -109,14 +109,6 @@ class _Actuator:
         }
 
 
-@dataclass
-class _Blocks:
-    """Blocks of another monitor's actuator, each with the clock at which it came; and when the last one came [s]."""
-
-    elsewhere: deque[tuple[float, SourceBlock]] = field(default_factory=deque)
-    heard: float = field(default_factory=time.monotonic)
-
-
 class _Repeated(Exception):  # noqa: N818 (says what happened)
     """One of the blocks is stored already."""
 
@@ -133,7 +125,9 @@ class WatchedActuators:
     ) -> None:
         self.store, self._share = store, share
         self.settings = {each.name: each for each in settings}
-        self._blocks = {name: _Blocks() for name in self.settings}
+        #: When the last block of each came [s], and those of others' actuators with the clock at which they came.
+        self._heard = dict.fromkeys(self.settings, time.monotonic())
+        self._elsewhere = {name: deque[tuple[float, SourceBlock]]() for name in self.settings}
         self._keep_s = keep_days * 86_400.0
         self._counters = Counter[str]()
         self._counting = threading.Lock()
@@ -215,7 +209,7 @@ class WatchedActuators:
 
     def _taken_over(self, name: str) -> None:
         """Take the blocks that came while another monitor watched an actuator; those it stored are passed over."""
-        waiting = self._blocks[name].elsewhere
+        waiting = self._elsewhere[name]
         for _ in range(len(waiting)):
             self._take([waiting[0][1]])
             waiting.popleft()
@@ -224,7 +218,7 @@ class WatchedActuators:
         """Keep a block of another monitor's actuator for as long as its takeover may last."""
         assert self._share is not None
         self.count("blocks of another monitor's actuator")
-        waiting, now = self._blocks[block.actuator].elsewhere, time.monotonic()
+        waiting, now = self._elsewhere[block.actuator], time.monotonic()
         waiting.append((now, replace(block, done=nothing)))
         while waiting and waiting[0][0] < now - _KEPT_LEASES * self._share.lease_s:
             waiting.popleft()
@@ -238,7 +232,7 @@ class WatchedActuators:
             known, held = [block for block in blocks if block.actuator in self.settings], self.held
             mine = [block for block in known if block.actuator in held]
             for name in {block.actuator for block in known}:
-                self._blocks[name].heard = time.monotonic()
+                self._heard[name] = time.monotonic()
             if self._share is not None:
                 for name in {block.actuator for block in mine}:
                     self._taken_over(name)
@@ -289,10 +283,8 @@ class WatchedActuators:
                 names = sorted({block.actuator for block in blocks})
                 lost = {name for name in names if not share.holds(connection, name)}
             mine = [(block, self._actuator(block.actuator)) for block in blocks if block.actuator not in lost]
-            taken, numbered = Counter[str](), []
-            for block, actuator in mine:
-                taken[block.actuator] += 1
-                numbered.append((block.actuator, block.identity, actuator.taken + taken[block.actuator]))
+            numbers = {actuator.settings.name: itertools.count(actuator.taken + 1) for _, actuator in mine}
+            numbered = [(block.actuator, block.identity, next(numbers[block.actuator])) for block, _ in mine]
             if numbered:
                 try:
                     self.store.keep_blocks(connection, numbered)
@@ -359,22 +351,19 @@ class WatchedActuators:
                 raise InputError(f"the settings must have the actuator {name[:60]!r}, got none")
             if name not in self.held:
                 raise InputError(f"{name} is watched by another monitor; mark its alarm on that one's page")
-            actuator = self._actuator(name)
+            actuator, rows = self._actuator(name), StoredRows()
             at = actuator.last.t if actuator.last is not None else 0.0
+            alarm = actuator.judge.marked(mark, at, until=at + hours * 3600.0, reason=text)
             try:
+                if mark == "invalid":
+                    actuator.watch.dismiss()
+                elif mark == "repaired":
+                    actuator.watch.relearn()
+                rows.add_alarm(alarm, mark, at, by_whom, text)
+                self._checkpoint(actuator, rows)
                 with self.store.writing() as connection:
-                    alarm = actuator.judge.marked(mark, at, until=at + hours * 3600.0, reason=text)
-                    if mark == "invalid":
-                        actuator.watch.dismiss()
-                    elif mark == "repaired":
-                        actuator.watch.relearn()
-                    rows = StoredRows()
-                    rows.add_alarm(alarm, mark, at, by_whom, text)
-                    self._checkpoint(actuator, rows)
                     self.store.keep_rows(connection, rows)
-            except InputError:
-                raise
-            except BaseException:
+            except BaseException:  # the next one begins at the last transaction
                 self._actuators.pop(name, None)
                 raise
         self._tell()
@@ -400,7 +389,7 @@ class WatchedActuators:
         for name, settings in self.settings.items():
             if name in known:
                 summary, own = known[name], known[name].get("state")
-                silent = now - self._blocks[name].heard > settings.no_data_s
+                silent = now - self._heard[name] > settings.no_data_s
                 if own is None or (silent and own["condition"] not in LEAKING):
                     own = state_of("no data", since_s=summary["t"]).as_dict()
                 shown[name] = {**summary, "state": own}

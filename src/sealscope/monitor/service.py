@@ -119,15 +119,13 @@ class Service:
                 _log.warning("%s", block)
             elif _worth_a_line(self._refused):
                 _log.warning("%s (message %d without a block)", block, self._refused)
-            size = len(block.beginning)
         else:
             self.supervisor.part("picture of samples").attempt(partial(self._live.take, block.actuator, block.samples))
-            size = bytes_of(block.samples)
-        if self._queue.put(block, size):
+        if self._queue.put(block, _bytes(block)):
             return
         self._waits += 1
         began, said = time.monotonic(), False
-        while not self.stopping.is_set() and not self._queue.put(block, size, 0.5):
+        while not self.stopping.is_set() and not self._queue.put(block, _bytes(block), 0.5):
             if not said and time.monotonic() - began > _LONG_WAIT_S:
                 said = True
                 blocks, waiting, _ = self.waits()
@@ -143,7 +141,9 @@ class Service:
 
     def waits(self) -> tuple[int, int, int]:
         """Return how many blocks are not stored yet, their bytes, and how often a source had to wait for them."""
-        return *self._queue.unsettled(), self._waits
+        at_hand = [*self._at_hand]
+        blocks, size = self._queue.waiting()
+        return blocks + len(at_hand), size + sum(map(_bytes, at_hand)), self._waits
 
     def run(self) -> None:
         """Take blocks until the sources have ended and there is no page, or `stop` is called.
@@ -233,7 +233,6 @@ class Service:
         self._store(refused, lambda rows: self.store.keep_refused([row.row() for row in rows]))
         self._left -= self._at_hand.count(None)
         self._at_hand = []
-        self._queue.settle()
 
     def stop(self) -> None:
         """End `run` after the block at hand."""
@@ -273,6 +272,10 @@ class Service:
         self._lines.pass_on()
         if not self._blocked:  # what can be read may still refuse to be written
             self.outages.back(DATABASE)
+
+
+def _bytes(block: SourceBlock | RefusedMessage | None) -> int:
+    return bytes_of(block.samples) if isinstance(block, SourceBlock) else 0 if block is None else len(block.beginning)
 
 
 def _worth_a_line(number: int) -> bool:

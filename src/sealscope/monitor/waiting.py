@@ -19,26 +19,12 @@ class Waiting(Generic[_Item]):
         self._most, self._most_bytes = most, most_bytes
         self._items: deque[tuple[_Item, int]] = deque()
         self._bytes = 0
-        self._at_hand = self._at_hand_bytes = 0
         self._changed = threading.Condition()
 
-    def __len__(self) -> int:
-        return len(self._items)
-
-    @property
-    def bytes(self) -> int:
-        """Bytes of what waits."""
-        return self._bytes
-
-    def unsettled(self) -> tuple[int, int]:
-        """Return the number of things that wait or were taken since the last `settle`, and their bytes."""
+    def waiting(self) -> tuple[int, int]:
+        """Return the number of things that wait, and their bytes."""
         with self._changed:
-            return len(self._items) + self._at_hand, self._bytes + self._at_hand_bytes
-
-    def settle(self) -> None:
-        """State that all that was taken is dealt with."""
-        with self._changed:
-            self._at_hand = self._at_hand_bytes = 0
+            return len(self._items), self._bytes
 
     def _room(self, size: int) -> bool:
         return not self._items or (len(self._items) < self._most and self._bytes + size <= self._most_bytes)
@@ -61,9 +47,6 @@ class Waiting(Generic[_Item]):
         with self._changed:
             self._changed.wait_for(lambda: bool(self._items), timeout)
             taken = [self._items.popleft() for _ in range(min(most, len(self._items)))]
-            size = sum(size for _, size in taken)
-            self._bytes -= size
-            self._at_hand += len(taken)
-            self._at_hand_bytes += size
+            self._bytes -= sum(size for _, size in taken)
             self._changed.notify_all()
             return [item for item, _ in taken]

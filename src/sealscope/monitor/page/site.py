@@ -79,23 +79,19 @@ _ROUTES = {
     "/api/changes": ("changes", "GET"),
     "/metrics": ("metrics", "GET"),
 }
+#: Returns how many blocks wait to be stored, their bytes, and how often a source had to wait for them.
 Waits = Callable[[], tuple[int, int, int]]
-
-
-def _nothing_waits() -> tuple[int, int, int]:
-    return 0, 0, 0
 
 
 def site(
     actuators: WatchedActuators,
     settings: PageSettings,
     token: str | None,
-    waits: Waits = _nothing_waits,
+    waits: Waits = lambda: (0, 0, 0),
     live: LiveSamples | None = None,
 ) -> Starlette:
     """Return the application of a monitor; with a token, nothing but the form for it is open without.
 
-    `waits`: returns how many blocks wait to be stored, their bytes, and how often a source had to wait for them;
     `live`: the samples that the service takes, those that are stored alone where there is none.
     """
     pages = _Pages(actuators, token, waits, live or LiveSamples(actuators.store.last_samples))
@@ -190,7 +186,7 @@ class _Pages:
                 silent += _LOOK_S
 
     def metrics(self, request: Request) -> Response:
-        return Response(self._measured(self._actuators.plain()), headers={"Content-Type": CONTENT_TYPE})
+        return Response(self._measured(self._actuators.plain()), media_type=CONTENT_TYPE)
 
     def _measured(self, summaries: Mapping[str, Mapping[str, Any]]) -> str:
         own = self._actuators
@@ -208,9 +204,8 @@ class _Pages:
         return JSONResponse({"error": text, **self._known()}, 503, _LATER)
 
     async def login(self, request: Request) -> Response:
-        status = 200
-        if request.method == "POST" and (admission := self._admission) is not None:
-            address = _address(request)
+        status, admission, address = 200, self._admission, _address(request)
+        if request.method == "POST" and admission is not None:
             if wait := admission.pause_s(address):
                 return _later(wait)
             try:
@@ -218,9 +213,9 @@ class _Pages:
             except (InputError, TimeoutError):
                 given = ""
             if admission.admits(address, given):
-                answer, secure = RedirectResponse("/", 303), request.url.scheme == "https"
-                kept = {"max_age": 30 * 86_400, "httponly": True, "samesite": "strict"}
-                answer.set_cookie(_COOKIE, admission.session, secure=secure, **kept)  # type: ignore[arg-type]
+                answer = RedirectResponse("/", 303)
+                secure, longest = request.url.scheme == "https", 30 * 86_400
+                answer.set_cookie(_COOKIE, admission.session, longest, secure=secure, httponly=True, samesite="strict")
                 return answer
             status = 401
         return Response(_packaged("login.html"), status, media_type="text/html")
@@ -304,7 +299,7 @@ class PageServer:
         actuators: WatchedActuators,
         settings: PageSettings,
         supervisor: Supervisor,
-        waits: Waits = _nothing_waits,
+        waits: Waits = lambda: (0, 0, 0),
         live: LiveSamples | None = None,
     ) -> None:
         token = secret_of(settings.token_file, "page.token_file")

@@ -160,7 +160,8 @@ class _Connection:
             if not self._arrived.put(arrived, size):
                 self._service.count(_NO_ROOM)
             return
-        full = len(self._arrived) >= _ASSURED_ROOM or self._arrived.bytes + size > _ASSURED_BYTES
+        messages, held = self._arrived.waiting()
+        full = messages >= _ASSURED_ROOM or held + size > _ASSURED_BYTES
         if full and self._refusing != self._connection:
             self._refusing, self._to_close = self._connection, self._client.socket()
         if self._refusing == self._connection:
