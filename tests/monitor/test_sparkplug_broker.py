@@ -182,11 +182,9 @@ def test_samples_and_alarms_over_sparkplug(
         wire.publish("spBv1.0/Sealscope/NCMD/monitor", spb.NCmd(timestamp=1, metrics=(rebirth,)))
         births = wire.until("Sealscope/NBIRTH/monitor", 2)
         wire.until("Sealscope/DBIRTH/monitor", 4)
-        wire._client.publish("spBv1.0/Sealscope/NCMD/monitor", b"\xff\xff")
-        until(lambda: running.service.actuators.counters)
     finally:
         running.end()
-    assert running.service.actuators.counters == {"Sparkplug commands that are none": 1}
+    assert running.service.actuators.counters == {}
     born = values(wire.of("Sealscope/DBIRTH/monitor/press 1")[-1])
     assert (born["State"], born["State/Health"], born["Alarm/State"]) == ("maintenance required", 4, "acknowledged")
     assert (born["Alarm/Diagnostic Number"], born["Status Word"]) == (4101, 1)

@@ -16,6 +16,7 @@ from sealscope.monitor.stream.joining import CHANNELS
 from sealscope.storage.toml_file import read_toml
 
 _Text = Annotated[str, Field(min_length=1, max_length=100)]
+_Level = Annotated[str, Field(pattern=r"^[^/+#\x00]+$", max_length=100)]  # of a topic
 _Words = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
@@ -114,7 +115,7 @@ class BrokerSettings(_Part):
     tls: bool = False
     ca_file: _File | None = None
     alarms_topic: str | None = "sealscope"
-    host_id: Annotated[str, Field(pattern=r"^[^/+#\x00]+$", max_length=100)] | None = None
+    host_id: _Level | None = None
 
 
 class OpcUaSettings(_Part):
@@ -131,8 +132,8 @@ class OpcUaSettings(_Part):
 class SparkplugSettings(_Part):
     """The edge node of Sparkplug B as which the alarms go out."""
 
-    group: Annotated[str, Field(pattern=r"^[^/+#\x00]+$", max_length=100)] = "Sealscope"
-    node: Annotated[str, Field(pattern=r"^[^/+#\x00]+$", max_length=100)] = "monitor"
+    group: _Level = "Sealscope"
+    node: _Level = "monitor"
     every_s: float = Field(default=10.0, ge=0.1, le=86_400)
 
 

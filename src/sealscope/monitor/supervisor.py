@@ -113,26 +113,17 @@ class SupervisedPart:
         """How long the part still pauses [s]."""
         return max(0.0, self._due - time.monotonic())
 
-    def attempt(self, work: Callable[[], object], *, at_once: bool = False, lasting: bool = False) -> bool:
-        """Run work, unless the part pauses; return whether it ended without an error.
-
-        `at_once`: without the pause; `lasting`: it counts as reached when it has run for `_SOUND_S`.
-        """
+    def attempt(self, work: Callable[[], object], *, at_once: bool = False) -> bool:
+        """Run work, unless the part pauses; return whether it ended without an error. `at_once`: without the pause."""
         if self.pause_s and not at_once:
             return False
-        sound = threading.Timer(_SOUND_S, self.works)
-        sound.daemon = True
-        if self._pause and lasting:
-            sound.start()
         try:
             work()
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # a panic of an extension in Rust and an exit of uvicorn are no Exception
-            sound.cancel()
             self._note(error)
             return False
-        sound.cancel()
         self.works()
         return True
 
@@ -183,8 +174,17 @@ class Supervisor:
         """
         part = self.part(name)
 
+        def lasting() -> None:
+            sound = threading.Timer(_SOUND_S, part.works)
+            sound.daemon = True
+            sound.start()
+            try:
+                work()
+            finally:
+                sound.cancel()
+
         def keep() -> None:
-            while not part.attempt(work, lasting=True) and again and not self._stopping.wait(part.pause_s):
+            while not part.attempt(lasting) and again and not self._stopping.wait(part.pause_s):
                 pass
             ended()
 

@@ -47,11 +47,7 @@ def engine_options(url: URL) -> dict[str, Any]:
 def limit_answers(engine: Engine) -> None:
     """Give each answer of PostgreSQL to an engine's connections a deadline, where the driver is psycopg 3."""
     if engine.dialect.driver == "psycopg":
-        event.listen(engine, "do_connect", _connected)
-
-
-def _connected(dialect: Any, record: Any, arguments: Any, options: Any) -> Any:
-    return _connection_class().connect(*arguments, **options)
+        event.listen(engine, "do_connect", lambda *of: _connection_class().connect(*of[2], **of[3]))
 
 
 @cache

@@ -101,19 +101,15 @@ class WatchedFolder:
                 continue
             try:
                 if path.is_symlink() and not path.resolve().is_relative_to(root):
-                    self._leave(path)
+                    if path.name not in self._led_out:  # said once: what is there is nobody's recording
+                        _log.warning("%s: %s is a link out of the folder", self.actuator, _shown(path.name))
+                    self._led_out.add(path.name)
                     continue
                 status = path.stat()
             except (OSError, RuntimeError):  # gone meanwhile, or links in a circle
                 continue
             if S_ISREG(status.st_mode):
                 yield status.st_mtime, path, f"{_shown(path.name[:60])} {status.st_size} {status.st_mtime_ns}"
-
-    def _leave(self, path: Path) -> None:
-        """Say once of a link that it leads out of the folder: what is there is nobody's recording."""
-        if path.name not in self._led_out:
-            self._led_out.add(path.name)
-            _log.warning("%s: %s is a link out of the folder, and is not read", self.actuator, _shown(path.name))
 
 
 def folders_of(service: BlockReceiver, *, once: bool) -> None:
@@ -153,11 +149,8 @@ def _on_the_clock(recording: Recording, written: float) -> Recording:
     """
     last = recording.t[np.isfinite(recording.t)]
     shift = written - float(last[-1]) if last.size else 0.0
-    channels, units, celsius = (
-        dict(recording.channels),
-        dict(recording.units),
-        stated_oil_temperature(recording.provenance),
-    )
+    channels, units = dict(recording.channels), dict(recording.units)
+    celsius = stated_oil_temperature(recording.provenance)
     if "T_oil" not in channels and celsius is not None:
         channels["T_oil"], units["T_oil"] = np.full(len(recording), celsius + 273.15), "K"
     return Recording(recording.t + shift, channels, units, recording.rate)
