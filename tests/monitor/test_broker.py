@@ -59,7 +59,7 @@ class Running:
 
     def __init__(self, settings: MonitorSettings) -> None:
         self.service = Service(settings, stdin=io.BytesIO(), stdout=io.StringIO())
-        self.thread = threading.Thread(target=self.service.run)
+        self.thread = threading.Thread(target=self.service.run, daemon=True)
         self.thread.start()
 
     def until(self, blocks: int) -> None:
