@@ -17,7 +17,7 @@ from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.inference.pressures.detector import PressureResponse
 from sealscope.diagnosis.inference.pressures.evidence import priors
 from sealscope.diagnosis.inspection import inspected
-from sealscope.diagnosis.rms_change.blocks import JUDGED, QUANTITIES, whole_log_rms
+from sealscope.diagnosis.rms_change.blocks import JUDGED, QUANTITIES, whole
 from sealscope.diagnosis.trend.wear import DayToDay, Level
 from sealscope.diagnosis.verdict.machine import AssumedMachine, assumed_rig
 from sealscope.errors import InputError
@@ -102,7 +102,7 @@ def _stated(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[str, Any
     if lacks is None and (reading := response.reading(part)) is not None:
         area = machine.area if reading.stated else None
         return {"basis": BASES[1], "level": Level(*reading.level), "states_flow": reading.stated, "area": area}
-    log_rms = whole_log_rms(part).reshape(-1, len(QUANTITIES))
+    log_rms = whole(part)[0].reshape(-1, len(QUANTITIES))
     ringing = float(-np.mean(log_rms[:, [QUANTITIES.index(name) for name in JUDGED]]))
     if np.isfinite(ringing):
         return {"basis": BASES[2], "level": Level(ringing, beliefs("trend")["own"]["ringing"])}

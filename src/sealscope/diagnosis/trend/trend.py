@@ -24,10 +24,10 @@ from sealscope.diagnosis.trend.reading import (
     timeline,
 )
 from sealscope.diagnosis.trend.wear import DayToDay, Episode, Levels, Wear, beyond, episodes
-from sealscope.diagnosis.verdict.diagnosis import next_check
 from sealscope.diagnosis.verdict.evidence import Verdict
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.severity import RepairLimit
+from sealscope.diagnosis.verdict.states import state_of
 from sealscope.errors import InputError
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
@@ -132,9 +132,9 @@ class Trend:
         if self.verdict == "no leak":
             return "Nothing needs a check; go on recording under the same duty."
         if self.verdict == "leak":
-            return next_check("leak", "piston or pump leak")
+            return state_of("leak", "piston or pump leak").action
         if self.wear is None:
-            return next_check("cannot tell", None)
+            return state_of("cannot tell").action
         return "Go on recording under the same duty, and compare the level with what a new machine passes."
 
     def as_dict(self) -> dict[str, Any]:
