@@ -32,8 +32,7 @@ from typing import Any
 import numpy as np
 
 from sealscope.diagnosis.trend.reading import reading_of, scatter_of
-from sealscope.diagnosis.trend.trend import YEARS
-from sealscope.diagnosis.trend.wear import MONTH, DayToDay, Levels, episodes, merged, search
+from sealscope.diagnosis.trend.wear import MONTH, DayToDay, Levels, episodes, search
 from sealscope.evaluation.binomial import clopper_pearson
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Array, Recording
@@ -42,7 +41,7 @@ from sealscope.simulation.faults import Leak
 from sealscope.simulation.simulate import simulate_with_truth
 from sealscope.units import LITRE_PER_MINUTE
 
-HEALTHY_DAYS, WORN_DAYS, SECONDS = 20, 84, 120.0
+HEALTHY_DAYS, WORN_DAYS, SECONDS, YEARS = 20, 84, 120.0, 10.0
 WEAR = 0.002
 TOLD = (1, 2, 5, 20)
 VIEWS = {"all channels": "volume balance", "pressures and command": "pressure response"}
@@ -236,7 +235,7 @@ def false_alarms(folder: Path, years: int) -> None:
                     noise[k] = lasts * noise[k - 1] + math.sqrt(1.0 - lasts**2) * noise[k]
                 levels = levels_at(np.arange(365.0), mean + scatter * noise, error)
                 prior = prior_of(basis, levels, told, unit)
-                few = merged(levels)
+                few = levels.merged()
                 known = max(1, round(told * len(few) / len(levels)))
                 begin = 0
                 while begin < len(few) - 1:  # an alarm is looked into, and the series goes on

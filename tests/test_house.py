@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -151,3 +152,11 @@ def test_decisions_are_numbered_in_turn():
     """A decision that no longer holds is deleted; the others keep their numbers."""
     numbers = [int(path.stem[:4]) for path in DECISIONS]
     assert numbers == sorted(set(numbers))
+
+
+@pytest.mark.parametrize("path", sorted(SOURCE.glob("diagnosis/**/priors.toml")), ids=lambda path: path.parent.name)
+def test_a_belief_states_value_unit_and_source(path):
+    for table in tomllib.loads(path.read_text("utf-8")).values():
+        for name, row in table.items():
+            assert set(row) == {"value", "unit", "source"}, name
+            assert row["unit"] and row["source"], name

@@ -48,11 +48,12 @@ _log = logging.getLogger(__name__)
 
 
 def source_hash(root: Path) -> str:
-    """Hash of every source file in the rooms under `root` that hold compiled functions."""
+    """Hash of every source file, and of the numbers beside them, in the rooms under `root` with compiled functions."""
     digest = hashlib.sha256()
     for room in _COMPILED_ROOMS:
         place = root / room
-        for path in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
+        files = (path for path in place.rglob("*") if path.suffix in (".py", ".toml"))
+        for path in sorted(files) if place.is_dir() else [place]:
             digest.update(path.relative_to(root).as_posix().encode() + b"\0")
             digest.update(path.read_bytes())
     return digest.hexdigest()

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.rms_change.blocks import DUTY, QUANTITIES, RmsBlocks
 from sealscope.diagnosis.rms_change.detector import RmsChange, within
-from sealscope.diagnosis.rms_change.ringing import beyond_noise, priors, rises
+from sealscope.diagnosis.rms_change.ringing import beyond_noise, rises
 from sealscope.simulation.bench.machines import draw
 from sealscope.simulation.commands import parse_command
 from sealscope.simulation.courses import parse_force
@@ -77,11 +78,11 @@ def test_the_rise_against_recordings_is_students() -> None:
     random = np.random.default_rng(1)
     known = np.c_[np.full(6, -5.0), random.standard_normal((6, 4))]
     own = np.array([-5.0, 1.0, 2.0, 3.0, 4.0])
-    belief = priors()["recordings"]
-    freedom, scatter = belief["freedom"].value, belief["scatter"].value
+    belief = beliefs("rms_change")["recordings"]
+    freedom, scatter = belief["freedom"], belief["scatter"]
     stated, weight = rises(own, np.zeros(4), known, np.zeros((6, 4)))
     assert weight[1:] == pytest.approx(1.0, abs=1e-3)
-    squares = freedom * (scatter**2 + belief["error"].value ** 2) + np.sum((known[:, 1] - known[:, 1].mean()) ** 2)
+    squares = freedom * (scatter**2 + belief["error"] ** 2) + np.sum((known[:, 1] - known[:, 1].mean()) ** 2)
     deviation = np.sqrt(squares / (freedom + 5) * (1 + 1 / 6))
     assert stated[1].value == pytest.approx(1.0 - known[:, 1].mean(), abs=1e-4)
     assert stated[1].deviation == pytest.approx(deviation, rel=1e-4)

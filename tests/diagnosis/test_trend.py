@@ -6,6 +6,7 @@ import itertools
 import json
 import math
 from dataclasses import replace
+from functools import partialmethod
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from scipy.integrate import quad
 from scipy.stats import halfnorm, multivariate_normal
 
 import sealscope as ss
-from sealscope.diagnosis.trend import wear
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.trend.reading import LeakReading, oil_temperature, reading_of
 from sealscope.diagnosis.trend.trend import Trend, trend_of
 from sealscope.diagnosis.trend.wear import MONTH, DayToDay, Level, Levels, beyond, episodes, search
@@ -71,9 +72,10 @@ def oracle(levels: Levels, prior: DayToDay, known: int) -> float:
     """Shiryaev and Roberts's R after all recordings, each likelihood as an integral over the size of the change."""
     n, flat = len(levels), 1e4
     reach = max(prior.scale, 0.3 * float(np.ptp(levels.value)))
-    grid = np.geomspace(wear._LEAST * prior.scale, wear._MOST * reach, wear._NODES)
+    grid = np.geomspace(0.1 * prior.scale, 10.0 * reach, 3)
     nodes = [(tau, 0.5, -prior.freedom * (math.log(tau) + 0.5 * (prior.scale / tau) ** 2)) for tau in grid]
-    kinds = [("step", scale) for scale in wear._STEPS] + [("growth", every) for every in wear._INTERVALS]
+    change = beliefs("trend")["change"]
+    kinds = [("step", scale) for scale in change["steps"]] + [("growth", every) for every in change["intervals"]]
     joint, null = dict.fromkeys(itertools.product(range(known, n), kinds), 0.0), 0.0
     for tau, share, log_prior in nodes:
         waits = np.abs(levels.t[:, None] - levels.t)
@@ -94,15 +96,15 @@ def oracle(levels: Levels, prior: DayToDay, known: int) -> float:
 
             value = quad(integrand, 0.0, 8.0 * size, limit=60, points=[0.01 * size, 0.1 * size, size])[0]
             joint[j, (kind, scale)] = before + weight * value
-    many = {"step": len(wear._STEPS), "growth": len(wear._INTERVALS)}
+    many = {"step": len(change["steps"]), "growth": len(change["intervals"])}
     waits = np.diff(levels.t)
     return sum(waits[j - 1] * value / null / 2.0 / many[kind] for (j, (kind, _)), value in joint.items())
 
 
 def test_the_statistic_is_the_ratio_of_the_likelihoods(monkeypatch: pytest.MonkeyPatch) -> None:
     """The sums of one factorisation against integrals of multivariate normal densities, unequal errors and waits."""
-    monkeypatch.setattr(wear, "_NODES", 3)
-    monkeypatch.setattr(wear, "_LASTING", (0.5,))
+    monkeypatch.setitem(beliefs("trend")["between"], "nodes", 3)  # type: ignore[arg-type]
+    monkeypatch.setitem(beliefs("trend")["between"], "lasts", [0.5])  # type: ignore[arg-type]
     levels = levels_at(np.array([0.0, 1.0, 3.0, 4.0]), np.array([5.0, 5.5, 6.2, 6.9]), np.array([0.1, 0.5, 0.2, 0.3]))
     assert not np.any(beyond(levels, PRIOR))
     assert search(levels, PRIOR, 2).log_R[-1] == pytest.approx(math.log(oracle(levels, PRIOR, 2)), abs=2e-3)
@@ -296,7 +298,7 @@ def test_numbers_out_of_range_are_refused(wrong: dict[str, float]) -> None:
 
 
 def test_many_recordings_are_merged(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(wear, "MOST", 60)
+    monkeypatch.setattr(Levels, "merged", partialmethod(Levels.merged, 60))
     trend = trend_of(life(150, wears=0.004, since=100.0, scatter=0.05), healthy=20)
     assert trend.verdict == "leak" and len(trend.rows) == 50 and len(trend.points) == 150
     assert trend.alarm is not None and 100.0 < trend.alarm.day < 125.0

@@ -202,8 +202,8 @@ def test_a_dismissed_leak_is_compared_with_nothing_before():
     "damage",
     [
         {"version": 99},
-        {"live": {"names": []}},
-        {"live": 1},
+        {"estimator": {"names": []}},
+        {"estimator": 1},
         {"rig": "{}"},
         {"detector": {}},
         {"samples": None},

@@ -158,9 +158,9 @@ def test_oil_that_warms_is_no_leak():
 @pytest.mark.parametrize("damage", ["follower", "next", "settling"])
 def test_a_damaged_state_is_refused_in_one_line(damage: str):
     state = whole()[0].state()
-    pressures = {**state["pressures"], damage: {"x": 1}}
+    estimator = {**state["estimator"], damage: {"x": 1}}
     with pytest.raises(InputError) as raised:
-        Watch.from_state({**state, "pressures": pressures})
+        Watch.from_state({**state, "estimator": estimator})
     assert "\n" not in str(raised.value)
 
 

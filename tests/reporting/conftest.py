@@ -160,19 +160,19 @@ def trend() -> Trend:
         level = 6.7e-13 * (1.0 + 0.05 * random.standard_normal() + (0.08 * (k - 10) if 10 < k < 30 else 0.0))
         days.append(
             LeakReading(
-                f"<day> {k}.csv",
-                1.7e9 + 86400.0 * k,
-                60.0,
-                None if k == 5 else "volume balance",
-                Level(level, 1.3e-14),
-                True,
-                633e-6,
-                1.1e5,
-                None,
-                1.03 if 20 <= k <= 22 else 1.0,
-                None,
-                str(k),
-                "needs theta" if k == 5 else "",
+                file=f"<day> {k}.csv",
+                start=1.7e9 + 86400.0 * k,
+                duration=60.0,
+                basis=None if k == 5 else "volume balance",
+                level=Level(level, 1.3e-14),
+                states_flow=True,
+                area=633e-6,
+                pressure=1.1e5,
+                temperature=None,
+                scale=1.03 if 20 <= k <= 22 else 1.0,
+                machine=None,
+                digest=str(k),
+                problem="needs theta" if k == 5 else "",
             )
         )
     return trend_of(days, healthy=5, limit="15 mL/min")

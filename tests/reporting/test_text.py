@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from sealscope.diagnosis.verdict.diagnosis import next_check
 from sealscope.diagnosis.verdict.evidence import Evidence
+from sealscope.diagnosis.verdict.states import state_of
 from sealscope.reporting import diagnosis_text, messages
 
 
@@ -61,7 +61,7 @@ def test_no_leak_says_how_large_one_could_be(make_diagnosis):
 
 
 def test_another_cause_is_told_with_what_to_check(make_diagnosis):
-    check = next_check("no leak", "friction change")
+    check = state_of("no change", "friction change").action
     found = make_diagnosis(
         verdict="no leak", score=1.5, onset_s=None, leak_lpm=None, cause="friction change", quality=()
     )
@@ -71,7 +71,7 @@ def test_another_cause_is_told_with_what_to_check(make_diagnosis):
     assert messages.headline(found) == "Friction change (no leak across the piston)"
     leak = make_diagnosis(cause="piston leak", quality=())
     assert messages.headline(leak) == "Leak: oil bypasses the piston"
-    assert messages.next_steps(leak)[0] == next_check("leak", "piston leak")
+    assert messages.next_steps(leak)[0] == state_of("leak", "piston leak").action
     assert messages.next_steps(make_diagnosis(cause="friction change", quality=()))[0] != check
 
 

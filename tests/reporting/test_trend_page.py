@@ -12,7 +12,6 @@ import pytest
 
 from sealscope.diagnosis.trend.reading import LeakReading
 from sealscope.diagnosis.trend.trend import Trend, trend_of
-from sealscope.diagnosis.trend.wear import Level
 from sealscope.errors import InputError
 from sealscope.reporting.trend.chart import chart_of
 from sealscope.reporting.trend.page import render_trend_page, write_trend_page
@@ -73,7 +72,14 @@ def test_the_chart_stands_within_its_frame(trend: Trend) -> None:
 
 def test_without_a_level_there_is_a_page_without_a_chart(tmp_path: Path) -> None:
     only = LeakReading(
-        "a.csv", 1.7e9, 1.0, None, Level(np.nan, np.nan), False, None, np.nan, None, None, None, b"", "no x"
+        file="a.csv",
+        start=1.7e9,
+        duration=1.0,
+        pressure=np.nan,
+        temperature=None,
+        machine=None,
+        digest="",
+        problem="no x",
     )
     trend = trend_of([only])
     page = write_trend_page(tmp_path / "page.html", trend).read_text()

@@ -6,7 +6,7 @@ import logging
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -31,14 +31,12 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 #: Probability of `leak` on a leak-free recording, unless the caller asks for another.
 FALSE_ALARM_PROBABILITY = 0.01
-_PROBABILITIES = (1e-4, 0.2)
 
 
 def check_probability(probability: float) -> None:
     """Raise InputError for a false-alarm probability that no threshold can be set for."""
-    low, high = _PROBABILITIES
-    if not (isinstance(probability, float | int) and low <= probability <= high):
-        raise InputError(f"false-alarm probability must be {low:g} to {high:g}, got {probability!r}")
+    if not (isinstance(probability, float | int) and 1e-4 <= probability <= 0.2):
+        raise InputError(f"false-alarm probability must be 0.0001 to 0.2, got {probability!r}")
 
 
 class Examination:
@@ -189,8 +187,7 @@ def diagnose(
         What may be assumed of the machine: a Rig, the name of a packaged one or the path of a TOML file; by default
         the thesis's, stated for a recording that was simulated with it, else a mere assumption.
     limit : str, optional
-        Leak from which the machine is to be repaired, as a flow (``"5 mL/min"``) or as the speed at which the piston
-        would creep (``"8 mm/min"``, the default).
+        Leak from which the machine is to be repaired: a flow (``"5 mL/min"``) or a creep (``"8 mm/min"``, the default).
     quick : bool, optional
         Stop at the detector that judges: the same verdict and figures in a fraction of the time.
     file : str or path-like, optional
@@ -214,50 +211,39 @@ def diagnose(
     >>> diagnosis.verdict, round(diagnosis.onset_s)
     ('leak', 30)
     """
-    repair = RepairLimit.of(limit)
+    repair, baselines = RepairLimit.of(limit), _checked(recording, baseline)
     check_probability(false_alarm_probability)
-    _check_recording("recording", recording)
     known, machine = assumed_rig(rig, recording)
-    baselines = [baseline] if isinstance(baseline, Recording) else _sequence(baseline)
     inspection = inspected(recording)
     compared = comparable(inspection, baselines)
+    stated = {"false_alarm_probability": false_alarm_probability, "baselines": len(compared.parts), "limit": repair}
     evidence = Examination(
         inspection.part,
         compared.parts,
         false_alarm_probability=false_alarm_probability,
         rig=known,
         distrust=inspection.distrust,
-        refusal=None if compared.parts else compared.refusal,
+        refusal=compared.refusal,
         share=inspection.share,
     ).fused(quick)
-    return Diagnosis.of(
-        evidence,
-        recording,
-        machine,
-        file=os.fspath(file) if file else None,
-        false_alarm_probability=false_alarm_probability,
-        quality=(*inspection.findings, *compared.findings),
-        baselines=len(compared.parts),
-        limit=repair,
-    )
+    quality = (*inspection.findings, *compared.findings)
+    name = os.fspath(file) if file else None
+    return Diagnosis.of(evidence, recording, machine, file=name, quality=quality, **stated)
 
 
-def _sequence(baseline: Sequence[Healthy]) -> list[Healthy]:
-    if isinstance(baseline, str | os.PathLike):
-        _check_recording("baseline", baseline)
-    try:
-        recordings = list(baseline)
-    except TypeError:
-        raise InputError(
-            f"baseline must be a Recording or a sequence of Recordings, got {type(baseline).__name__}"
-        ) from None
-    for k, recording in enumerate(recordings):
-        if not isinstance(recording, Learnt):
-            _check_recording(f"baseline[{k}]", recording)
-    return recordings
-
-
-def _check_recording(name: str, value: object) -> None:
-    if not isinstance(value, Recording):
-        hint = "; sealscope.read makes one of a file" if isinstance(value, str | os.PathLike) else ""
-        raise InputError(f"{name} must be a Recording, got {type(value).__name__} {value!r:.40}{hint}")
+def _checked(recording: object, baseline: Recording | Sequence[Healthy]) -> list[Healthy]:
+    """Return the baselines; InputError where they, or the recording, are something else."""
+    healthy: list[Any] = [baseline]
+    if not isinstance(baseline, Recording | str | os.PathLike):
+        try:
+            healthy = list(baseline)
+        except TypeError:
+            kind = type(baseline).__name__
+            raise InputError(f"baseline must be a Recording or a sequence of Recordings, got {kind}") from None
+    single = isinstance(baseline, str | os.PathLike)
+    names = ("recording", *("baseline" if single else f"baseline[{k}]" for k in range(len(healthy))))
+    for name, value in zip(names, (recording, *healthy), strict=True):
+        if not isinstance(value, Recording if name == "recording" else Recording | Learnt):
+            hint = "; sealscope.read makes one of a file" if isinstance(value, str | os.PathLike) else ""
+            raise InputError(f"{name} must be a Recording, got {type(value).__name__} {value!r:.40}{hint}")
+    return healthy

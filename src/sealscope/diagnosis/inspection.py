@@ -24,14 +24,6 @@ from sealscope.recordings.motion import runs_of
 from sealscope.recordings.quality import SHORTEST, Finding, Severity, inspect, uniform_segments
 from sealscope.recordings.recording import Recording, remembered
 
-#: Findings on a chamber pressure that leave no trust in its details ...
-_SPOILING = ("constant", "stuck")
-#: ... and clipping, when it takes more than this share of the samples; a chamber that empties into the tank rests at
-#: the rail for a while in any stroke.
-_MOST_CLIPPED = 0.5
-#: Most names of left-out baselines that a finding lists.
-_MOST_NAMES = 3
-
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
@@ -104,8 +96,11 @@ def _inspection(recording: Recording, names: Sequence[str]) -> Inspection:
 
 
 def _spoils(finding: Finding, samples: int) -> bool:
-    """Return whether a finding on a chamber pressure of so many samples leaves no trust in its details."""
-    return finding.code in _SPOILING or (finding.code == "clipped" and finding.count > _MOST_CLIPPED * samples)
+    """Return whether a finding on a chamber pressure of so many samples leaves no trust in its details.
+
+    A chamber that empties into the tank rests at the rail for a while in any stroke.
+    """
+    return finding.code in ("constant", "stuck") or (finding.code == "clipped" and finding.count > samples / 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,15 +135,18 @@ def comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baselines:
             chosen[own.digest] = k
         else:
             left_out.setdefault((severity, reason), []).append(k)
-    findings = tuple(
-        Finding("baseline_left_out", severity, None, len(numbers), None, _text(inspections, numbers, reason))
-        for (severity, reason), numbers in left_out.items()
-    )
+    findings = []
+    for (severity, reason), numbers in left_out.items():
+        names = [inspections[k].file or f"number {k + 1}" for k in sorted(numbers)]
+        listed = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+        count = f"{len(names)} of {len(baseline)} baseline recordings {'is' if len(names) == 1 else 'are'}"
+        text = f"{count} left out: {reason} ({listed})"
+        findings.append(Finding("baseline_left_out", severity, None, len(numbers), None, text))
     refusal = None
     if baseline and not chosen:
         most = max(left_out, key=lambda kind: len(left_out[kind]))
         refusal = f"no baseline recording can be used: {most[1]}"
-    return Baselines(tuple(inspections[k].part for k in sorted(chosen.values())), findings, refusal)
+    return Baselines(tuple(inspections[k].part for k in sorted(chosen.values())), tuple(findings), refusal)
 
 
 class _Healthy(NamedTuple):
@@ -176,10 +174,3 @@ def _refusal(judged: Inspection, own: _Healthy) -> tuple[Severity, str | None]:
         return "warning", "the same samples as the recording itself"
     alike = all(own.units.get(name) == judged.part.units[name] for name in chambers_of(judged.part))
     return "note", None if alike else "other channels or units"
-
-
-def _text(baseline: Sequence[_Healthy], numbers: Sequence[int], reason: str) -> str:
-    names = [baseline[k].file or f"number {k + 1}" for k in sorted(numbers)]
-    listed = ", ".join(names[:_MOST_NAMES]) + (", ..." if len(names) > _MOST_NAMES else "")
-    verb = "is" if len(names) == 1 else "are"
-    return f"{len(names)} of {len(baseline)} baseline recordings {verb} left out: {reason} ({listed})"

@@ -15,8 +15,6 @@ from sealscope.diagnosis.verdict.evidence import LEAKS, LEAST_SPECIFIC, Evidence
 
 #: Detectors that state a size or a bound: by every litre, then by a model of the pressures.
 ORDER = ("volume balance", "pressure response")
-#: Least share of a recording that `no leak` rests on.
-WHOLE = 0.95
 
 
 def rank(detector: str) -> int:
@@ -62,8 +60,8 @@ def judged(
         reasons.append(f"this rests on {100.0 * judge.share:.3g} % of the recording")
     if verdict == "no leak":
         doubts = [] if refusal is None else [refusal]
-        if judge.share < WHOLE:
-            doubts.append(f"and the rest may hide a leak ({WHOLE:.0%} are needed)")
+        if judge.share < 0.95:
+            doubts.append("and the rest may hide a leak (95% are needed)")
         reasons += doubts
         verdict = "cannot tell" if doubts else verdict
     others = [own for own in ranked if own is not judge]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from base64 import b64decode, b64encode
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
 
 import numpy as np
@@ -59,3 +59,37 @@ def part_of(state: Any, name: str, kind: type | tuple[type, ...]) -> Any:
     if not isinstance(value, kind):
         raise InputError(f"saved state's {name} must be {kind}, got {type(value).__name__}")
     return value
+
+
+def saved(owner: Any, names: Iterable[str]) -> dict[str, Any]:
+    """Return attributes as plain values, for `recall`: arrays, numbers, texts, tuples; null for what is not finite."""
+    state = {}
+    for name in names:
+        value = getattr(owner, name)
+        if isinstance(value, np.ndarray):
+            value = plain_array(value)
+        elif isinstance(value, float) and not np.isfinite(value):
+            value = None
+        state[name.lstrip("_")] = list(value) if isinstance(value, tuple) else value
+    return state
+
+
+def recall(owner: Any, names: Iterable[str], state: Any) -> None:
+    """Set the attributes that `saved` returned; null leaves what is there. Arrays of a tuple are written to.
+
+    Raises InputError where one is missing or unlike what is there: in its type, or in the shape of an array but for
+    axes that are empty.
+    """
+    for name in names:
+        plain, there = name.lstrip("_"), getattr(owner, name)
+        value = part_of(state, plain, object)
+        if isinstance(there, np.ndarray):
+            value = array_of(value, plain)
+            if value.ndim != there.ndim or any(b not in (a, 0) for a, b in zip(value.shape, there.shape, strict=True)):
+                raise InputError(f"saved state's {plain} must have the shape {there.shape}, got {value.shape}")
+        elif value is not None:
+            value = restored(type(there), value, plain)
+        if isinstance(owner, tuple):
+            there[:] = value
+        elif value is not None:
+            setattr(owner, name, value)

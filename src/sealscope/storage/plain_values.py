@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
 from typing import Any, TypeVar
@@ -58,3 +59,18 @@ def as_type(kind: type[_T], value: Any) -> _T:
         first = error.errors(include_url=False)[0]
         place = ".".join(map(str, first["loc"])) or "value"
         raise ValueError(f"{place}: {first['msg']}, got {str(first['input'])[:60]!r}") from None
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON holds it: records as objects, tuples as lists, a number that is not finite as null."""
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {name: plain(own) for name, own in value.items()}
+    if hasattr(value, "_asdict"):
+        return plain(value._asdict())
+    if is_dataclass(value):
+        return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, tuple | list):
+        return [plain(own) for own in value]
+    return value

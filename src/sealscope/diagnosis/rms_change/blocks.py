@@ -7,10 +7,12 @@ machine alone; where there is no cycle it is a window of fixed length.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.recordings.chambers import CHAMBERS, chambers_of
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.gaps import touched
@@ -19,24 +21,12 @@ from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.details import Details, details
 from sealscope.signals.filters import IntArray
 
-LEVELS = 4
 #: The quantities of one chamber, in the order of the columns of `RmsBlocks.log_rms`.
 QUANTITIES = ("d1", "d2", "d3", "d4", "d3d4")
 #: Quantities that make the verdict; d1 holds noise alone, d3d4 follows from d3 and d4.
 JUDGED = ("d2", "d3", "d4")
 #: What is known of a block's duty, in the order of the columns of `RmsBlocks.duty`.
 DUTY = ("command", "rate", "load", "direction")
-#: Length a block should have [s]: long enough for the RMS of d4 to be steady, short enough to place an onset.
-BLOCK_SECONDS = 1.5
-#: ... and fewest samples it should have: two periods of the slowest oscillation in d4, whose memory then ends in the
-#: next block. It counts at sampling rates under 43 Hz.
-BLOCK_SAMPLES = 64
-#: Most blocks; they are longer in a longer recording.
-MOST_BLOCKS = 160
-#: The beginning is left out: pressures and speed settle within the first strokes after a start.
-_SETTLING_SECONDS, _SETTLING_CYCLES, _SETTLING_AT_MOST = 10.0, 3.0, 1.0 / 8.0
-#: RMS below which a command rests, as a share of that of the whole recording.
-_REST = 1e-3
 
 
 @dataclass(frozen=True)
@@ -67,7 +57,7 @@ class RmsBlocks:
     @property
     def names(self) -> list[str]:
         """Names of the columns, such as "d3 of p_A"."""
-        return [f"{quantity} of {chamber}" for chamber in self.chambers for quantity in QUANTITIES]
+        return columns_of(self.chambers)
 
     @property
     def seconds(self) -> float:
@@ -76,18 +66,20 @@ class RmsBlocks:
 
     def settled(self) -> RmsBlocks:
         """Return the blocks after the machine's start: without 10 s or three cycles, at most an eighth of them."""
-        n = len(self.log_rms)
-        if n == 0:
-            return self
-        start = max(_SETTLING_SECONDS, _SETTLING_CYCLES * (self.cycle or 0.0))
-        first = min(int(n * _SETTLING_AT_MOST), int(np.ceil(start / self.seconds)))
+        n, believed = len(self.log_rms), beliefs("rms_change")["blocks"]
+        start = max(believed["settling"], believed["settling_cycles"] * (self.cycle or 0.0))
+        first = min(n // 8, int(np.ceil(start / self.seconds))) if n else 0
         return replace(self, edges=self.edges[first:], log_rms=self.log_rms[first:], duty=self.duty[first:])
+
+
+def columns_of(chambers: Sequence[str]) -> list[str]:
+    """Return the names of the columns of `RmsBlocks.log_rms`."""
+    return [f"{quantity} of {chamber}" for chamber in chambers for quantity in QUANTITIES]
 
 
 def mean_squares(transformed: Details, bounds: IntArray) -> Array:
     """Return the mean squares of d1..d4 and d3d4 between consecutive sample bounds: (len(bounds) - 1, 5)."""
-    squares = np.vstack([transformed.values**2, transformed.product()[None, :] ** 2])
-    return _means(squares, bounds).T
+    return _means(np.vstack([transformed.values**2, transformed.product()[None, :] ** 2]), bounds).T
 
 
 def _means(values: Array, bounds: IntArray) -> Array:
@@ -95,11 +87,6 @@ def _means(values: Array, bounds: IntArray) -> Array:
     sums = np.add.reduceat(values, bounds[:-1], axis=1)
     sums[:, -1] = values[:, bounds[-2] : bounds[-1]].sum(axis=1)
     return np.asarray(sums / np.diff(bounds))
-
-
-def whole_log_rms(recording: Recording) -> Array:
-    """Return the log RMS of every quantity over the whole recording but its edges: (5 per chamber,)."""
-    return whole(recording)[0]
 
 
 def whole(recording: Recording) -> tuple[Array, Array]:
@@ -119,36 +106,46 @@ def _columns(recording: Recording, transformed: list[Details], bounds: IntArray)
         load = recording[chambers[0]] - recording[chambers[0]].mean()
     command = recording.channels.get("u", np.zeros(len(recording)))
     squares = np.stack([command, np.gradient(command) * recording.rate, load]) ** 2
-    rest = np.maximum(_REST**2 * squares.mean(axis=1, keepdims=True), np.finfo(float).tiny)
+    rest = np.maximum(
+        beliefs("rms_change")["blocks"]["rest"] ** 2 * squares.mean(axis=1, keepdims=True), np.finfo(float).tiny
+    )
     with np.errstate(divide="ignore", over="ignore"):
         energies = np.concatenate([mean_squares(own, bounds) for own in transformed], axis=1)
-        log_rms, duty = 0.5 * np.log(energies), 0.5 * np.log(_means(squares, bounds) + rest)
+        log_rms, duty = (
+            0.5 * np.log(energies),
+            0.5 * np.log(_means(squares, bounds) + rest),
+        )
     return log_rms, np.vstack([duty, _means(load[None], bounds) / np.exp(duty[-1:])]).T
 
 
 def cut(recording: Recording) -> RmsBlocks:
     """Cut a uniformly sampled recording without missing samples into blocks, edges of the transform dropped."""
-    chambers = chambers_of(recording)
+    chambers, rate, believed = chambers_of(recording), recording.rate, beliefs("rms_change")["blocks"]
     transformed = [details(recording[chamber]) for chamber in chambers]
-    inside = transformed[0].inside()
-    cycle = find_cycle(recording)
-    wanted = max(BLOCK_SECONDS, BLOCK_SAMPLES / recording.rate)
+    inside, cycle = transformed[0].inside(), find_cycle(recording)
+    wanted = max(believed["seconds"], believed["samples"] / rate)
     phases = 1 if cycle is None else max(1, round(cycle / wanted))
     length = wanted if cycle is None else cycle / phases * max(1, round(wanted / (cycle / phases)))
     samples = inside.stop - inside.start
-    if samples > MOST_BLOCKS * length * recording.rate:
-        length *= phases * math.ceil(samples / (MOST_BLOCKS * phases * length * recording.rate))
+    if samples > believed["most"] * length * rate:
+        length *= phases * math.ceil(samples / (believed["most"] * phases * length * rate))
         phases = 1
-    count = int(samples / (length * recording.rate))
-    bounds = inside.start + np.round(np.arange(count + 1) * length * recording.rate).astype(np.int64)
+    count = int(samples / (length * rate))
+    bounds = inside.start + np.round(np.arange(count + 1) * length * rate).astype(np.int64)
     if count == 0:
         empty = np.empty((0, len(QUANTITIES) * len(chambers)))
         return RmsBlocks(recording.t[bounds], empty, np.empty((0, len(DUTY))), chambers, phases, cycle)
     log_rms, duty = _columns(recording, transformed, bounds)
-    ends = recording.t[0] + bounds / recording.rate
-    kept = ~touched(recording, bounds)
-    still = _still(recording, chambers, log_rms, ends, kept)
-    if still is None and phases > 1:
+    ends, kept = recording.t[0] + bounds / rate, ~touched(recording, bounds)
+    floor = np.log([ROUNDING * np.abs(recording[name]).max() for name in chambers])[:, None]
+    levels = log_rms.reshape(count, len(chambers), -1)[:, :, :-1]  # of d1 to d4; else rounding, or no number
+    fixed = kept[:, None] & ~np.all(np.isfinite(levels) & (levels > floor), axis=2)
+    still = None
+    if fixed.any():
+        chamber = int(np.argmax(fixed.any(axis=0)))
+        first = int(np.argmax(fixed[:, chamber]))
+        still = f"{chambers[chamber]} does not move from {ends[first]:.4g} s to {ends[first + 1]:.4g} s"
+    elif phases > 1:
         for values in (log_rms, duty):
             level = values[kept].mean(axis=0)
             for phase in range(min(phases, count)):
@@ -157,16 +154,3 @@ def cut(recording: Recording) -> RmsBlocks:
                     values[same] += level - values[same].mean(axis=0)
     edges = np.append(ends[:-1][kept], ends[1:][kept][-1:] if kept.any() else ends[:1])
     return RmsBlocks(edges, log_rms[kept], duty[kept], chambers, phases, cycle, still, int(np.count_nonzero(~kept)))
-
-
-def _still(
-    recording: Recording, chambers: tuple[str, ...], log_rms: Array, edges: Array, kept: Array | np.ndarray
-) -> str | None:
-    """Say in which of the `kept` blocks a chamber's details are rounding, or no number, first; None for none."""
-    for chamber, name in enumerate(chambers):
-        levels = log_rms[:, chamber * len(QUANTITIES) : chamber * len(QUANTITIES) + LEVELS]
-        floor = np.log(ROUNDING * np.abs(recording[name]).max())
-        still = np.flatnonzero(kept & ~np.all(np.isfinite(levels) & (levels > floor), axis=1))
-        if still.size:
-            return f"{name} does not move from {edges[still[0]]:.4g} s to {edges[still[0] + 1]:.4g} s"
-    return None

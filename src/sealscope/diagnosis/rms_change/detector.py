@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Interval, step_test
-from sealscope.diagnosis.inference.scatter import Rise
 from sealscope.diagnosis.learnt import Healthy, Lesson, lessons_of
-from sealscope.diagnosis.rms_change.blocks import JUDGED, QUANTITIES, RmsBlocks, cut, whole
-from sealscope.diagnosis.rms_change.ringing import information, priors, rises
+from sealscope.diagnosis.rms_change.blocks import JUDGED, RmsBlocks, columns_of, cut, whole
+from sealscope.diagnosis.rms_change.ringing import information, rises
 from sealscope.diagnosis.verdict.evidence import Evidence, Verdict
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.hydraulics import lack_of_chambers
@@ -26,16 +26,6 @@ from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.motion import constant
 from sealscope.recordings.recording import Recording
 from sealscope.signals.details import shortest
-
-#: Fewest blocks in which a change is looked for.
-FEWEST_BLOCKS = 12
-#: Chance below which a quantity has a say in the onset.
-MOVED = 0.5
-#: Lowest rate [Hz] at which the ringing of the piston on its oil, 70 Hz on the packaged rigs, reaches into the judged
-#: details: d2 ends at a quarter of the rate, and d1 is noise. Below, leaks of up to 0.5 L/min changed nothing in them.
-RINGING_RATE = 250.0
-#: Lowest rate [Hz]: the ringing of a hydraulic line of some metres lies over 4 Hz.
-SLOWEST_RATE = 8.0
 
 
 class _Change(NamedTuple):
@@ -53,10 +43,14 @@ class _Change(NamedTuple):
     weight: float
     onset: Interval | None = None
 
-    @property
-    def text(self) -> str:
+    def evidence(self) -> Evidence:
+        """Return it as a part of the detector's evidence; noise (d1) that changed is no leak."""
         percent = 100.0 * np.expm1(self.weight * self.value)
-        return f"RMS of {self.name} {'rose' if percent > 0 else 'fell'} by {abs(percent):.1f} %"
+        text = f"RMS of {self.name} {'rose' if percent > 0 else 'fell'} by {abs(percent):.1f} %"
+        at = "" if self.onset is None else f" at {self.onset.value:.1f} s"
+        changed: Verdict = "cannot tell" if self.name.startswith("d1 ") else "leak"
+        verdict: Verdict = "no leak" if self.score <= self.threshold else changed
+        return Evidence(verdict, text + at, self.score, self.threshold, detector=f"RMS of {self.name}")
 
 
 class RmsChange:
@@ -74,47 +68,37 @@ class RmsChange:
             return lack
         if len(recording) < shortest():
             return f"needs {shortest()} samples or more without a gap, got {len(recording)}"
-        for chamber in chambers_of(recording):
-            if constant(recording[chamber]):
-                return f"{chamber} is constant"
-        return None
+        still = next((name for name in chambers_of(recording) if constant(recording[name])), None)
+        return None if still is None else f"{still} is constant"
 
     def learn(self, recording: Recording) -> Lesson:
         """Return what a healthy recording teaches: its log RMS and duty, whose they are, and when."""
         levels, duty = whole(recording)
-        return {
-            "chambers": list(chambers_of(recording)),
-            "rate": recording.rate,
-            "start_s": start_seconds(recording),
-            "levels": levels,
-            "duty": duty,
-        }
+        chambers, start = list(chambers_of(recording)), start_seconds(recording)
+        return {"chambers": chambers, "rate": recording.rate, "start_s": start, "levels": levels, "duty": duty}
 
     def examine(self, recording: Recording, baseline: Sequence[Healthy], false_alarm_probability: float) -> Evidence:
         """Return the evidence on a recording that is `usable`, within it or against the baseline."""
-        evidence = _examine(recording, baseline, false_alarm_probability)
-        if evidence.verdict != "no leak" or recording.rate >= RINGING_RATE:
+        rates = beliefs("rms_change")["rate"]
+        if recording.rate < rates["slowest"]:
+            least = f"needs {rates['slowest']:g} Hz or more to see the ringing that a leak damps"
+            return Evidence("cannot tell", f"{least}, got {recording.rate:g} Hz: is the unit of the time right?")
+        if baseline:
+            evidence = against(recording, baseline, false_alarm_probability)
+        else:
+            evidence = _within(cut(recording), false_alarm_probability)
+        if evidence.verdict != "no leak" or recording.rate >= rates["ringing"]:
             return evidence
-        seen = f"at {recording.rate:g} Hz the details hold no ringing that a leak damps ({RINGING_RATE:g} Hz would)"
-        return replace(evidence, verdict="cannot tell", reason=f"{seen}; {evidence.reason}")
+        why = f"at {recording.rate:g} Hz the details hold no ringing that a leak damps ({rates['ringing']:g} Hz would)"
+        return replace(evidence, verdict="cannot tell", reason=f"{why}; {evidence.reason}")
 
 
-def _examine(recording: Recording, baseline: Sequence[Healthy], probability: float) -> Evidence:
-    """Return the evidence on a recording, by what its details show."""
-    if recording.rate < SLOWEST_RATE:
-        reason = f"needs {SLOWEST_RATE:g} Hz or more to see the ringing that a leak damps, got {recording.rate:g} Hz"
-        return Evidence("cannot tell", f"{reason}: is the unit of the time right?")
-    if baseline:
-        return against(recording, baseline, probability)
-    blocks = cut(recording)
+def _within(blocks: RmsBlocks, probability: float) -> Evidence:
     if blocks.still is not None:
         return Evidence("cannot tell", f"the pressures cannot be trusted: {blocks.still}")
-    if len(blocks.log_rms) < FEWEST_BLOCKS:
-        return Evidence(
-            "cannot tell",
-            f"too short to be its own baseline: {len(blocks.log_rms)} blocks, {FEWEST_BLOCKS} are needed; give "
-            "leak-free recordings as --baseline",
-        )
+    if len(blocks.log_rms) < (fewest := beliefs("rms_change")["blocks"]["fewest"]):
+        short = f"too short to be its own baseline: {len(blocks.log_rms)} blocks, {fewest} are needed"
+        return Evidence("cannot tell", f"{short}; give leak-free recordings as --baseline")
     return within(blocks.settled(), probability)
 
 
@@ -136,82 +120,61 @@ def within(blocks: RmsBlocks, probability: float) -> Evidence:
         if name.split()[0] in JUDGED:
             moved.append(test)
     rarest = min(moved, key=lambda test: test.chance)
-    likelihood = np.sum([test.likelihood for test in moved if test is rarest or test.chance < MOVED], axis=0)
+    likelihood = np.sum([test.likelihood for test in moved if test is rarest or test.chance < 0.5], axis=0)
     onset = replace(rarest, likelihood=likelihood, best=int(likelihood.argmax())).onset()
     return _evidence(changes, blocks.share, "within the recording", onset)
 
 
 def against(recording: Recording, baseline: Sequence[Healthy], probability: float) -> Evidence:
     """Return the evidence of a rise or fall against leak-free recordings of the machine."""
-    alike = [own for own in lessons_of(RmsChange(), baseline) if own["chambers"] == list(chambers_of(recording))]
+    chambers = chambers_of(recording)
+    alike = [own for own in lessons_of(RmsChange(), baseline) if own["chambers"] == list(chambers)]
     alike = [own for own in alike if abs(own["rate"] / recording.rate - 1.0) < 1e-3]
     if not alike:
         return Evidence("cannot tell", f"no baseline recording has the same chambers at {recording.rate:g} Hz")
-    apart = _apart(recording, alike)
+    start, pause = start_seconds(recording), beliefs("rms_change")["recordings"]["pause"]
+    others = [other for own in alike if (other := own.get("start_s")) is not None]
+    known = start is not None and bool(others)
+    apart = known and all(abs(start - other) > pause for other in others)  # type: ignore[operator]
     levels, duties = (np.stack([np.asarray(own[name], dtype=float) for own in alike]) for name in ("levels", "duty"))
-    stated, weights = rises(*whole(recording), levels, duties, bool(apart))
-    names = [f"{quantity} of {chamber}" for chamber in chambers_of(recording) for quantity in QUANTITIES]
-    share = probability / (2 * len(JUDGED) * len(chambers_of(recording)))
-    changes = [_of_rise(name, own, w, share) for name, own, w in zip(names, stated, weights, strict=True)]
-    count = f"{len(alike)} comparable leak-free recording{'s' if len(alike) > 1 else ''}"
-    count += {True: " of another session", False: "", None: ", maybe of another session or machine"}[apart]
+    share, changes = probability / (2 * len(JUDGED) * len(chambers)), []
+    for name, rise, weight in zip(columns_of(chambers), *rises(*whole(recording), levels, duties, apart), strict=True):
+        size = rise._replace(value=abs(rise.value))
+        bound = size.value + size.threshold(0.05) * size.deviation
+        changes.append(_Change(name, rise.value, size.score, size.chance, size.threshold(share), bound, weight))
+    session = " of another session" if apart else "" if known else ", maybe of another session or machine"
+    count = f"{len(alike)} comparable leak-free recording{'s' if len(alike) > 1 else ''}{session}"
     return _evidence(changes, 1.0, f"against {count}", None)
-
-
-def _apart(recording: Recording, baseline: Sequence[Lesson]) -> bool | None:
-    """Whether a recording is of another session than all of the baseline's; None where no times tell."""
-    start, pause = start_seconds(recording), priors()["recordings"]["pause"].value
-    others = [other for own in baseline if (other := own.get("start_s")) is not None]
-    return None if start is None or not others else all(abs(start - other) > pause for other in others)
-
-
-def _of_rise(name: str, rise: Rise, weight: float, share: float) -> _Change:
-    size = Rise(abs(rise.value), rise.deviation, rise.freedom)
-    bound = size.value + size.threshold(0.05) * size.deviation
-    return _Change(name, rise.value, size.score, size.chance, size.threshold(share), bound, weight)
 
 
 def _evidence(changes: Sequence[_Change], share: float, where: str, onset: Interval | None) -> Evidence:
     """Return the evidence of the changes of all quantities: the rarest of the judged ones decides."""
-    judged = [own for own in changes if own.name.split()[0] in JUDGED]
-    rarest = min(judged, key=lambda own: own.chance)
-    chance = min(1.0, 2.0 * len(judged) * rarest.chance)
-    figures = f"score {rarest.score:.1f}, threshold {rarest.threshold:.1f}"
+    judged = sorted((own for own in changes if own.name.split()[0] in JUDGED), key=lambda own: own.chance)
+    rarest, bound = judged[0], min(own.bound for own in judged)
+    figures, limit = f"score {rarest.score:.1f}, threshold {rarest.threshold:.1f}", f"{-100.0 * np.expm1(-bound):.2g} %"
     noise = any(own.score > own.threshold for own in changes if own.name.startswith("d1 "))
     note = "; the noise (d1) changed too, and was taken out of the other details" if noise else ""
-    bound = min(own.bound for own in judged)
-    limit = f"{-100.0 * np.expm1(-bound):.2g} %"
     verdict: Verdict = "leak" if rarest.score > rarest.threshold else "no leak"
     if verdict == "leak":
         at = "" if onset is None else f" at {onset.value:.1f} s"
-        moved = sorted((own for own in judged if own.score > own.threshold), key=lambda own: own.chance)[:3]
-        reason = f"{', '.join(own.text for own in moved)}{at} {where} ({figures}){note}"
-    elif bound > priors()["recordings"]["worth"].value:
+        moved = [own._replace(onset=None).evidence().reason for own in judged if own.score > own.threshold][:3]
+        reason = f"{', '.join(moved)}{at} {where} ({figures}){note}"
+    elif bound > beliefs("rms_change")["recordings"]["worth"]:
         verdict = "cannot tell"
         reason = f"a fall of the ringing by {limit} {where} would not show (95 %; {figures}){note}"
     else:
         reason = f"no fall of the ringing above {limit} (95 %) {where} ({figures}){note}"
         if onset is not None:
             reason += "; a leak that was there from the start would need a --baseline to be seen"
-    parts = tuple(
-        Evidence(
-            "no leak" if own.score <= own.threshold else "cannot tell" if own.name.startswith("d1 ") else "leak",
-            own.text if own.onset is None else f"{own.text} at {own.onset.value:.1f} s",
-            own.score,
-            own.threshold,
-            detector=f"RMS of {own.name}",
-        )
-        for own in changes
-    )
-    onset = onset if verdict == "leak" else None
+    stated = onset if verdict == "leak" else None
     return Evidence(
         verdict,
         reason,
         rarest.score,
         rarest.threshold,
-        onset_s=None if onset is None else onset.value,
-        onset_interval_s=None if onset is None else (onset.low, onset.high),
-        parts=parts,
-        chance=chance,
+        onset_s=None if stated is None else stated.value,
+        onset_interval_s=None if stated is None else (stated.low, stated.high),
+        parts=tuple(own.evidence() for own in changes),
+        chance=min(1.0, 2.0 * len(judged) * rarest.chance),
         share=share,
     )

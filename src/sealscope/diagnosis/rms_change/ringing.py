@@ -12,31 +12,19 @@ by exponents that are believed within a width (`priors.toml`).
 
 from __future__ import annotations
 
-import tomllib
-from collections.abc import Mapping
-from functools import cache
-from importlib.resources import files
-
 import numpy as np
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Information
 from sealscope.diagnosis.inference.scatter import Rise
-from sealscope.diagnosis.inference.terms import Prior
 from sealscope.diagnosis.rms_change.blocks import DUTY, QUANTITIES, RmsBlocks
 from sealscope.recordings.recording import Array
-
-
-@cache
-def priors() -> Mapping[str, Mapping[str, Prior]]:
-    """Return what is believed of the RMS of the details, by table and name."""
-    tree = tomllib.loads((files("sealscope.diagnosis.rms_change") / "priors.toml").read_text("utf-8"))
-    return {table: {name: Prior(**row) for name, row in rows.items()} for table, rows in tree.items()}
 
 
 def beyond_noise(log_rms: Array, known: Array) -> tuple[Array, Array]:
     """Return y and w (n, 5 per chamber) of log RMS (n, 5 per chamber), the machine's own energy that of `known`."""
     left, weight = np.array(log_rms), np.ones_like(log_rms)
-    least = priors()["walk"]["least"].value
+    least = beliefs("rms_change")["walk"]["least"]
     for first in range(0, log_rms.shape[1], len(QUANTITIES)):
         noise = np.exp(2.0 * log_rms[:, first])
         for column in range(first + 1, first + QUANTITIES.index("d3d4")):
@@ -55,12 +43,13 @@ def information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
     error = np.mean(np.diff(left, axis=0) ** 2, axis=0) / 2.0
     explaining = DUTY[:-1]  # the direction is that of the phase
     duty = (blocks.duty - blocks.duty.mean(axis=0))[:, : len(explaining)]
-    believed = np.array([float(priors()["duty"][name].value) for name in explaining])
-    time, walks = blocks.edges[:-1] + 0.5 * blocks.seconds, priors()["walk"]
-    over_all = float(np.sqrt(len(time) * blocks.seconds / walks["time"].value))
+    exponents, walks = (beliefs("rms_change")[table] for table in ("duty", "walk"))
+    believed = np.array([float(exponents[name]) for name in explaining])
+    time = blocks.edges[:-1] + 0.5 * blocks.seconds
+    over_all = float(np.sqrt(len(time) * blocks.seconds / walks["time"]))
     stated = []
     for name, y, w, variance in zip(blocks.names, left.T, weight.T, error, strict=True):
-        drift = walks["noise" if name.startswith("d1 ") else "machine"].value * over_all
+        drift = walks["noise" if name.startswith("d1 ") else "machine"] * over_all
         precision, vector = w**2 / variance, w * y / variance
         along = precision[:, None] * duty
         gain = along @ np.linalg.inv(duty.T @ along + np.diag(believed**-2))
@@ -79,20 +68,20 @@ def rises(
     section 14.8); the rise is Student's, as in `inference.scatter`. `apart`: the recording is of another
     session than all of these, whose own deviation no scatter within a session shows.
     """
-    belief, n = priors()["recordings"], len(known)
-    freedom = belief["freedom"].value + n - 1
+    belief, n = beliefs("rms_change")["recordings"], len(known)
+    freedom = belief["freedom"] + n - 1
     design = np.column_stack([np.ones(n), known_duty - duty])
-    exponents = np.array([priors()["duty"][name].value for name in DUTY])
+    exponents = np.array([float(beliefs("rms_change")["duty"][name]) for name in DUTY])
     values, weights = beyond_noise(np.vstack([log_rms, known]), known)
     weight = weights[1:].mean(axis=0)
     stated = []
     for own, others, w in zip(values[0], values[1:].T, weight, strict=True):
-        scatter = float(np.hypot(w * belief["scatter"].value, belief["error"].value))
+        scatter = float(np.hypot(w * belief["scatter"], belief["error"]))
         penalty = np.diag([0.0, *(scatter / (w * exponents)) ** 2])
         inverse = np.linalg.inv(design.T @ design + penalty)
         fitted = inverse @ design.T @ others
         squares = np.sum((others - design @ fitted) ** 2) + fitted @ penalty @ fitted
-        variance = (belief["freedom"].value * scatter**2 + squares) / freedom * (1.0 + inverse[0, 0])
-        variance += (w * belief["session"].value) ** 2 if apart else 0.0
+        variance = (belief["freedom"] * scatter**2 + squares) / freedom * (1.0 + inverse[0, 0])
+        variance += (w * belief["session"]) ** 2 if apart else 0.0
         stated.append(Rise(float(own - fitted[0]) / w, float(np.sqrt(variance)) / w, freedom))
     return stated, weight

@@ -1,39 +1,42 @@
-"""Reading: what a single recording states of the leakage, by the best detector that its channels allow."""
+"""Readings: what a single recording states of the leakage, and the order in which those of a machine are compared."""
 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.detector import unusable
 from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.inference.pressures.detector import PressureResponse
 from sealscope.diagnosis.inference.pressures.evidence import priors
 from sealscope.diagnosis.inspection import inspected
-from sealscope.diagnosis.rms_change.blocks import JUDGED, QUANTITIES, whole_log_rms
+from sealscope.diagnosis.rms_change.blocks import JUDGED, QUANTITIES, whole
 from sealscope.diagnosis.trend.wear import DayToDay, Level
 from sealscope.diagnosis.verdict.machine import AssumedMachine, assumed_rig
+from sealscope.errors import InputError
 from sealscope.parameters import Rig
 from sealscope.recordings.chambers import CHAMBERS, chambers_of
 from sealscope.recordings.formats.headings.oil_temperature import stated_oil_temperature
 from sealscope.recordings.joining import start_seconds
+from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
 
+DAY = 86_400.0
 #: What a level rests on, the most specific first: a conductance, but for `ringing`, the damping of the pressures'
 #: details.
 Basis = Literal["volume balance", "pressure response", "ringing"]
+UNKNOWN = Level(np.nan, np.nan)
 BASES: tuple[Basis, ...] = ("volume balance", "pressure response", "ringing")
-#: Between recordings a level moves by this share of itself, or by this much; both known as from five recordings. Those
-#: of the conductances are what `diagnose` assumes; that of the ringing is `rms change`'s between sessions.
-_SHARE, _RINGING, _FREEDOM = 0.1, 0.11, 4.0
-#: Error of a ringing's logarithm that a recording states of itself.
-_RINGING_ERROR = 0.01
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class LeakReading:
     """What a recording states of the leakage.
 
@@ -48,26 +51,16 @@ class LeakReading:
     file: str
     start: float | None
     duration: float
-    basis: Basis | None
-    level: Level
-    states_flow: bool
-    area: float | None
+    basis: Basis | None = None
+    level: Level = UNKNOWN
+    states_flow: bool = False
+    area: float | None = None
     pressure: float
     temperature: float | None
-    scale: float | None
+    scale: float | None = None
     machine: AssumedMachine | None
     digest: str
     problem: str = ""
-
-
-class _Stated(NamedTuple):
-    """What a detector states: a level on a basis, and which of its figures have a unit."""
-
-    basis: Basis | None = None
-    level: Level = Level(np.nan, np.nan)
-    states_flow: bool = False
-    in_metres: bool = False
-    scale: float | None = None
 
 
 def reading_of(recording: Recording, rig: Rig | str | os.PathLike[str] | None = None, file: str = "") -> LeakReading:
@@ -77,47 +70,44 @@ def reading_of(recording: Recording, rig: Rig | str | os.PathLike[str] | None = 
     """
     known, machine = assumed_rig(rig, recording)
     inspection = inspected(recording)
-    part, problem, stated = inspection.part, inspection.defect or "", _Stated()
-    if not problem:
+    part = inspection.part
+    stated: dict[str, Any] = {"problem": inspection.defect or ""}
+    if not inspection.defect:
         with np.errstate(all="ignore"):
-            stated = _stated(part, known)
-        if stated.basis is None:
-            reasons = (unusable(detector(known), part) for detector in (VolumeBalance, PressureResponse))
-            why = dict.fromkeys(reason for reason in reasons if reason) or ["the pressures do not ring"]
-            problem = "no detector states a level: " + "; ".join(why)
+            stated = _stated(part, known, machine)
     both = len(chambers_of(part)) == len(CHAMBERS) and len(part) > 0
     return LeakReading(
         file=file or str(recording.provenance.get("file", "recording")),
         start=start_seconds(recording, file),
         duration=recording.duration,
-        basis=stated.basis,
-        level=stated.level,
-        states_flow=stated.states_flow,
-        area=machine.area if stated.states_flow or stated.in_metres else None,
         pressure=float(np.mean(np.abs(part["p_A"] - part["p_B"]))) if both else float("nan"),
         temperature=oil_temperature(recording),
-        scale=stated.scale,
         machine=machine,
         digest=inspection.digest,
-        problem=problem,
+        **stated,
     )
 
 
-def _stated(part: Recording, rig: Rig) -> _Stated:
-    """Return the most specific level that a recording without a defect allows."""
+def _stated(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[str, Any]:
+    """Return the most specific level that a recording without a defect allows, or the problem."""
     balance, response = VolumeBalance(rig), PressureResponse(rig)
-    if unusable(balance, part) is None:
-        own = balance.balance(part)
-        if own is not None and len(own.columns) == 1:
-            size, total = own.size, own.level
-            level = Level(total.value * size.scale, (total.high - total.low) * size.scale / 3.92)
-            ratio = None if size.ratio is None else size.ratio.value
-            return _Stated("volume balance", level, size.stated, ("x", "m") in own.units, ratio)
-    if unusable(response, part) is None and (reading := response.reading(part)) is not None:
-        return _Stated("pressure response", Level(*reading.level), reading.stated)
-    log_rms = whole_log_rms(part).reshape(-1, len(QUANTITIES))
+    lack, lacks = unusable(balance, part), unusable(response, part)
+    own = balance.balance(part) if lack is None else None
+    if own is not None and len(own.columns) == 1:
+        size, total = own.size, own.level
+        level = Level(total.value * size.scale, (total.high - total.low) * size.scale / 3.92)
+        area = machine.area if size.stated or ("x", "m") in own.units else None
+        ratio = None if size.ratio is None else size.ratio.value
+        return {"basis": BASES[0], "level": level, "states_flow": size.stated, "area": area, "scale": ratio}
+    if lacks is None and (reading := response.reading(part)) is not None:
+        area = machine.area if reading.stated else None
+        return {"basis": BASES[1], "level": Level(*reading.level), "states_flow": reading.stated, "area": area}
+    log_rms = whole(part)[0].reshape(-1, len(QUANTITIES))
     ringing = float(-np.mean(log_rms[:, [QUANTITIES.index(name) for name in JUDGED]]))
-    return _Stated("ringing", Level(ringing, _RINGING_ERROR)) if np.isfinite(ringing) else _Stated()
+    if np.isfinite(ringing):
+        return {"basis": BASES[2], "level": Level(ringing, beliefs("trend")["own"]["ringing"])}
+    why = dict.fromkeys(reason for reason in (lack, lacks) if reason) or ["the pressures do not ring"]
+    return {"problem": "no detector states a level: " + "; ".join(why)}
 
 
 def oil_temperature(recording: Recording) -> float | None:
@@ -129,6 +119,139 @@ def oil_temperature(recording: Recording) -> float | None:
 
 def scatter_of(basis: Basis, usual: float) -> DayToDay:
     """Return the prior on the scatter of a level between recordings, for a machine of that usual level."""
+    believed = beliefs("trend")["between"]
     if basis == "volume balance":
-        return DayToDay(max(_SHARE * abs(usual), float(np.finfo(float).tiny)), _FREEDOM)
-    return DayToDay(priors("response")["G_level"].width if basis == "pressure response" else _RINGING, _FREEDOM)
+        scale = max(believed[basis] * abs(usual), float(np.finfo(float).tiny))
+    else:
+        scale = priors("response")["G_level"].width if basis == "pressure response" else believed[basis]
+    return DayToDay(scale, believed["freedom"])
+
+
+@dataclass(frozen=True)
+class TrendPoint:
+    """One recording of a trend.
+
+    `start` [s since 1970], `day` since the first one; `value` and 95 % interval of its own error in the trend's unit,
+    None where it is left out, for the reason `note`; `group` of comparable recordings, -1 where left out.
+    """
+
+    file: str
+    start: float
+    day: float
+    value: float | None
+    low: float | None
+    high: float | None
+    group: int
+    temperature: float | None
+    note: str = ""
+
+
+class Timeline(NamedTuple):
+    """Readings in the order of their times, the `points` of them without values yet.
+
+    `groups`: what each group of comparable ones is, in words; `findings`: on the whole; `basis` of those in a group.
+    """
+
+    readings: list[LeakReading]
+    points: list[TrendPoint]
+    groups: tuple[str, ...]
+    findings: list[Finding]
+    basis: Basis | None
+
+
+def natural(name: str) -> tuple[tuple[int, int, str], ...]:
+    """Return what orders names with numbers as people do: day_2 before day_10."""
+    parts = re.findall(r"\d+|\D+", name)
+    return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts)
+
+
+def timeline(readings: Sequence[LeakReading], every: float | None = None) -> Timeline:
+    """Order readings by their times, and sort out what cannot be compared.
+
+    `every`: time between them [s], in the order of their names. Raises InputError where the time of one is not known.
+    """
+    if every is not None:
+        ordered = sorted(readings, key=lambda reading: natural(reading.file))
+        readings = [replace(reading, start=k * every) for k, reading in enumerate(ordered)]
+    if unknown := [reading.file for reading in readings if reading.start is None]:
+        raise InputError(
+            f"the time of every recording must be known, got none of {_names(unknown)}: put the date into the names "
+            "(press_20240531.csv, press_20240531_0730.csv), or give --every 1d where they were made at equal "
+            "intervals, in the order of their names"
+        )
+    ordered = sorted(readings, key=lambda reading: (reading.start or 0.0, natural(reading.file)))
+    first: dict[str, str] = {}
+    notes = []
+    for reading in ordered:
+        copy = first.setdefault(reading.digest, reading.file) if reading.basis is not None else reading.file
+        notes.append(reading.problem or ("" if copy == reading.file else f"the same samples as {copy}"))
+    kept = [reading.basis for reading, note in zip(ordered, notes, strict=True) if not note]
+    basis: Basis | None = max(BASES, key=kept.count) if kept else None
+    scales: list[float | None] = []
+    points = []
+    for k, reading in enumerate(ordered):
+        if not notes[k] and reading.basis != basis:
+            notes[k] = f"its channels allow the {reading.basis}, not the {basis}"
+        group = -1 if notes[k] else next((n for n, own in enumerate(scales) if _alike(reading.scale, own)), len(scales))
+        scales += [reading.scale] if group == len(scales) else []
+        start, first_start = reading.start or 0.0, ordered[0].start or 0.0
+        day = (start - first_start) / DAY
+        points.append(TrendPoint(reading.file, start, day, None, None, None, group, reading.temperature, notes[k]))
+    others = (
+        f"position or angle is scaled by {100.0 * _change(scale, scales[0]):+.2g} %: a sensor exchanged, or another "
+        "machine"
+        for scale in scales[1:]
+    )
+    groups = ("", *others) if scales else ()
+    return Timeline(ordered, points, groups, [*_clock(ordered), *_named(points, groups)], basis)
+
+
+def _change(scale: float | None, other: float | None) -> float:
+    return 0.0 if scale is None or other is None else scale / other - 1.0
+
+
+def _alike(scale: float | None, other: float | None) -> bool:
+    return bool(abs(_change(scale, other)) <= beliefs("trend")["own"]["scale"])
+
+
+def _clock(ordered: Sequence[LeakReading]) -> list[Finding]:
+    """Return what shows that a clock was set back: recordings that overlap, or numbered names against the times.
+
+    Recordings of one date without times of day have the same start.
+    """
+    timed = [(reading.start or 0.0, reading) for reading in ordered]
+    overlaps = [
+        f"{early.file} was still recording when {late.file} began: a clock was set back, or they are of two machines"
+        for (begin, early), (start, late) in pairwise(timed)
+        if early.digest != late.digest and begin < start < begin + 0.99 * early.duration
+    ]
+    back = [
+        f"{late.file} is numbered after {early.file} and has an earlier time: a clock was set back"
+        for (begin, early), (start, late) in pairwise(sorted(timed, key=lambda own: natural(own[1].file)))
+        if start < begin
+    ]
+    alike = len({re.split(r"[\d\W_]", reading.file, maxsplit=1)[0].lower() for reading in ordered}) == 1
+    # numbers that fall more often are no order
+    texts = overlaps or (back if alike and len(back) <= max(2, len(ordered) // 10) else [])
+    return [Finding("clock", "warning", None, len(texts), None, texts[0])] if texts else []
+
+
+def _named(points: Sequence[TrendPoint], groups: Sequence[str]) -> list[Finding]:
+    """Return findings on what is left out, one for each reason, and on what is compared among itself only."""
+    reasons: dict[str, list[TrendPoint]] = {}
+    for point in points:
+        if point.note:
+            reasons.setdefault(re.sub(r"\d[\d.]*", "#", point.note), []).append(point)  # alike but for its numbers
+    findings = []
+    for own in reasons.values():
+        text = f"{len(own)} of {len(points)} left out: {own[0].note} ({_names([point.file for point in own])})"
+        findings.append(Finding("left_out", "warning", None, len(own), None, text))
+    for number in range(1, len(groups)):
+        files = [point.file for point in points if point.group == number]
+        text = f"{len(files)} of {len(points)} compared among themselves only: {groups[number]} ({_names(files)})"
+        findings.append(Finding("not_comparable", "note", None, len(files), None, text))
+    return findings
+
+
+def _names(files: Sequence[str]) -> str:
+    return ", ".join(files[:3]) + (", ..." if len(files) > 3 else "")

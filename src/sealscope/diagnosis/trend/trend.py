@@ -6,58 +6,36 @@ import math
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sealscope.calls import checked_call
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Interval
-from sealscope.diagnosis.trend.reading import Basis, LeakReading, reading_of, scatter_of
-from sealscope.diagnosis.trend.timeline import DAY, Timeline, spaced, timeline
-from sealscope.diagnosis.trend.wear import DayToDay, Episode, Levels, Wear, beyond, episodes, merged
-from sealscope.diagnosis.verdict.diagnosis import next_check
+from sealscope.diagnosis.trend.reading import (
+    DAY,
+    Basis,
+    LeakReading,
+    Timeline,
+    TrendPoint,
+    reading_of,
+    scatter_of,
+    timeline,
+)
+from sealscope.diagnosis.trend.wear import DayToDay, Episode, Levels, Wear, beyond, episodes
 from sealscope.diagnosis.verdict.evidence import Verdict
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.severity import RepairLimit
+from sealscope.diagnosis.verdict.states import state_of
 from sealscope.errors import InputError
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
-from sealscope.signals.filters import IntArray
+from sealscope.storage.plain_values import plain
 from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
-
-#: Machine-years in which a healthy machine has one false alarm, unless the caller asks for another number.
-YEARS = 10.0
-_YEARS = (0.1, 1000.0)
-#: A laminar leak goes with 1/viscosity: ISO VG 46 of viscosity index 100 has 117 mm^2/s at 20 deg C and 30 at 50
-#: (ISO 3448), 4.5 % a kelvin; what the oil's sensor sees is not what the gap does. Mean and deviation [1/K].
-_PER_KELVIN, _PER_KELVIN_SD = 0.04, 0.015
-#: A step of so many deviations from day to day is surely found at the second recording after it.
-_FOUND = 5.0
-#: Fewest comparable recordings that show that nothing grows.
-_FEWEST = 3
-_APART = "apart from the recordings before and after: it counts as if it were near"
-
-
-@dataclass(frozen=True)
-class TrendPoint:
-    """One recording of a trend.
-
-    `start` [s since 1970], `day` since the first one; `value` and 95 % interval of its own error in the trend's unit,
-    None where it is left out, for the reason `note`; `group` of comparable recordings, -1 where left out.
-    """
-
-    file: str
-    start: float
-    day: float
-    value: float | None
-    low: float | None
-    high: float | None
-    group: int
-    temperature: float | None
-    note: str = ""
 
 
 @dataclass(frozen=True)
@@ -154,79 +132,74 @@ class Trend:
         if self.verdict == "no leak":
             return "Nothing needs a check; go on recording under the same duty."
         if self.verdict == "leak":
-            return next_check("leak", "piston or pump leak")
+            return state_of("leak", "piston or pump leak").action
         if self.wear is None:
-            return next_check("cannot tell", None)
+            return state_of("cannot tell").action
         return "Go on recording under the same duty, and compare the level with what a new machine passes."
 
     def as_dict(self) -> dict[str, Any]:
         """Return the trend as plain JSON values; a number that is not finite becomes null."""
         wear, alarm = self.wear, self.alarm
-        reached = None if wear is None or wear.reach is None or not self.points else wear.reach
-        last = self.points[-1].day if self.points else 0.0
-        return {
-            "verdict": self.verdict,
-            "reason": self.reason,
-            "basis": self.basis,
-            "unit": self.unit,
-            "pressure_Pa": _plain(self.pressure),
-            "recordings": len(self.points),
-            "compared": len(self.rows),
-            "first": self._moment(self.points[0].day) if self.points else None,
-            "last": self._moment(last) if self.points else None,
-            "now": None if wear is None else _interval(wear.now),
-            "healthy": None if wear is None else _interval(wear.healthy),
-            "day_to_day": None if wear is None else _plain(wear.scatter),
-            "growth_per_month": None if wear is None else _interval(wear.growth),
-            "step": None if wear is None or wear.step is None else _interval(wear.step),
-            "onset": None if wear is None or wear.onset is None else self._moments(*wear.onset),
-            "alarm": None if alarm is None else {"file": alarm.file, "time": self._moment(alarm.day)},
-            "repairs": [{"file": point.file, "time": self._moment(point.day)} for point in self.repairs],
-            "limit": _plain(self.limit),
-            "repair_limit": self.repair.as_dict(),
-            "days_to_limit": None if reached is None else _interval(reached),
-            "limit_reached": None if reached is None else self._moments(*(last + days for days in reached)),
-            "false_alarm_years": self.years,
-            "healthy_recordings": self.healthy,
-            "rig": None if self.machine is None else self.machine.as_dict(),
-            "groups": list(self.groups),
-            "points": [
-                {
-                    "file": point.file,
-                    "time": self._moment(point.day),
-                    "day": point.day,
-                    **{name: _plain(getattr(point, name)) for name in ("value", "low", "high")},
-                    "group": None if point.group < 0 else point.group,
-                    "temperature_C": _plain(point.temperature),
-                    "note": point.note,
-                }
-                for point in self.points
-            ],
-            "findings": [
-                {name: getattr(finding, name) for name in ("code", "count", "severity", "text")}
-                for finding in self.findings
-            ],
-            "next_check": self.next_check,
-        }
+        first, last = (self.points[0].day, self.points[-1].day) if self.points else (math.nan, math.nan)
+        figures = ("now", "healthy", "growth", "step", "onset", "reach", "scatter")
+        now, healthy, growth, step, onset, reach, scatter = (wear and getattr(wear, name) for name in figures)
+        return plain(  # type: ignore[no-any-return]
+            {
+                "verdict": self.verdict,
+                "reason": self.reason,
+                "basis": self.basis,
+                "unit": self.unit,
+                "pressure_Pa": self.pressure,
+                "recordings": len(self.points),
+                "compared": len(self.rows),
+                "first": self._moment(first),
+                "last": self._moment(last),
+                "now": now,
+                "healthy": healthy,
+                "day_to_day": scatter,
+                "growth_per_month": growth,
+                "step": step,
+                "onset": self._moments(onset),
+                "alarm": None if alarm is None else {"file": alarm.file, "time": self._moment(alarm.day)},
+                "repairs": [{"file": point.file, "time": self._moment(point.day)} for point in self.repairs],
+                "limit": self.limit,
+                "repair_limit": self.repair.as_dict(),
+                "days_to_limit": reach,
+                "limit_reached": self._moments(reach and Interval(*(last + days for days in reach))),
+                "false_alarm_years": self.years,
+                "healthy_recordings": self.healthy,
+                "rig": None if self.machine is None else self.machine.as_dict(),
+                "groups": self.groups,
+                "points": [
+                    {
+                        "file": point.file,
+                        "time": self._moment(point.day),
+                        "day": point.day,
+                        "value": point.value,
+                        "low": point.low,
+                        "high": point.high,
+                        "group": None if point.group < 0 else point.group,
+                        "temperature_C": point.temperature,
+                        "note": point.note,
+                    }
+                    for point in self.points
+                ],
+                "findings": [
+                    {name: getattr(finding, name) for name in ("code", "count", "severity", "text")}
+                    for finding in self.findings
+                ],
+                "next_check": self.next_check,
+            }
+        )
 
     def _moment(self, day: float) -> str | float | None:
         """Return a time as an ISO stamp, or in days where the times are not known."""
-        if not math.isfinite(day):
-            return None
-        if not self.dated or not self.points:
+        if not math.isfinite(day) or not self.dated:
             return day
         return str(np.datetime64(round((self.points[0].start + (day - self.points[0].day) * DAY) * 1e3), "ms"))[:19]
 
-    def _moments(self, *days: float) -> dict[str, str | float | None]:
-        return dict(zip(("value", "low", "high"), map(self._moment, days), strict=True))
-
-
-def _plain(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else float(value)
-
-
-def _interval(interval: Interval) -> dict[str, float | None]:
-    return {name: _plain(value) for name, value in interval._asdict().items()}
+    def _moments(self, days: Interval | None) -> dict[str, str | float | None] | None:
+        return days and {name: self._moment(day) for name, day in days._asdict().items()}
 
 
 @checked_call
@@ -236,7 +209,7 @@ def trend(
     rig: Rig | str | os.PathLike[str] | None = None,
     healthy: int = 1,
     limit: str | None = None,
-    years: float = YEARS,
+    years: float = 10.0,
     every: float | None = None,
 ) -> Trend:
     """Return how the leakage of a single machine went over its recordings.
@@ -286,115 +259,86 @@ def trend_of(
     *,
     healthy: int = 1,
     limit: str | None = None,
-    years: float = YEARS,
+    years: float = 10.0,
     every: float | None = None,
 ) -> Trend:
     """Return the trend of readings; arguments and errors as for `trend`."""
     if not (isinstance(healthy, int) and healthy >= 1):
         raise InputError(f"the number of healthy recordings must be 1 or more, got {healthy!r}")
-    if not _YEARS[0] <= years <= _YEARS[1]:
-        raise InputError(f"machine-years to a false alarm must be {_YEARS[0]:g} to {_YEARS[1]:g}, got {years!r}")
+    if not 0.1 <= years <= 1000.0:
+        raise InputError(f"machine-years to a false alarm must be 0.1 to 1000, got {years!r}")
     if every is not None and not (math.isfinite(every) and every > 0.0):
         raise InputError(f"every must be > 0 s, got {every!r}")
-    repair = RepairLimit.of(limit)
-    line = timeline(readings if every is None else spaced(readings, every))
-    return _trend(line, healthy=healthy, repair=repair, years=years, dated=every is None)
-
-
-def _trend(line: Timeline, *, healthy: int, repair: RepairLimit, years: float, dated: bool) -> Trend:
-    kept = np.flatnonzero(line.group >= 0)
-    series = _series(line, kept, healthy, repair) if kept.size else None
-    findings, rows = list(line.findings), kept
-    stretches: tuple[Episode, ...] = ()
-    points = [_point(reading, line.readings[0], note) for reading, note in zip(line.readings, line.notes, strict=True)]
-    if series is not None:
-        levels, few = series.levels, merged(series.levels)
-        alone = np.flatnonzero(beyond(levels, series.prior)[1])
-        if alone.size:
-            files = ", ".join(line.readings[int(kept[k])].file for k in alone[:3])
-            text = f"{alone.size} of {len(points)} {_APART} ({files})"
-            findings.append(Finding("outlier", "warning", None, int(alone.size), None, text))
-        for k, row in enumerate(kept):
-            value, half = float(levels.value[k]), 1.96 * float(levels.error[k])
-            points[row] = replace(
-                points[row],
-                value=value,
-                low=value - half,
-                high=value + half,
-                group=int(line.group[row]),
-                note=_APART if k in alone else "",
-            )
-        known = max(1, round(healthy * len(few) / len(levels)))
-        stretches = tuple(episodes(few, series.prior, years=years, known=known, allowed=series.allowed))
-        if len(few) < len(levels):
-            rows = kept[[int(np.argmin(np.abs(levels.t - t))) for t in few.t]]
-    trend = Trend(
+    line, repair = timeline(readings, every), RepairLimit.of(limit)
+    kept = [k for k, point in enumerate(line.points) if point.group >= 0]
+    flows = bool(kept) and all(line.readings[k].states_flow for k in kept)
+    stated = Trend(
         verdict="cannot tell",
         reason="",
         basis=line.basis,
-        unit="L/min" if series is not None and series.states_flow else "%",
-        pressure=series.pressure if series is not None and series.states_flow else None,
-        points=tuple(points),
+        unit="L/min" if flows else "%",
+        pressure=float(np.median([line.readings[k].pressure for k in kept])) if flows else None,
+        points=tuple(line.points),
         groups=line.groups,
-        episodes=stretches,
-        rows=tuple(map(int, rows)),
+        episodes=(),
+        rows=tuple(kept),
         repair=repair,
         machine=line.readings[0].machine if line.readings else None,
-        findings=tuple(findings),
+        findings=tuple(line.findings),
         years=years,
         healthy=healthy,
-        dated=dated,
+        dated=every is None,
     )
-    verdict, reason = _verdict(trend)
-    return replace(trend, verdict=verdict, reason=reason)
+    if kept:
+        stated = _with_levels(stated, line)
+    verdict, reason = _verdict(stated)
+    return replace(stated, verdict=verdict, reason=reason)
 
 
-class _Series(NamedTuple):
-    """Levels of readings in the trend's unit, and their prior.
+def _with_levels(trend: Trend, line: Timeline) -> Trend:
+    """Return the trend with its levels and what they say, of one recording or more that can be compared."""
+    levels, prior, allowed = _levels(trend, [line.readings[k] for k in trend.rows])
+    few, points, findings = levels.merged(), [*trend.points], trend.findings
+    alone = np.flatnonzero(beyond(levels, prior)[1])
+    apart = "apart from the recordings before and after: it counts as if it were near"
+    if alone.size:
+        files = ", ".join(points[trend.rows[k]].file for k in alone[:3])
+        text = f"{alone.size} of {len(points)} {apart} ({files})"
+        findings = (*findings, Finding("outlier", "warning", None, int(alone.size), None, text))
+    for k, row in enumerate(trend.rows):
+        value, half = float(levels.value[k]), 1.96 * float(levels.error[k])
+        note = apart if k in alone else ""
+        points[row] = replace(points[row], value=value, low=value - half, high=value + half, note=note)
+    known = max(1, round(trend.healthy * len(few) / len(levels)))
+    stretches = episodes(few, prior, years=trend.years, known=known, allowed=allowed)
+    rows = [trend.rows[int(np.argmin(np.abs(levels.t - t)))] for t in few.t] if few is not levels else trend.rows
+    return replace(trend, points=tuple(points), findings=findings, episodes=tuple(stretches), rows=tuple(rows))
 
-    `states_flow`: whether the unit is L/min, at the `pressure` [Pa]; `allowed`: rise at which a repair is due, None
-    where it cannot be stated in the unit.
-    """
 
-    levels: Levels
-    prior: DayToDay
-    states_flow: bool
-    pressure: float
-    allowed: float | None
-
-
-def _series(line: Timeline, kept: IntArray, healthy: int, repair: RepairLimit) -> _Series:
-    readings = [line.readings[k] for k in kept]
-    t = np.array([_day(reading, line.readings[0]) for reading in readings])
+def _levels(trend: Trend, readings: Sequence[LeakReading]) -> tuple[Levels, DayToDay, float | None]:
+    """Return the levels in the trend's unit, their prior, and the rise at which a repair is due, None where unknown."""
+    points = [trend.points[k] for k in trend.rows]
+    t, group = np.array([point.day for point in points]), np.array([point.group for point in points])
     value, error = (np.array([reading.level[k] for reading in readings]) for k in (0, 1))
-    usual, pressure = float(np.mean(value[:healthy])), float(np.median([reading.pressure for reading in readings]))
-    scatter = scatter_of(line.basis or "ringing", usual)
+    usual, pressure = float(np.mean(value[: trend.healthy])), float(np.median([own.pressure for own in readings]))
+    prior = scatter_of(trend.basis or "ringing", usual)
     warmer, slope_sd = np.zeros(t.size), 0.0
     temperatures = [reading.temperature for reading in readings if reading.temperature is not None]
-    if line.basis != "ringing" and len(temperatures) == t.size:
-        warmer, slope_sd = np.array(temperatures) - temperatures[0], _PER_KELVIN_SD * abs(usual)
-        value, error = value * np.exp(-_PER_KELVIN * warmer), error * np.exp(-_PER_KELVIN * warmer)
-    flows = all(reading.states_flow for reading in readings)
+    if trend.basis != "ringing" and len(temperatures) == t.size:
+        oil = beliefs("trend")["oil"]
+        warmer, slope_sd = np.array(temperatures) - temperatures[0], oil["kelvin_deviation"] * abs(usual)
+        value, error = (own * np.exp(-oil["kelvin"] * warmer) for own in (value, error))
+    flows = trend.pressure is not None
     unit = pressure / LITRE_PER_MINUTE if flows else 100.0 / max(abs(usual), float(np.finfo(float).tiny))
-    if line.basis == "ringing":
+    if trend.basis == "ringing":
         unit, value = 100.0, value - usual
     allowed = None
-    if repair.kind == "flow" and flows:
-        allowed = repair.value / LITRE_PER_MINUTE
-    elif repair.kind == "creep" and readings[0].area is not None:
-        allowed = repair.value * readings[0].area / pressure * unit
-    levels = Levels(t, value * unit, error * unit, line.group[kept], warmer, slope_sd * unit)
-    return _Series(levels, scatter._replace(scale=scatter.scale * unit), flows, pressure, allowed)
-
-
-def _day(reading: LeakReading, first: LeakReading) -> float:
-    return ((reading.start or 0.0) - (first.start or 0.0)) / DAY
-
-
-def _point(reading: LeakReading, first: LeakReading, note: str) -> TrendPoint:
-    """Return the point of a recording that is left out."""
-    day, start = _day(reading, first), reading.start or 0.0
-    return TrendPoint(reading.file, start, day, None, None, None, -1, reading.temperature, note)
+    if trend.repair.kind == "flow" and flows:
+        allowed = trend.repair.value / LITRE_PER_MINUTE
+    elif trend.repair.kind == "creep" and readings[0].area is not None:
+        allowed = trend.repair.value * readings[0].area / pressure * unit
+    levels = Levels(t, value * unit, error * unit, group, warmer, slope_sd * unit)
+    return levels, prior._replace(scale=prior.scale * unit), allowed
 
 
 def _verdict(trend: Trend) -> tuple[Verdict, str]:
@@ -421,9 +365,9 @@ def _verdict(trend: Trend) -> tuple[Verdict, str]:
             f"the leakage {shape} beyond the machine's own scatter ({rate}); pump and piston are not told apart"
         )
     count = last.end - last.begin
-    if count < _FEWEST:
-        return "cannot tell", f"{count} comparable recordings are too few, {_FEWEST} are needed"
-    found = _FOUND * max(wear.scatter, (wear.healthy.high - wear.healthy.low) / 3.92)
+    if count < 3:
+        return "cannot tell", f"{count} comparable recordings are too few, 3 are needed"
+    found = 5.0 * max(wear.scatter, (wear.healthy.high - wear.healthy.low) / 3.92)
     if trend.limit is not None and wear.healthy.value + found > trend.limit:
         return "cannot tell", (
             f"the level scatters so much from recording to recording that a rise to the limit would not surely show: "

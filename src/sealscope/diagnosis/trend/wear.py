@@ -30,33 +30,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Interval
 from sealscope.recordings.recording import Array
 from sealscope.signals.filters import IntArray
 
-BoolArray: TypeAlias = NDArray[np.bool_]
-
 #: Days of a month: a growth is stated per month.
 MONTH = 365.25 / 12.0
-#: Grid of tau, from a share of the prior's scale to so many times the larger of scale and scatter seen, and of r.
-_LEAST, _MOST, _NODES, _LASTING = 0.1, 10.0, 14, (0.0, 0.5, 0.9)
-#: How long what lasts does [days]: for an hour within a session (a machine warms up), for a week (weather, load).
-_TIMES = (1.0 / 24.0, 7.0)
-#: Recordings of a shorter time [days] state no growth by a month; a wait for the next counts up to the longest.
-_LEAST_SPAN, LONGEST_WAIT = 1.0, 30.0
-#: Scales of a step's prior in tau, and of a growth's: tau in so many typical intervals between recordings.
-_STEPS, _INTERVALS = (2.0, 8.0, 40.0, 200.0), (0.05, 0.5, 4.0, 12.0, 48.0)
-#: A single recording counts no further than so many deviations from so many before it, unless the next agrees.
-_HELD, _BESIDE = 3.5, 3
-#: Most recordings that are searched; neighbours of more are merged.
-MOST = 240
-#: Draws from the posterior for figures that have no closed form, and their seed.
-_DRAWS, _SEED = 4000, 20
 #: Deviation of a prior that says nothing, over scatter and range of the values: its square leaves half of the digits.
 _WIDE, _TINY = 1e2, 1e-10
 
@@ -93,7 +78,7 @@ class Levels:
     def __len__(self) -> int:
         return self.t.size
 
-    def part(self, rows: IntArray | slice) -> Levels:
+    def part(self, rows: slice) -> Levels:
         """Return some of the recordings."""
         t, value, error, covariate = (own[rows] for own in (self.t, self.value, self.error, self.covariate))
         return Levels(t, value, error, self.group[rows], covariate, self.slope_sd)
@@ -110,6 +95,203 @@ class Levels:
         known = prior.scale**2 + (float(np.mean(self.error**2)) if len(self) else 0.0)
         own = (1.4826 * float(np.median(steps))) ** 2 if steps.size else 0.0
         return math.sqrt((prior.freedom * known + steps.size * own) / (prior.freedom + steps.size))
+
+    def merged(self, most: int = 240) -> Levels:
+        """Return about so many levels at most: neighbours of a group are averaged where there are more."""
+        each = -(-len(self) // most)
+        if each <= 1:
+            return self
+        runs = np.split(np.arange(len(self)), np.flatnonzero(np.diff(self.group)) + 1)
+        rows = [run[k : k + each] for run in runs for k in range(0, run.size, each)]
+        t, value, covariate = (np.array([own[r].mean() for r in rows]) for own in (self.t, self.value, self.covariate))
+        error = np.array([math.sqrt(np.sum(self.error[r] ** 2)) / r.size for r in rows])
+        return Levels(t, value, error, self.group[[r[0] for r in rows]], covariate, self.slope_sd)
+
+
+def beyond(levels: Levels, prior: DayToDay) -> tuple[Array, Array]:
+    """Return what of each value does not count while it is the last one, and what not once the next one is known.
+
+    That is what is beyond 3.5 deviations of the three before it, unless its neighbour lies as far out.
+    """
+    last, later = np.zeros((2, len(levels)))
+    for k in range(1, len(levels)):
+        same = np.flatnonzero(levels.group == levels.group[k])
+        place = int(np.searchsorted(same, k))
+        before, after = levels.value[same[max(place - 3, 0) : place]], levels.value[same[place + 1 : place + 2]]
+        if before.size:
+            reach, middle = 3.5 * levels.part(slice(0, k)).scatter(prior), float(np.median(before))
+            apart = levels.value[k] - middle
+            agree = [np.sign(apart) * (other - middle) > reach for other in (before[-1], *after)]
+            last[k] = 0.0 if agree[0] else np.sign(apart) * max(abs(apart) - reach, 0.0)
+            later[k] = 0.0 if any(agree) or not after.size else last[k]
+    return last, later
+
+
+class _Changes(NamedTuple):
+    """Possible changes: c of them, of m shapes (n, m).
+
+    Of each change (c,) the `column` of its shape, the `scale` of its size in tau, `begin`: the recording that shows it
+    first, `grows`: whether it is a growth, `log_weight`: logarithm of its weight w_j, shared among the kinds and scales
+    of a begin.
+    """
+
+    shape: Array
+    column: IntArray
+    scale: Array
+    begin: IntArray
+    grows: NDArray[np.bool_]
+    log_weight: Array
+
+    @classmethod
+    def after(cls, levels: Levels, known: int, *, steps_only: bool = False) -> _Changes:
+        """Return the changes that may begin after the first `known` recordings."""
+        believed = beliefs("trend")["change"]
+        begin = np.arange(max(known, 1), len(levels))
+        step = (np.arange(len(levels))[:, None] >= begin).astype(float)
+        growth = np.maximum(levels.t[:, None] - levels.t[begin - 1], 0.0) / MONTH
+        slopes = [] if steps_only else [MONTH / levels.interval / many for many in believed["intervals"]]
+        steps = len(believed["steps"])
+        scale = np.array([*believed["steps"], *slopes], dtype=float)[:, None]
+        grows = np.arange(scale.size)[:, None] >= steps
+        share = np.where(grows, len(slopes), steps) * (1.0 if steps_only else 2.0)
+        with np.errstate(divide="ignore"):
+            log_weight = np.log(np.clip(levels.t[begin] - levels.t[begin - 1], 0.0, believed["wait"]) / share)
+        column = np.arange(begin.size) + begin.size * grows
+        spread = np.broadcast_arrays(column, scale, begin, grows, log_weight)
+        return cls(np.hstack([step, growth]), *(own.ravel() for own in spread))  # type: ignore[call-arg]
+
+    @classmethod
+    def single(cls, shape: Array, scale: float) -> _Changes:
+        """Return a change of one shape (n,), whose scale is in tau."""
+        first, one = np.zeros(1, dtype=np.int64), np.ones(1)
+        return cls(shape[:, None], first, scale * one, first, one > 0.0, 0.0 * one)
+
+
+class _Node(NamedTuple):
+    """A pair (tau, r) of the grid, with all recordings whitened by it.
+
+    `log` (n,): logarithm of its prior and of the likelihood without a change, after each recording; `a`, `b` (n, m) of
+    m shapes of changes; of the last group's mean `mean`, `variance`, and by how much it `yields` (m,) to each change.
+    """
+
+    tau: float
+    log: Array
+    a: Array
+    b: Array
+    mean: float
+    variance: float
+    yields: Array
+
+
+def _nodes(levels: Levels, prior: DayToDay, shapes: Array, *, sloping: bool = False) -> list[_Node]:
+    """Return every node of the grid, for changes (n, m); `sloping`: the level may have grown evenly before."""
+    from scipy.linalg import solve_triangular
+
+    believed = beliefs("trend")["between"]
+    last, later = beyond(levels, prior)
+    values = levels.value - levels.value[0] - later
+    reach = max(prior.scale, 0.3 * float(np.ptp(levels.value)))
+    wide = (_WIDE * reach) ** 2
+    mean = wide * (levels.group == levels.group[-1])
+    shared = wide * (levels.group[:, None] == levels.group) + levels.slope_sd**2 * np.outer(*(levels.covariate,) * 2)
+    if sloping:
+        grown = 10.0 * levels.scatter(prior) / levels.interval * (levels.t - levels.t[0])
+        shared += np.outer(grown, grown)
+    waits = np.abs(levels.t[:, None] - levels.t)
+    lasting = np.mean([np.exp(-waits / time) for time in believed["times"]], axis=0)
+    right = np.column_stack([values, mean, shapes])
+    nodes = []
+    for tau in np.geomspace(0.1 * prior.scale, 10.0 * reach, believed["nodes"]):
+        log_prior = -prior.freedom * (math.log(tau) + 0.5 * (prior.scale / tau) ** 2)
+        for share in believed["lasts"]:
+            own = shared + tau**2 * share * lasting
+            own[np.diag_indices(len(levels))] += tau**2 * (1.0 - share + _TINY) + levels.error**2
+            L = np.linalg.cholesky(own)
+            z, u, g = np.split(solve_triangular(L, right, lower=True, check_finite=False), [1, 2], axis=1)
+            held = z - ((last - later) / L.diagonal())[:, None]  # the value counts so while it is the last
+            square = np.cumsum(z**2) - (z**2 - held**2)[:, 0]
+            log = log_prior - np.cumsum(np.log(L.diagonal())) - 0.5 * square
+            a, b = np.cumsum(g**2, axis=0), np.cumsum(g * z, axis=0) - g * (z - held)
+            base = float(levels.value[0] + u[:-1, 0] @ z[:-1, 0] + u[-1, 0] * held[-1, 0])
+            nodes.append(_Node(float(tau), log, a, b, base, wide - float(u[:, 0] @ u[:, 0]), g.T @ u[:, 0]))
+    return nodes
+
+
+def _log_ratio(a: Array, b: Array, scale: Array) -> Array:
+    """Return log E[exp(b delta - a delta^2/2)] for delta > 0, half-normal of a scale.
+
+    ``2 (1 + a k^2)^(-1/2) exp(b^2 v/2) Phi(b sqrt(v))`` with ``v = 1/(a + 1/k^2)``.
+    """
+    from scipy.special import log_ndtr
+
+    v = 1.0 / (a + scale**-2)
+    bent = math.log(2.0) - 0.5 * np.log1p(a * scale**2) + log_ndtr(b * np.sqrt(v))
+    return np.asarray(bent + 0.5 * b * b * v, dtype=float)
+
+
+class Path(NamedTuple):
+    """The sequential test after each recording (n,): `log_R`, and `first`: which shows the likeliest change first."""
+
+    log_R: Array
+    first: IntArray
+
+    def alarm(self, days: float) -> int | None:
+        """Return the first recording after which R is over a mean time to a false alarm, None where it never is."""
+        over = np.flatnonzero(self.log_R > math.log(days))
+        return int(over[0]) if over.size else None
+
+
+def search(levels: Levels, prior: DayToDay, known: int = 1, *, falls: bool = False, sloping: bool = False) -> Path:
+    """Run the sequential test for a rise (a step or a growth), or for a fall (a step).
+
+    `known`: how many of the first recordings are known to be of a machine that has not changed; `sloping`: whether the
+    level may have grown evenly before.
+    """
+    if falls:
+        levels = replace(levels, value=-levels.value)
+    n, changes = len(levels), _Changes.after(levels, known, steps_only=falls)
+    terms, null = np.full((n, changes.begin.size), -np.inf), np.full(n, -np.inf)
+    if not changes.begin.size:
+        return Path(null, np.zeros(n, dtype=np.int64))
+    for node in _nodes(levels, prior, changes.shape, sloping=sloping):
+        null = np.logaddexp(null, node.log)
+        a, b = node.a[:, changes.column], node.b[:, changes.column]
+        terms = np.logaddexp(terms, node.log[:, None] + _log_ratio(a, b, changes.scale * node.tau))
+    terms += changes.log_weight - null[:, None]
+    terms[np.arange(n)[:, None] < changes.begin] = -np.inf
+    return Path(np.logaddexp.reduce(terms, axis=1), changes.begin[np.argmax(terms, axis=1)])
+
+
+class _Draws(NamedTuple):
+    """Draws (d,) from the posterior after all recordings: `tau`, which `change`, its `size`, mean before it `base`."""
+
+    tau: Array
+    change: IntArray
+    size: Array
+    base: Array
+
+    @classmethod
+    def of(cls, levels: Levels, prior: DayToDay, changes: _Changes, *, signed: bool = False) -> _Draws:
+        """Return draws; `signed`: the size may be of either sign, its prior flat."""
+        from scipy.special import ndtr, ndtri
+
+        random, count = np.random.default_rng(20), 4000
+        nodes = _nodes(levels, prior, changes.shape)
+        a, b = (np.stack([getattr(node, name)[-1][changes.column] for node in nodes]) for name in ("a", "b"))
+        scale = changes.scale * np.array([[node.tau] for node in nodes])
+        v = 1.0 / (a + scale**-2)
+        ratio = 0.5 * (np.log(v) + b * b * v) if signed else _log_ratio(a, b, scale)
+        log_weight = np.array([[node.log[-1]] for node in nodes]) + ratio + changes.log_weight
+        weight = np.exp(log_weight - log_weight.max())
+        chosen = random.choice(weight.size, count, p=weight.ravel() / weight.sum())
+        node, change = np.unravel_index(chosen, weight.shape)
+        mean, deviation = (b * v)[node, change], np.sqrt(v)[node, change]
+        low = np.zeros(count) if signed else ndtr(-mean / deviation)  # of a normal number that is known to be positive
+        size = mean + deviation * ndtri(np.clip(low + (1.0 - low) * random.random(count), 1e-300, 1.0 - 1e-16))
+        tau, base, variance = np.array([(own.tau, own.mean, own.variance) for own in nodes])[node].T
+        yields = np.stack([own.yields[changes.column] for own in nodes])[node, change]
+        spread = np.sqrt(np.maximum(variance, 0.0)) * random.standard_normal(count)
+        return cls(tau, change, size, base - yields * size + spread)
 
 
 class Wear(NamedTuple):
@@ -132,218 +314,10 @@ class Wear(NamedTuple):
     reach: Interval | None
 
 
-def merged(levels: Levels) -> Levels:
-    """Return at most about `MOST` levels: neighbours of a group are averaged where there are more."""
-    each = -(-len(levels) // MOST)
-    if each <= 1:
-        return levels
-    runs = np.split(np.arange(len(levels)), np.flatnonzero(np.diff(levels.group)) + 1)
-    rows = [run[k : k + each] for run in runs for k in range(0, run.size, each)]
-    t, value, covariate = (
-        np.array([own[r].mean() for r in rows]) for own in (levels.t, levels.value, levels.covariate)
-    )
-    error = np.array([math.sqrt(np.sum(levels.error[r] ** 2)) / r.size for r in rows])
-    return Levels(t, value, error, levels.group[[r[0] for r in rows]], covariate, levels.slope_sd)
-
-
-def beyond(levels: Levels, prior: DayToDay) -> tuple[Array, Array]:
-    """Return what of each value does not count while it is the last one, and what not once the next one is known.
-
-    That is what is beyond `_HELD` deviations of those before it, unless its neighbour lies as far out.
-    """
-    last, later = np.zeros((2, len(levels)))
-    for k in range(1, len(levels)):
-        same = np.flatnonzero(levels.group == levels.group[k])
-        place = int(np.searchsorted(same, k))
-        before, after = levels.value[same[max(place - _BESIDE, 0) : place]], levels.value[same[place + 1 : place + 2]]
-        if before.size:
-            reach, middle = _HELD * levels.part(slice(0, k)).scatter(prior), float(np.median(before))
-            apart = levels.value[k] - middle
-            agree = [np.sign(apart) * (other - middle) > reach for other in (before[-1], *after)]
-            last[k] = 0.0 if agree[0] else np.sign(apart) * max(abs(apart) - reach, 0.0)
-            later[k] = 0.0 if any(agree) or not after.size else last[k]
-    return last, later
-
-
-class _Node(NamedTuple):
-    """A pair (tau, r) of the grid, with all recordings whitened by it.
-
-    `log` (n,): logarithm of its prior and of the likelihood without a change, after each recording; `a`, `b` (n, m) of
-    m changes; of the last group's mean `mean`, `variance`, and by how much it `yields` (m,) to each change.
-    """
-
-    tau: float
-    log: Array
-    a: Array
-    b: Array
-    mean: float
-    variance: float
-    yields: Array
-
-
-def _nodes(levels: Levels, prior: DayToDay, changes: Array, *, sloping: bool = False) -> list[_Node]:
-    """Return every node of the grid, for changes (n, m); `sloping`: the level may have grown evenly before."""
-    from scipy.linalg import solve_triangular
-
-    last, later = beyond(levels, prior)
-    values = levels.value - levels.value[0] - later
-    reach = max(prior.scale, 0.3 * float(np.ptp(levels.value)))
-    wide = (_WIDE * reach) ** 2
-    mean = wide * (levels.group == levels.group[-1])
-    shared = wide * (levels.group[:, None] == levels.group) + levels.slope_sd**2 * np.outer(*(levels.covariate,) * 2)
-    if sloping:
-        grown = 10.0 * levels.scatter(prior) / levels.interval * (levels.t - levels.t[0])
-        shared += np.outer(grown, grown)
-    lasting = np.mean([np.exp(-np.abs(levels.t[:, None] - levels.t) / time) for time in _TIMES], axis=0)
-    right = np.column_stack([values, mean, changes])
-    nodes = []
-    for tau in np.geomspace(_LEAST * prior.scale, _MOST * reach, _NODES):
-        log_prior = -prior.freedom * (math.log(tau) + 0.5 * (prior.scale / tau) ** 2)
-        for share in _LASTING:
-            own = shared + tau**2 * share * lasting
-            own[np.diag_indices(len(levels))] += tau**2 * (1.0 - share + _TINY) + levels.error**2
-            L = np.linalg.cholesky(own)
-            z, u, g = np.split(solve_triangular(L, right, lower=True, check_finite=False), [1, 2], axis=1)
-            held = z - ((last - later) / L.diagonal())[:, None]  # the value counts so while it is the last
-            square = np.cumsum(z**2) - (z**2 - held**2)[:, 0]
-            nodes.append(
-                _Node(
-                    float(tau),
-                    log_prior - np.cumsum(np.log(L.diagonal())) - 0.5 * square,
-                    np.cumsum(g**2, axis=0),
-                    np.cumsum(g * z, axis=0) - g * (z - held),
-                    float(levels.value[0] + u[:-1, 0] @ z[:-1, 0] + u[-1, 0] * held[-1, 0]),
-                    wide - float(u[:, 0] @ u[:, 0]),
-                    g.T @ u[:, 0],
-                )
-            )
-    return nodes
-
-
-def _log_ratio(a: Array, b: Array, scale: Array) -> Array:
-    """Return log E[exp(b delta - a delta^2/2)] for delta > 0, half-normal of a scale.
-
-    ``2 (1 + a k^2)^(-1/2) exp(b^2 v/2) Phi(b sqrt(v))`` with ``v = 1/(a + 1/k^2)``.
-    """
-    from scipy.special import log_ndtr
-
-    v = 1.0 / (a + scale**-2)
-    bent = math.log(2.0) - 0.5 * np.log1p(a * scale**2) + log_ndtr(b * np.sqrt(v))
-    return np.asarray(bent + 0.5 * b * b * v, dtype=float)
-
-
-class _Changes(NamedTuple):
-    """Possible changes: c of them, of m shapes.
-
-    `shape` (n, m); of each change (c,) the `column` of its shape, the `scale` of its size in tau, `begin`: the
-    recording that shows it first, `grows`: whether it is a growth, `log_weight`: logarithm of its weight w_j, shared
-    among the kinds and scales of a begin.
-    """
-
-    shape: Array
-    column: IntArray
-    scale: Array
-    begin: IntArray
-    grows: BoolArray
-    log_weight: Array
-
-
-def _changes(levels: Levels, known: int, *, steps_only: bool = False) -> _Changes:
-    """Return the changes that may begin after the first `known` recordings."""
-    begin = np.arange(max(known, 1), len(levels))
-    step = (np.arange(len(levels))[:, None] >= begin).astype(float)
-    growth = np.maximum(levels.t[:, None] - levels.t[begin - 1], 0.0) / MONTH
-    slopes = () if steps_only else tuple(MONTH / levels.interval / many for many in _INTERVALS)
-    scale, grows = np.array([*_STEPS, *slopes]), np.arange(len(_STEPS) + len(slopes)) >= len(_STEPS)
-    share = np.where(grows, len(_INTERVALS), len(_STEPS)) * (1.0 if steps_only else 2.0)
-    waits = np.clip(levels.t[begin] - levels.t[begin - 1], 0.0, LONGEST_WAIT)
-    with np.errstate(divide="ignore"):
-        log_weight = np.log(waits / share[:, None])
-    column = np.arange(begin.size) + begin.size * grows[:, None]
-    spread = np.broadcast_arrays(column, scale[:, None], begin, grows[:, None], log_weight)
-    return _Changes(np.hstack([step, growth]), *(own.ravel() for own in spread))  # type: ignore[call-arg]
-
-
-class Path(NamedTuple):
-    """The sequential test: `log_R` (n,) after each recording, `terms` (n, c) of it, `begin` (c,) of each change."""
-
-    log_R: Array
-    terms: Array
-    begin: IntArray
-
-    def alarm(self, days: float) -> int | None:
-        """Return the first recording after which R is over a mean time to a false alarm, None where it never is."""
-        over = np.flatnonzero(self.log_R > math.log(days))
-        return int(over[0]) if over.size else None
-
-    def likeliest(self, after: int) -> int:
-        """Return the recording at which the likeliest change shows first, as known after a recording."""
-        return int(self.begin[int(np.argmax(self.terms[after]))])
-
-
-def search(levels: Levels, prior: DayToDay, known: int = 1, *, falls: bool = False, sloping: bool = False) -> Path:
-    """Run the sequential test for a rise (a step or a growth), or for a fall (a step).
-
-    `known`: how many of the first recordings are known to be of a machine that has not changed; `sloping`: whether the
-    level may have grown evenly before.
-    """
-    if falls:
-        levels = replace(levels, value=-levels.value)
-    n, changes = len(levels), _changes(levels, known, steps_only=falls)
-    terms, null = np.full((n, changes.begin.size), -np.inf), np.full(n, -np.inf)
-    if not changes.begin.size:
-        return Path(null, terms, changes.begin)
-    for node in _nodes(levels, prior, changes.shape, sloping=sloping):
-        null = np.logaddexp(null, node.log)
-        a, b = node.a[:, changes.column], node.b[:, changes.column]
-        terms = np.logaddexp(terms, node.log[:, None] + _log_ratio(a, b, changes.scale * node.tau))
-    terms += changes.log_weight - null[:, None]
-    terms[np.arange(n)[:, None] < changes.begin] = -np.inf
-    return Path(np.logaddexp.reduce(terms, axis=1), terms, changes.begin)
-
-
-class _Draws(NamedTuple):
-    """Draws (d,) from the posterior after all recordings: `tau`, which `change`, its `size`, mean before it `base`."""
-
-    tau: Array
-    change: IntArray
-    size: Array
-    base: Array
-
-
-def _draws(levels: Levels, prior: DayToDay, changes: _Changes, *, signed: bool = False) -> _Draws:
-    """Return draws; `signed`: the size may be of either sign, its prior flat."""
-    from scipy.special import ndtr, ndtri
-
-    random = np.random.default_rng(_SEED)
-    nodes = _nodes(levels, prior, changes.shape)
-    a, b = (np.stack([getattr(node, name)[-1][changes.column] for node in nodes]) for name in ("a", "b"))
-    tau = np.array([node.tau for node in nodes])
-    scale = changes.scale * tau[:, None]
-    v = 1.0 / (a + scale**-2)
-    ratio = 0.5 * (np.log(v) + b * b * v) if signed else _log_ratio(a, b, scale)
-    log_weight = np.array([[node.log[-1]] for node in nodes]) + ratio + changes.log_weight
-    weight = np.exp(log_weight - log_weight.max())
-    node, change = np.unravel_index(random.choice(weight.size, _DRAWS, p=weight.ravel() / weight.sum()), weight.shape)
-    mean, deviation = (b * v)[node, change], np.sqrt(v)[node, change]
-    low = np.zeros(_DRAWS) if signed else ndtr(-mean / deviation)  # of a normal number that is known to be positive
-    size = mean + deviation * ndtri(np.clip(low + (1.0 - low) * random.random(_DRAWS), 1e-300, 1.0 - 1e-16))
-    base, variance = (np.array([getattr(own, name) for own in nodes])[node] for name in ("mean", "variance"))
-    yields = np.stack([own.yields[changes.column] for own in nodes])[node, change]
-    spread = np.sqrt(np.maximum(variance, 0.0)) * random.standard_normal(_DRAWS)
-    return _Draws(tau[node], change, size, base - yields * size + spread)
-
-
 def _interval(draws: Array) -> Interval:
     """Return median and 95 % interval of draws; of several that are not finite, the order still counts."""
     low, middle, high = np.quantile(draws, [0.025, 0.5, 0.975], method="lower")
     return Interval(float(middle), float(low), float(high))
-
-
-def _single(shape: Array, scale: float) -> _Changes:
-    """Return a change of one shape (n,), whose scale is in tau."""
-    first = np.zeros(1, dtype=np.int64)
-    return _Changes(shape[:, None], first, np.array([scale]), first, np.array([True]), np.zeros(1))
 
 
 def describe(levels: Levels, prior: DayToDay, allowed: float | None, alarmed: int | None) -> Wear:
@@ -351,20 +325,19 @@ def describe(levels: Levels, prior: DayToDay, allowed: float | None, alarmed: in
 
     `allowed`: rise of the level at which a repair is due, None where none is stated; `alarmed`: first recording that
     shows the change, as the test sees it; None where it did not alarm: then the even growth over all recordings is
-    estimated, of either sign and with a wide prior.
+    estimated, of either sign and with a wide prior. Recordings of less than a day state no growth by a month.
     """
-    span = float(levels.t[-1] - levels.t[0])
-    spans, rises = span >= _LEAST_SPAN, alarmed is not None
+    spans, rises = levels.t[-1] - levels.t[0] >= 1.0, alarmed is not None
     even = (levels.t - levels.t[0]) / MONTH if spans else np.zeros(len(levels))
-    changes = _changes(levels, 1) if rises else _single(even, _WIDE * MONTH / levels.interval)
-    draws = _draws(levels, prior, changes, signed=not rises)
+    changes = _Changes.after(levels, 1) if rises else _Changes.single(even, _WIDE * MONTH / levels.interval)
+    draws = _Draws.of(levels, prior, changes, signed=not rises)
     grows = changes.grows[draws.change]
     now = draws.base + draws.size * changes.shape[-1, changes.column[draws.change]]
     slope, growing = np.where(grows, draws.size, 0.0), float(np.mean(grows)) >= 0.5
     before = levels.part(slice(0, alarmed))
-    usual = _draws(before, prior, _single(np.zeros(len(before)), 1.0))
+    usual = _Draws.of(before, prior, _Changes.single(np.zeros(len(before)), 1.0))
     error = float(np.mean(before.error[before.group == before.group[-1]] ** 2))
-    noise = np.random.default_rng(_SEED + 1).standard_normal(_DRAWS)
+    noise = np.random.default_rng(21).standard_normal(usual.tau.size)
     healthy = _interval(usual.base + np.sqrt(usual.tau**2 + error) * noise)._replace(value=float(usual.base.mean()))
     limit = reach = None
     unknown = Interval(math.nan, -math.inf, math.inf)
@@ -414,15 +387,13 @@ def episodes(
         rise, fall = search(part, prior, known), search(part, prior, known, falls=True)
         alarm, dropped, first = rise.alarm(days), fall.alarm(days), 0
         if alarm is not None and (dropped is None or alarm < dropped):  # worn: what falls back to its beginning
-            first = rise.likeliest(alarm)
+            first = int(rise.first[alarm])
             fall = search(part.part(slice(first, None)), prior, 2, falls=True, sloping=True)
             dropped = fall.alarm(days)
-        end = len(part) if dropped is None else max(first + fall.likeliest(dropped), 1)
+        end = len(part) if dropped is None else max(first + int(fall.first[dropped]), 1)
         alarm = None if alarm is None or alarm >= end else alarm
-        own = part.part(slice(0, end))
-        wear = describe(own, prior, allowed, None if alarm is None else rise.likeliest(end - 1))
-        fell = bool(result)
-        result.append(Episode(begin, begin + end, None if alarm is None else begin + alarm, wear, fell))
+        wear = describe(part.part(slice(0, end)), prior, allowed, None if alarm is None else int(rise.first[end - 1]))
+        result.append(Episode(begin, begin + end, None if alarm is None else begin + alarm, wear, bool(result)))
         prior = DayToDay(wear.scatter, prior.freedom + min(end - 1, 20))
         begin, known = begin + end, 1
     return result

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sealscope.diagnosis.verdict.evidence import LEAKS, LEAST_SPECIFIC, RAREST, Cause, Evidence, Passage, Verdict
+from sealscope.diagnosis.verdict.evidence import LEAKS, LEAST_SPECIFIC, Evidence
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.severity import RepairLimit, Severity, beside_the_pump, severity
 from sealscope.diagnosis.verdict.states import MachineState, state_of
@@ -18,35 +18,25 @@ from sealscope.errors import InputError, MissingExtra
 from sealscope.recordings.formats.headings.preamble import remarks_of
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
+from sealscope.storage.plain_values import plain
 from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
     import matplotlib.axes
     import pandas
 
-#: What a file may call the name of the machine.
-_MACHINE = ("machine", "actuator", "asset", "serial number", "serial", "rig", "test rig", "maschine", "prüfstand")
-#: Columns of a table of diagnoses, beside those of the intervals.
+#: Figures of a diagnosis that stand in its plain form as they are, and those of a detector, and of a finding.
 _FIGURES = (
+    *("file", "verdict", "reason", "onset_s", "onset_interval_s", "leak_lpm", "leak_interval_lpm", "bound_lpm"),
+    *("unused", "false_alarm_probability", "score", "threshold"),
+)
+_OF_METHOD = ("score", "threshold", "verdict", "reason")
+_OF_FINDING = ("code", "channel", "count", "first_t", "severity", "text")
+#: Columns of a table of diagnoses, beside those of the intervals.
+_COLUMNS = (
     *("file", "start", "machine", "verdict", "reason", "onset_s", "leak_lpm", "bound_lpm", "score", "threshold"),
     *("chance", "odds", "false_alarm_probability", "cause", "summary", "next_check"),
 )
-
-
-def next_check(verdict: Verdict, cause: Cause | None, *, healthy: bool = False, coarse: bool = False) -> str:
-    """Return what to check next on the machine, in one or two sentences.
-
-    With `no leak`, `healthy`: whether the level of the leakage is known to be that of a healthy machine; `coarse`:
-    whether only the least specific method, which states no size, could judge.
-    """
-    return state_of(_condition(verdict, healthy, coarse), cause).action
-
-
-def _condition(verdict: Verdict, healthy: bool, coarse: bool) -> str:
-    """Return the condition of `states.toml` that a verdict is."""
-    if verdict != "no leak" or healthy:
-        return verdict
-    return "no change of RMS" if coarse else "no change"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,8 +154,19 @@ class Diagnosis(Evidence):
     @property
     def machine_name(self) -> str | None:
         """What the file calls the machine; None where it does not say."""
+        of_machine = (
+            "machine",
+            "actuator",
+            "asset",
+            "serial number",
+            "serial",
+            "rig",
+            "test rig",
+            "maschine",
+            "prüfstand",
+        )
         names = {name.lower(): text for name, text in self.about.items()}
-        return next((names[name] for name in _MACHINE if name in names), None)
+        return next((names[name] for name in of_machine if name in names), None)
 
     @property
     def methods(self) -> tuple[Evidence, ...]:
@@ -173,18 +174,24 @@ class Diagnosis(Evidence):
         return tuple(evidence for detector in self.parts for evidence in (detector, *detector.parts))
 
     @property
+    def _condition(self) -> str:
+        """The condition of `states.toml` that the verdict is."""
+        if self.verdict != "no leak" or self.known_healthy:
+            return self.verdict
+        return "no change of RMS" if self.detector == LEAST_SPECIFIC else "no change"
+
+    @property
     def next_check(self) -> str:
         """What to check next on the machine, in one or two sentences."""
-        return next_check(self.verdict, self.cause, healthy=self.known_healthy, coarse=self.detector == LEAST_SPECIFIC)
+        return state_of(self._condition, self.cause).action
 
     @property
     def state(self) -> MachineState:
         """State of the machine as NAMUR NE 107 names it, a failure where the leak is surely over the repair limit."""
-        condition = _condition(self.verdict, self.known_healthy, self.detector == LEAST_SPECIFIC)
-        if self.severity is not None and self.severity.level == "repair":
-            condition = "leak over the limit"
+        over = self.severity is not None and self.severity.level == "repair"
+        condition = "leak over the limit" if over else self._condition
         cause = self.cause if self.verdict == "leak" or self.cause not in LEAKS else None
-        return state_of(condition, cause, since_s=_plain(self.onset_s), action=self.next_check)
+        return state_of(condition, cause, since_s=plain(self.onset_s), action=self.next_check)
 
     @property
     def known_healthy(self) -> bool:
@@ -197,57 +204,44 @@ class Diagnosis(Evidence):
 
         A number that is not finite becomes null.
         """
-        return {
-            "file": self.file,
-            "verdict": self.verdict,
-            "reason": self.reason,
-            "onset_s": _plain(self.onset_s),
-            "onset_interval_s": _pair(self.onset_interval_s),
-            "leak_lpm": _plain(self.leak_lpm),
-            "leak_interval_lpm": _pair(self.leak_interval_lpm),
-            "bound_lpm": _plain(self.bound_lpm),
-            "unused": list(self.unused),
-            "false_alarm_probability": self.false_alarm_probability,
-            "score": _plain(self.score),
-            "threshold": _plain(self.threshold),
-            "methods": [
-                {
-                    "name": method.detector,
-                    "score": _plain(method.score),
-                    "threshold": _plain(method.threshold),
-                    "verdict": method.verdict,
-                    "reason": method.reason,
-                    "chance": _chance(method),
-                    "odds": method.odds,
-                }
-                for method in self.methods
-            ],
-            "quality": [
-                {
-                    "code": finding.code,
-                    "channel": finding.channel,
-                    "count": finding.count,
-                    "first_t": _plain(finding.first_t),
-                    "severity": finding.severity,
-                    "text": finding.text,
-                }
-                for finding in self.quality
-            ],
-            "cause": self.cause,
-            "next_check": self.next_check,
-            "passage": None if self.passage is None else _plain_passage(self.passage),
-            "chance": _chance(self),
-            "odds": self.odds,
-            "summary": self.summary,
-            "start": self.start,
-            "machine": self.machine_name,
-            "about": dict(self.about),
-            "rig": None if self.machine is None else self.machine.as_dict(),
-            "severity": None if self.severity is None else self.severity.as_dict(),
-            "limit": self.limit.as_dict(),
-            "evidence": self._evidence(),
-            "state": self.state.as_dict(),
+        ratio = self.measured_ratio or (None, None)
+        of_passage = {} if self.passage is None else vars(self.passage)
+        passage = {("pressure_Pa" if name == "pressure" else name): value for name, value in of_passage.items()}
+        methods = [
+            {"name": own.detector}
+            | {name: getattr(own, name) for name in _OF_METHOD}
+            | {"chance": own.stated_chance, "odds": own.odds}
+            for own in self.methods
+        ]
+        evidence = {
+            "detector": self.detector or None,
+            "share": self.share,
+            "baselines": self.baselines,
+            "ratio": ratio[0],
+            "ratio_interval": ratio[1],
+            "refuses": sorted(self.refuses),
         }
+        return plain(  # type: ignore[no-any-return]
+            {
+                **{name: getattr(self, name) for name in _FIGURES},
+                "methods": methods,
+                "quality": [{name: getattr(own, name) for name in _OF_FINDING} for own in self.quality],
+                "cause": self.cause,
+                "next_check": self.next_check,
+                "passage": passage or None,
+                "chance": self.stated_chance,
+                "odds": self.odds,
+                "summary": self.summary,
+                "start": self.start,
+                "machine": self.machine_name,
+                "about": self.about,
+                "rig": self.machine and self.machine.as_dict(),
+                "severity": self.severity and self.severity.as_dict(),
+                "limit": self.limit.as_dict(),
+                "evidence": evidence,
+                "state": self.state.as_dict(),
+            }
+        )
 
     def to_frame(self) -> pandas.DataFrame:
         """Return the figures as one row of a table, intervals as two columns; `pandas.concat` joins those of several.
@@ -259,7 +253,7 @@ class Diagnosis(Evidence):
         except ImportError:
             raise MissingExtra("a table needs pandas: pip install 'sealscope[io]'") from None
         whole = self.as_dict()
-        row = {name: whole[name] for name in _FIGURES}
+        row = {name: whole[name] for name in _COLUMNS}
         for name in ("onset_interval_s", "leak_interval_lpm"):
             row[f"{name}_low"], row[f"{name}_high"] = whole[name] or (None, None)
         return pandas.DataFrame([row])
@@ -303,18 +297,6 @@ class Diagnosis(Evidence):
         axes.legend()
         return axes
 
-    def _evidence(self) -> dict[str, Any]:
-        """Return what the verdict rests on as plain JSON values."""
-        ratio = self.measured_ratio
-        return {
-            "detector": self.detector or None,
-            "share": float(self.share),
-            "baselines": self.baselines,
-            "ratio": None if ratio is None else _plain(ratio[0]),
-            "ratio_interval": None if ratio is None else _pair(ratio[1]),
-            "refuses": sorted(self.refuses),
-        }
-
     def __str__(self) -> str:
         since = "" if self.onset_s is None else f" since {self.onset_s:.1f} s"
         return f"{self.file}: {self.verdict}{since} ({self.reason})"
@@ -326,50 +308,23 @@ class Diagnosis(Evidence):
 
     def _repr_html_(self) -> str:
         """Return the diagnosis as a table for notebooks."""
+
+        def shown(value: float | None, interval: tuple[float, float] | None = None) -> str | None:
+            ends = "" if interval is None else f" ({interval[0]:.4g} to {interval[1]:.4g})"
+            return None if value is None else f"{value:.4g}{ends}"
+
         rows = [
             ("reason", self.reason),
-            ("onset [s]", _shown(self.onset_s, self.onset_interval_s)),
-            ("leak [L/min]", _shown(self.leak_lpm, self.leak_interval_lpm)),
+            ("onset [s]", shown(self.onset_s, self.onset_interval_s)),
+            ("leak [L/min]", shown(self.leak_lpm, self.leak_interval_lpm)),
             ("cause", self.cause),
-            ("score", _shown(self.score)),
-            ("threshold", _shown(self.threshold)),
+            ("score", shown(self.score)),
+            ("threshold", shown(self.threshold)),
             ("odds", self.odds),
             ("false-alarm probability", f"{self.false_alarm_probability:g}"),
             *((finding.severity, finding.text) for finding in self.quality),
             ("state", self.state.name),
             ("next check", self.next_check),
         ]
-        body = "".join(
-            f"<tr><th>{escape(label)}</th><td>{escape(text)}</td></tr>" for label, text in rows if text is not None
-        )
+        body = "".join(f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>" for name, text in rows if text)
         return f"<table><caption>{escape(self.file)}: {escape(self.verdict)}</caption>{body}</table>"
-
-
-def _chance(evidence: Evidence) -> float | None:
-    return None if evidence.chance is None else max(RAREST, float(evidence.chance))
-
-
-def _plain(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else float(value)
-
-
-def _plain_passage(passage: Passage) -> dict[str, Any]:
-    return {
-        "lpm": _plain(passage.lpm),
-        "interval_lpm": _pair(passage.interval_lpm),
-        "pressure_Pa": _plain(passage.pressure),
-        "findable_lpm": _plain(passage.findable_lpm),
-        "healthy_lpm": _plain(passage.healthy_lpm),
-        "pump_share": _plain(passage.pump_share),
-        "findable_share": _plain(passage.findable_share),
-    }
-
-
-def _pair(pair: tuple[float, float] | None) -> list[float | None] | None:
-    return None if pair is None else [_plain(pair[0]), _plain(pair[1])]
-
-
-def _shown(value: float | None, interval: tuple[float, float] | None = None) -> str | None:
-    if value is None or interval is None:
-        return None if value is None else f"{value:.4g}"
-    return f"{value:.4g} ({interval[0]:.4g} to {interval[1]:.4g})"

@@ -29,8 +29,6 @@ LEAKS: tuple[Cause, ...] = ("piston leak", "piston or pump leak")
 
 #: Smallest chance that is stated: no null distribution is known further out.
 RAREST = 1e-4
-#: Chance from which on a recording looks like any healthy one.
-OFTEN = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,15 +191,19 @@ class Evidence:
         return f"{self.cause} ({'none' if self.cause.endswith('leak') else 'no leak'} across the piston)"
 
     @property
+    def stated_chance(self) -> float | None:
+        """`chance`, no smaller than it is known."""
+        return None if self.chance is None else max(RAREST, self.chance)
+
+    @property
     def odds(self) -> str | None:
         """How many healthy recordings look like this one, in words; None where that is not stated."""
-        if self.chance is None:
+        if self.stated_chance is None:
             return None
-        if self.chance <= RAREST:
-            return f"fewer than 1 in {grouped(1.0 / RAREST)} healthy recordings looks like this"
-        if self.chance >= OFTEN:
-            return f"more than 1 in {1.0 / OFTEN:.0f} healthy recordings look like this"
-        return f"1 in {grouped(1.0 / self.chance)} healthy recordings looks like this"
+        if self.stated_chance >= 0.2:
+            return "more than 1 in 5 healthy recordings look like this"
+        times = f"{float(f'{1.0 / self.stated_chance:.2g}'):,.0f}".replace(",", " ")
+        return f"{'fewer than ' if self.stated_chance == RAREST else ''}1 in {times} healthy recordings looks like this"
 
 
 def without_flow(evidence: Evidence, why: str) -> Evidence:
@@ -214,9 +216,3 @@ def without_flow(evidence: Evidence, why: str) -> Evidence:
         course=None,
         refuses=evidence.refuses | {"leak_lpm"},
     )
-
-
-def grouped(value: float) -> str:
-    """Return a number of two digits, its thousands apart."""
-    rounded = float(f"{value:.2g}")
-    return f"{rounded:,.0f}".replace(",", " ")

@@ -16,8 +16,8 @@ from sealscope.units import LITRE_PER_MINUTE, parse_quantity
 
 #: How much of the limit a leak takes: surely all of it, maybe half of it or more, surely less than half of it.
 Level = Literal["repair", "plan", "follow"]
-#: Share of the limit from which a repair is planned.
-HALF = 0.5
+#: A figure with its 95 % interval, None where it is not known.
+_Figure = tuple[float, float, float] | None
 _ML_PER_MINUTE, _MM_PER_MINUTE = 1e-3 * LITRE_PER_MINUTE, 1e-3 / 60.0
 
 
@@ -89,10 +89,10 @@ class Severity:
         The leak over the repair limit.
     """
 
-    mL_per_min: tuple[float, float, float] | None
-    pump_share: tuple[float, float, float] | None
-    creep_mm_per_min: tuple[float, float, float] | None
-    of_limit: tuple[float, float, float] | None
+    mL_per_min: _Figure
+    pump_share: _Figure
+    creep_mm_per_min: _Figure
+    of_limit: _Figure
 
     @property
     def level(self) -> Level | None:
@@ -103,7 +103,7 @@ class Severity:
         if self.of_limit is None:
             return None
         _, low, high = self.of_limit
-        return "repair" if low > 1.0 else "follow" if high < HALF else "plan"
+        return "repair" if low > 1.0 else "follow" if high < 0.5 else "plan"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the severity as plain JSON values: each figure with `_interval` beside it, and the level."""
@@ -123,15 +123,17 @@ def severity(evidence: Evidence, limit: RepairLimit, *, trusts_position: bool = 
     relative = evidence.relative
     if evidence.verdict != "leak" or (evidence.leak_lpm is None and relative is None):
         return None
-    flow = _triple(evidence.leak_lpm, evidence.leak_interval_lpm, LITRE_PER_MINUTE)
-    creep = None if relative is None or not trusts_position else _triple(relative.creep, relative.creep_interval, 1.0)
-    share = None if relative is None else _triple(relative.pump_share, relative.pump_share_interval, 1.0)
-    held = flow if limit.kind == "flow" else creep
+    flow = _figure(evidence.leak_lpm, evidence.leak_interval_lpm, LITRE_PER_MINUTE)
+    creep = share = None
+    if relative is not None:
+        share = _figure(relative.pump_share, relative.pump_share_interval)
+        creep = _figure(relative.creep, relative.creep_interval) if trusts_position else None
+    against = flow if limit.kind == "flow" else creep
     return Severity(
         mL_per_min=_over(flow, _ML_PER_MINUTE),
         pump_share=share,
         creep_mm_per_min=_over(creep, _MM_PER_MINUTE),
-        of_limit=_over(held, limit.value),
+        of_limit=_over(against, limit.value),
     )
 
 
@@ -142,12 +144,12 @@ def beside_the_pump(evidence: Evidence, recording: Recording, machine: AssumedMa
     """
     if evidence.leak_lpm is None or evidence.leak_interval_lpm is None:
         return None
-    leak, low, high = (LITRE_PER_MINUTE * value for value in (evidence.leak_lpm, *evidence.leak_interval_lpm))
-    creep = leak / machine.area, (low / machine.area, high / machine.area)
-    pump = _mean_speed(recording) / (2.0 * math.pi) * machine.displacement
+    leak, *interval = (LITRE_PER_MINUTE * value for value in (evidence.leak_lpm, *evidence.leak_interval_lpm))
+    area, pump = machine.area, _mean_speed(recording) / (2.0 * math.pi) * machine.displacement
+    creep = leak / area, (interval[0] / area, interval[1] / area)
     if not pump > 0.0:
         return RelativeLeak(None, None, *creep)
-    return RelativeLeak(leak / pump, (low / pump, high / pump), *creep)
+    return RelativeLeak(leak / pump, (interval[0] / pump, interval[1] / pump), *creep)
 
 
 def _mean_speed(recording: Recording) -> float:
@@ -159,14 +161,12 @@ def _mean_speed(recording: Recording) -> float:
     return 0.0
 
 
-def _triple(
-    value: float | None, interval: tuple[float, float] | None, factor: float
-) -> tuple[float, float, float] | None:
+def _figure(value: float | None, interval: tuple[float, float] | None, factor: float = 1.0) -> _Figure:
     """Return a figure with its interval, without one where the interval is not stated."""
     if value is None or interval is None or not all(math.isfinite(number) for number in (value, *interval)):
         return None
     return factor * value, factor * interval[0], factor * interval[1]
 
 
-def _over(figure: tuple[float, float, float] | None, unit: float) -> tuple[float, float, float] | None:
-    return None if figure is None else (figure[0] / unit, figure[1] / unit, figure[2] / unit)
+def _over(figure: _Figure, unit: float) -> _Figure:
+    return figure and (figure[0] / unit, figure[1] / unit, figure[2] / unit)

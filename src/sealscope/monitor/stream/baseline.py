@@ -6,12 +6,8 @@ import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.terms import priors
-
-#: Logarithm by which pressure and flow of a duty may lie outside what was learned.
-_DUTY_MARGIN = 0.2
-#: ... and by which a leak may lower the pressure difference.
-_DAMPED = 0.7
 
 
 @dataclass(frozen=True)
@@ -89,10 +85,10 @@ class WatchedRise(NamedTuple):
 
 def within(duty: tuple[float, float], low: tuple[float, float], high: tuple[float, float]) -> bool:
     """Return whether a duty lies between two others, give or take; a leak may take more of the pressure."""
-    return all(
-        least - below <= value <= most + _DUTY_MARGIN
-        for value, least, most, below in zip(duty, low, high, (_DAMPED, _DUTY_MARGIN), strict=True)
-    )
+    believed = beliefs("inference.live")["watch"]
+    margin = believed["margin"]
+    below = (low[0] - believed["damped"], low[1] - margin)
+    return all(least <= own <= most + margin for own, least, most in zip(duty, below, high, strict=True))
 
 
 @dataclass

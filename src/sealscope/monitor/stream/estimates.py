@@ -5,9 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-#: A rise as rare as this share of the stated rate, or rarer, is said to be so rare: nothing is known further out.
-_RAREST = 1e-9
-
 
 @dataclass(frozen=True)
 class BlockEstimate:
@@ -78,7 +75,7 @@ class WatchedLeak:
 
     @property
     def rarity(self) -> float:
-        """How much rarer than at the stated rate a healthy machine shows such a score, as a share <= 1.
+        """How much rarer than at the stated rate a healthy machine shows such a score, as a share of 1e-9 to 1.
 
         For a level by the normal tail; for a step half the score is the logarithm of an e-value (`sequential`).
         """
@@ -88,4 +85,4 @@ class WatchedLeak:
             exponent = float(log_ndtr(-self.score) - log_ndtr(-self.threshold))
         else:
             exponent = 0.5 * (self.threshold - self.score)
-        return min(1.0, max(_RAREST, math.exp(max(exponent, math.log(_RAREST)))))
+        return math.exp(min(0.0, max(exponent, math.log(1e-9))))

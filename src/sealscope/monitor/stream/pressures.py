@@ -12,119 +12,143 @@ as little known as at first, and nothing before is compared with what comes afte
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sealscope.diagnosis.inference.live.balance import BlockConductance, NotJudged, Shown
+from sealscope.diagnosis.beliefs import beliefs
+from sealscope.diagnosis.inference.live.balance import FOLLOWS, BlockConductance, NotJudged, Shown
 from sealscope.diagnosis.inference.pressures.evidence import SLOWEST, flow_scale, priors, states_flow, unusable
-from sealscope.diagnosis.inference.pressures.response import Beliefs, Follower, G, Machine
+from sealscope.diagnosis.inference.pressures.response import Follower, G, Machine, beliefs_of
 from sealscope.errors import InputError
 from sealscope.recordings.motion import moves
-from sealscope.recordings.recording import Recording
-from sealscope.storage.plain_state import array_of, part_of, plain_array
+from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
+from sealscope.storage.plain_state import array_of, part_of, plain_array, recall, saved
 from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Length of a block [s]; it goes on after a gap up to a pause [s].
-BLOCK_SECONDS, PAUSE_S = 6.0, 300.0
-#: What is read.
-CHANNELS = ("u", "p_A", "p_B")
-#: Blocks that are left out until the states have settled: after the start, and after a gap.
-_SETTLING, _RESUMING = 10, 3
-#: Excess of a block's chi square, in deviations, from which on it is not described, and how many lose the machine.
-_DESCRIBED, _LOST = 6.0, 10
-#: Blocks over which the usual variance is taken; over those of resuming while it is being found.
-_USUAL = 60
-#: Arrays of a follower that change, and those of its beliefs.
-_ARRAYS = ("theta", "covariance", "states", "beliefs")
+_BELIEVED = beliefs("inference.live")["response"]
+_SETTLING, _RESUMING, _PAUSE = _BELIEVED["settling"], _BELIEVED["resuming"], beliefs("inference.live")["watch"]["pause"]
+_READ = ("u", "p_A", "p_B")
 
 
 class PressureEstimator:
-    """Conductances by the response, block by block.
+    """Conductances by the response, block by block, as `LiveBalance` gives them by volumes.
 
-    `rig`: what is believed of the machine; `litres`: whether it states what turns a conductance into L/min. The
-    conductance itself is not stated (`levels`), only its changes, to `size_error`; an orifice that shows as the same
-    conductance passes `orifice` times what a laminar leak does, by which the upper end of an interval is wider.
+    `rig`: what is believed of the machine; `names`: channels of the samples; `litres`: whether the rig states what
+    turns a conductance into L/min. The conductance itself is not stated (`levels`), only its changes, to `size_error`;
+    an orifice that shows as the same conductance passes `orifice` times what a laminar leak does, by which the upper
+    end of an interval is wider; `inside`: share of what shows that is surely inside.
     """
 
-    levels, size_error, orifice = False, flow_scale(), priors("ring_down")["orifice"].value
+    by, levels, cause = "pressures", False, "leak inside or outside"
+    size_error, orifice = flow_scale(), priors("ring_down")["orifice"].value
+    inside: float = beliefs("inference.live")["watch"]["inside"]
+    block_seconds: float = _BELIEVED["seconds"]
+    states_flow = staticmethod(states_flow)
 
-    def __init__(self, rig: Rig, litres: bool) -> None:
-        self._rig, self.litres = rig, litres
+    def __init__(self, rig: Rig, names: Sequence[str], litres: bool | None = None) -> None:
+        self._rig, self.names = rig, tuple(names)
+        self.litres = states_flow(rig) if litres is None else litres
+        self._pieces: list[list[Array]] = []  # since the last whole block, of each the times and the channels
+        self._have, self._rate, self._until = 0, 0.0, -math.inf
+        self.begun = False  # once the machine moved for so long that its response was fitted
         self._follower: Follower | None = None
         self._next = math.nan  # clock at which the next block begins if it follows
         self._settling, self._lost = _SETTLING, 0
 
-    @classmethod
-    def of(cls, rig: Rig) -> PressureEstimator:
-        """Return the estimator of a machine of the rig's kind."""
-        return cls(rig, states_flow(rig))
+    def take(self, t: Array, samples: Mapping[str, Array], rate: float) -> list[Shown]:
+        """Take samples that follow each other at the times `t` [s]; return what each block shows that they complete."""
+        if rate != self._rate or not FOLLOWS[0] < (float(t[0]) - self._until) * rate < FOLLOWS[1]:
+            self.interrupt()
+        self._rate, self._until, self._have = rate, float(t[-1]), self._have + t.size
+        self._pieces.append([t, *(samples[name] for name in self.names)])
+        first, length = round(_BELIEVED["begins"] * rate), round(self.block_seconds * rate)
+        shown: list[Shown] = []
+        while not self.begun and self._have >= first:
+            self.begun = self._begin(self._next_samples(first))
+            if not self.begun:
+                self._drop(first // 2)
+                reason = "half minutes at rest or with missing values before the first block"
+                shown.append(NotJudged(self._until, "", reason))
+        while self.begun and self._have >= length:
+            block = self._next_samples(length)
+            self._drop(length)
+            shown.append(self._shown(block))
+        return shown
 
-    def seconds_of(self, first: Recording) -> float | None:
-        """Return the length of a block [s], having fitted the first minute; None where nothing moves."""
-        if not all(name in first and moves(first[name]) for name in CHANNELS):
-            return None
+    def _join(self) -> None:
+        if len(self._pieces) > 1:
+            self._pieces = [[np.concatenate(column) for column in zip(*self._pieces, strict=True)]]
+
+    def _next_samples(self, length: int) -> Recording:
+        self._join()
+        t, *channels = (values[:length] for values in self._pieces[0])
+        units = {name: CHANNEL_UNITS[name] for name in self.names}
+        return Recording(t, dict(zip(self.names, channels, strict=True)), units, self._rate)
+
+    def _drop(self, length: int) -> None:
+        self._pieces, self._have = [[values[length:].copy() for values in self._pieces[0]]], self._have - length
+
+    def interrupt(self) -> None:
+        """Take the next samples as those after a gap, whatever their time is."""
+        self._pieces, self._have, self._until = [], 0, -math.inf
+
+    def _begin(self, first: Recording) -> bool:
+        """Fit the response to the first minute; return whether the machine moves in it, and nothing is missing."""
+        if not all(np.isfinite(first[name]).all() for name in first.channels):
+            return False
+        if not all(name in first and moves(first[name]) for name in _READ):
+            return False
         if unusable(first, self._rig) is None:
-            self._follower = Follower.begun(first.only(CHANNELS), self._rig)
-        return BLOCK_SECONDS
+            self._follower = Follower.begun(first.only(_READ), self._rig)
+        return True
 
-    def take(self, block: Recording) -> Shown:
+    def _shown(self, block: Recording) -> Shown:
         """Return what a block shows."""
         begin, end = float(block.t[0]), float(block.t[-1]) + 1.0 / block.rate
         if self._follower is None:
-            slow = block.rate < SLOWEST
-            return _passed_over(
-                end, f"sampled at less than {SLOWEST:g} Hz" if slow else "needs a pump and two like areas"
-            )
-        if not all(np.isfinite(block[name]).all() for name in CHANNELS):
+            slow = f"sampled at less than {SLOWEST:g} Hz"
+            return _passed_over(end, slow if block.rate < SLOWEST else "needs a pump and two like areas")
+        if not all(np.isfinite(block[name]).all() for name in _READ):
             return _passed_over(end, "missing values")
-        apart = self._resume(begin - self._next, block.rate)
+        apart = self._resume(self._follower, begin - self._next, block.rate)
         self._next = end
-        own = self._follower.take(block.only(CHANNELS))
+        own = self._follower.take(block.only(_READ))
         variance, follower = own.squares / max(own.samples, 1.0), self._follower
         settling, self._settling = self._settling > 0, max(self._settling - 1, 0)
-        described = bool(np.isfinite(follower.theta).all()) and follower.excess < _DESCRIBED
+        described = bool(np.isfinite(follower.theta).all()) and follower.excess < _BELIEVED["described"]
         ratio = float(np.clip(max(variance, 1.0) / follower.variance, 0.1, 10.0)) if math.isfinite(variance) else 1.0
-        follower.variance *= ratio ** (1.0 / (_USUAL if described and not settling else _RESUMING))
-        if not described:
-            return self._not_described(end, apart, settling)
+        follower.variance *= ratio ** (1.0 / (_BELIEVED["usual"] if described and not settling else _RESUMING))
+        if not described:  # after some of them the machine is lost
+            self._lost += 1
+            if self._lost < _BELIEVED["lost"] and np.isfinite(follower.theta).all():
+                self._settling = self._settling if settling else _RESUMING
+                return _passed_over(end, "settling" if settling else "not described by the model", apart)
+            follower.interrupt(math.inf)
+            self._lost, self._settling = 0, _SETTLING
+            return _passed_over(end, "not described by the model", True)
         self._lost = 0
-        if settling:
-            return _passed_over(end, "settling", apart)
         width = priors("response")["G"].width
         g, sd = float(follower.theta[G]), math.sqrt(follower.covariance[G, G]) * float(follower.beliefs.unit[G])
-        if sd > width:
-            return _passed_over(end, "at rest", apart)
+        if settling or sd > width:
+            return _passed_over(end, "settling" if settling else "at rest", apart)
         dp = float(np.mean(np.abs(block["p_A"] - block["p_B"])))
         sizes = np.log(np.maximum([dp, np.sqrt(np.mean(block["u"] ** 2))], np.finfo(float).tiny))
         duty = float(sizes[0]), float(sizes[1])
         return [BlockConductance(begin, end, g, sd, g, width, dp / LITRE_PER_MINUTE, duty)]
 
-    def _resume(self, gap: float, rate: float) -> bool:
+    def _resume(self, follower: Follower, gap: float, rate: float) -> bool:
         """Prepare for a block after a gap [s]; return whether nothing before may be compared with what comes."""
-        assert self._follower is not None
         if abs(gap) < 0.5 / rate:
             return False
-        first = math.isnan(self._next)
-        self._follower.interrupt(gap if 0.0 < gap <= PAUSE_S else math.inf)
-        known = not first and 0.0 < gap <= PAUSE_S
-        self._settling = max(self._settling, _RESUMING if known else _SETTLING)
-        return not known
-
-    def _not_described(self, end: float, apart: bool, settling: bool) -> NotJudged:
-        """Count a block that the response does not describe; after some of them the machine is lost."""
-        assert self._follower is not None
-        self._lost += 1
-        if self._lost < _LOST and np.isfinite(self._follower.theta).all():
-            self._settling = self._settling if settling else _RESUMING
-            return _passed_over(end, "settling" if settling else "not described by the model", apart)
-        self._follower.interrupt(math.inf)
-        self._lost, self._settling = 0, _SETTLING
-        return _passed_over(end, "not described by the model", True)
+        short = 0.0 < gap <= _PAUSE  # nan before the first block
+        follower.interrupt(gap if short else math.inf)
+        self._settling = max(self._settling, _RESUMING if short else _SETTLING)
+        return not short
 
     def relearn(self) -> None:
         """Know the machine's parameters as little as at first."""
@@ -133,49 +157,34 @@ class PressureEstimator:
 
     def state(self) -> dict[str, Any]:
         """Return all of it but the rig as plain values."""
-        follower = self._follower
-        return {
-            "litres": self.litres,
-            "next": None if math.isnan(self._next) else self._next,
-            "settling": self._settling,
-            "lost": self._lost,
-            "follower": None
-            if follower is None
-            else {
-                "rate": follower.machine.rate,
-                "sense": follower.sense,
-                "variance": follower.variance,
-                "last": None if math.isnan(follower.last) else follower.last,
-                "theta": plain_array(follower.theta),
-                "covariance": plain_array(follower.covariance),
-                "states": plain_array(follower.states),
-                "beliefs": plain_array(np.array(follower.beliefs)),
-            },
-        }
+        self._join()
+        state = saved(self, _SAVED) | {"pieces": [plain_array(np.array(piece)) for piece in self._pieces]}
+        if (own := self._follower) is None:
+            return state | {"follower": None}
+        return state | {"follower": saved(own, _FOLLOWED) | {"rate": own.machine.rate, "sense": own.sense}}
 
     @classmethod
     def from_state(cls, rig: Rig, state: Mapping[str, Any]) -> PressureEstimator:
         """Return the estimator that `state` was of; raises InputError where it does not fit."""
-        estimator = cls(rig, bool(part_of(state, "litres", bool)))
-        after = part_of(state, "next", (float, int, type(None)))
-        estimator._next = math.nan if after is None else float(after)
-        estimator._settling, estimator._lost = (int(part_of(state, name, int)) for name in ("settling", "lost"))
-        saved = part_of(state, "follower", (Mapping, type(None)))
-        if saved is None:
+        estimator = cls(rig, part_of(state, "names", list), part_of(state, "litres", bool))
+        recall(estimator, _SAVED, state)
+        pieces = [array_of(piece, "pieces") for piece in part_of(state, "pieces", list)]
+        if any(piece.ndim != 2 or len(piece) != 1 + len(estimator.names) for piece in pieces):
+            raise InputError("saved state's pieces must have a row of times and one for each channel")
+        estimator._pieces, estimator._have = [list(piece) for piece in pieces], sum(piece.shape[1] for piece in pieces)
+        if (known := part_of(state, "follower", (Mapping, type(None)))) is None:
             return estimator
-        theta, covariance, states, beliefs = (array_of(part_of(saved, name, Mapping), name) for name in _ARRAYS)
-        rate, sense, variance = (float(part_of(saved, name, (float, int))) for name in ("rate", "sense", "variance"))
-        last = part_of(saved, "last", (float, int, type(None)))
-        size = theta.size
-        if beliefs.shape != (3, size) or covariance.shape != (size, size) or states.ndim != 2 or not rate > 0.0:
-            raise InputError("saved state's arrays of the response do not fit each other")
-        follower = Follower(Machine.of(rig, rate), Beliefs(*beliefs), sense)
-        if follower.theta.size != size or follower.states.shape != states.shape:
-            raise InputError(f"saved state's theta must have {follower.theta.size} numbers, got {size}")
-        follower.theta, follower.covariance, follower.states, follower.variance = theta, covariance, states, variance
-        follower.last = math.nan if last is None else float(last)
+        rate, sense = (float(part_of(known, name, (float, int))) for name in ("rate", "sense"))
+        if not rate > 0.0:
+            raise InputError(f"saved state's rate must be > 0 Hz, got {rate}")
+        follower = Follower(Machine.of(rig, rate), beliefs_of(rig), sense)
+        recall(follower, _FOLLOWED, known)
         estimator._follower = follower
         return estimator
+
+
+_SAVED = ("names", "litres", "begun", "_rate", "_until", "_next", "_settling", "_lost")
+_FOLLOWED = ("theta", "covariance", "states", "variance", "last")
 
 
 def _passed_over(end: float, status: str, apart: bool = False) -> NotJudged:

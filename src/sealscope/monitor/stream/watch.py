@@ -6,13 +6,14 @@ import json
 import math
 import os
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sealscope.calls import checked_call
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.live.balance import (
     BLOCK_SECONDS,
     LEARNED,
@@ -20,10 +21,8 @@ from sealscope.diagnosis.inference.live.balance import (
     LiveBalance,
     NotJudged,
     Shown,
-    size_error,
-    states_flow,
 )
-from sealscope.diagnosis.inference.live.sequential import RECENT, StepDetector
+from sealscope.diagnosis.inference.live.sequential import RECENT, StepDetector, probability_of
 from sealscope.diagnosis.inference.terms import priors
 from sealscope.errors import InputError
 from sealscope.monitor.stream.baseline import BaselineLearning, WatchBaseline, WatchedRise, within
@@ -37,39 +36,12 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 #: Format of the saved state.
-STATE_VERSION = 9
-#: The duty's cycle is looked for in so long a run without a hole [s], where there is no position.
-_LEARN_SECONDS = 60.0
-#: Blocks are not compared across a pause of over so many seconds.
-_PAUSE_S = 300.0
-#: Blocks of one mean that is compared with the baseline.
-GROUP = 16
-#: Blocks whose mean is the leak after an alarm, or what passed before it.
-_RECENT = 8
-#: Share of the rate of false alarms that each test takes.
-_SHARES = {"step": 0.9, "level": 0.1}
-#: Probabilities of a false alarm of a block for which a test can be set.
-_PROBABILITIES = (1e-12, 0.05)
-#: Where the oil goes that either way of watching shows, and the share of it that is surely inside: by pressures an
-#: external leak shows as 2.6 to 4.1 times what it is.
-_CAUSES = {"volumes": ("piston or pump leak", 1.0), "pressures": ("leak inside or outside", 0.2)}
-#: Columns of the last blocks: end, conductance, deviation, flow of a unit of it, duty.
-_COLUMNS = 6
-
-
-def probability_of(test: str, false_alarms_per_1000_h: float, seconds: float) -> float:
-    """Return the probability of a false alarm of one look of a test, with so many seconds between looks.
-
-    Raises InputError where the test cannot be set for it.
-    """
-    probability = _SHARES[test] * false_alarms_per_1000_h / 1000.0 * seconds / 3600.0
-    low, high = _PROBABILITIES
-    if not low <= probability <= high:
-        scale = 1000.0 * 3600.0 / (_SHARES[test] * seconds)
-        raise InputError(
-            f"false_alarms_per_1000_h must be {low * scale:.2g} to {high * scale:.2g}, got {false_alarms_per_1000_h:g}"
-        )
-    return probability
+STATE_VERSION = 10
+#: Blocks of one mean that is compared with the baseline, and of the mean that is the leak after an alarm.
+GROUP, _RECENT = 16, 8
+_BELIEVED = beliefs("inference.live")["watch"]
+#: Ways of watching, each a stream of conductances.
+_KINDS: tuple[type[LiveBalance | PressureEstimator], ...] = (LiveBalance, PressureEstimator)
 
 
 class Watch:
@@ -81,8 +53,8 @@ class Watch:
     ----------
     rig, false_alarms_per_1000_h, learn_hours : Rig, float, float
         As for `watch`.
-    litres : bool, optional
-        Whether the rig states what turns a conductance into L/min; by default it is asked.
+    litres : mapping of str to bool, optional
+        Whether the rig states what turns a conductance into L/min, for each way of watching; by default it is asked.
 
     Attributes
     ----------
@@ -107,25 +79,34 @@ class Watch:
     """
 
     def __init__(
-        self, rig: Rig, false_alarms_per_1000_h: float, learn_hours: float, *, litres: bool | None = None
+        self,
+        rig: Rig,
+        false_alarms_per_1000_h: float,
+        learn_hours: float,
+        *,
+        litres: Mapping[str, bool] | None = None,
     ) -> None:
-        probability_of("step", false_alarms_per_1000_h, BLOCK_SECONDS)
+        self.false_alarms_per_1000_h, self.learn_hours = false_alarms_per_1000_h, learn_hours
+        self._probability("step", BLOCK_SECONDS)
         if not 0.0 < learn_hours <= 1000.0:
             raise InputError(f"learn_hours must be > 0 and at most 1000 h, got {learn_hours:g}")
-        self._rig, self._litres = rig, states_flow(rig) if litres is None else litres
+        self._rig = rig
+        self._litres = {kind.by: kind.states_flow(rig) for kind in _KINDS} if litres is None else litres
         self._samples = SampleJoiner(valved=rig.valve.spool == "present")
-        self._live: LiveBalance | None = None
-        self._pressures: PressureEstimator | None = None
-        self.false_alarms_per_1000_h, self.learn_hours = false_alarms_per_1000_h, learn_hours
+        self._estimator: LiveBalance | PressureEstimator | None = None
         self.baseline: WatchBaseline | None = None
         self.leak: WatchedLeak | None = None
-        self.blocks = 0
-        self._version = 1
-        self._seconds = 0.0
-        self._learning = BaselineLearning()
-        self._detector = StepDetector()
+        self.blocks, self._version = 0, 1
+        self._learning, self._detector = BaselineLearning(), StepDetector()
+        # of the last blocks end, conductance, deviation, flow of a unit of it, duty; of those whose mean is not whole
+        # yet end, conductance, deviation, and what all conductances are off by
         self._last: deque[tuple[float, ...]] = deque(maxlen=RECENT)
         self._group: list[tuple[float, ...]] = []
+
+    def _probability(self, test: str, seconds: float) -> float:
+        """Return the probability of a false alarm of one look of a test, with so many seconds between looks."""
+        hours = 1000.0 / _BELIEVED[test]
+        return probability_of(self.false_alarms_per_1000_h, hours, seconds, "false_alarms_per_1000_h")
 
     @property
     def by(self) -> str:
@@ -140,7 +121,7 @@ class Watch:
     @property
     def block_seconds(self) -> float:
         """About how long a block is [s]."""
-        return self._seconds or BLOCK_SECONDS
+        return BLOCK_SECONDS if self._estimator is None else self._estimator.block_seconds
 
     def update(self, samples: Recording, *, follows: bool = True) -> list[BlockEstimate]:
         """Take the next samples; results do not depend on how they are cut.
@@ -165,29 +146,20 @@ class Watch:
         """Yield what `update` returns, each estimate with the leak as of that block; to be gone through to the end."""
         if not follows:
             self._samples.restart("restart")
-            if self._live is not None:
-                self._live.interrupt()
-        for _ in self._samples.runs(samples):
-            for shown in self._by_volumes() if self.by == "volumes" else self._by_pressures():
-                yield self.judged(shown), self.leak
-
-    def _by_volumes(self) -> list[Shown]:
-        t, channels = self._samples.drained()
-        if self._live is None:
-            self._live = LiveBalance(self._rig, self._samples.names)
-            self._samples.settled = True
-        with np.errstate(all="ignore"):  # a block whose sums overflow says nothing
-            return self._live.take(t, channels, self._samples.rate)
-
-    def _by_pressures(self) -> Iterator[Shown]:
-        if not self._seconds and not self._find_duty():
-            return
-        assert self._pressures is not None
-        length = round(self._seconds * self._samples.rate)
-        while len(self._samples) >= length:
-            with np.errstate(all="ignore"):
-                shown = self._pressures.take(self._samples.taken(length))
-            yield shown
+            if self._estimator is not None:
+                self._estimator.interrupt()
+        for t, channels in self._samples.runs(samples):
+            if self._estimator is None or self._estimator.by != self.by:  # a position came with the second piece
+                kind = next(kind for kind in _KINDS if kind.by == self.by)
+                self._estimator = kind(self._rig, self._samples.names, self._litres[self.by])
+            with np.errstate(all="ignore"):  # a block whose sums overflow says nothing
+                every = self._estimator.take(t, channels, self._samples.rate)
+            self._samples.settled = self._estimator.begun
+            for shown in every:
+                if isinstance(shown, NotJudged) and not shown.status:
+                    self._samples.count(shown.counted)
+                else:
+                    yield self.judged(shown), self.leak
 
     def continue_from(self, blocks: int, baseline_version: int) -> None:
         """Count blocks and baselines on from those of a watch before, whose settings or state were of another kind."""
@@ -202,9 +174,8 @@ class Watch:
         """Learn a new baseline from now on: the machine was repaired, or is another."""
         self._version += 1
         self.baseline, self._learning = None, BaselineLearning()
-        for estimator in (self._live, self._pressures):
-            if estimator is not None:
-                estimator.relearn()
+        if self._estimator is not None:
+            self._estimator.relearn()
         self.dismiss()
 
     def dismiss(self) -> None:
@@ -216,27 +187,6 @@ class Watch:
         self._detector.forget()
         self._last.clear()
         self._group = []
-
-    def _find_duty(self) -> bool:
-        """Set the length of a block from the first minute in which every value is known and the machine moves."""
-        count = round(_LEARN_SECONDS * self._samples.rate)
-        self._pressures = self._pressures or PressureEstimator.of(self._rig)
-        while len(self._samples) >= count:
-            first = self._samples.first(count)
-            if all(np.isfinite(first[name]).all() for name in first.channels):
-                seconds = self._pressures.seconds_of(first)
-                if seconds is not None:
-                    self._seconds = seconds
-                    self._samples.settled = True
-                    return True
-            self._samples.taken(count // 2)
-            self._samples.count("half minutes at rest or with missing values before the first block")
-        return False
-
-    @property
-    def to_learn(self) -> int:
-        """Blocks of the baseline."""
-        return max(LEARNED, math.ceil(self.learn_hours * 3600.0 / self.block_seconds))
 
     def judged(self, shown: Shown) -> BlockEstimate:
         """Return the estimate of a block, from what is shown of it."""
@@ -252,10 +202,11 @@ class Watch:
         return estimate
 
     def _judge(self, block: BlockConductance) -> BlockEstimate:
+        assert self._estimator is not None
         if self.baseline is not None and not self.baseline.knows(block.duty):
             self._samples.count("blocks: another duty")
             return BlockEstimate(self.blocks, block.end, "another duty")
-        if self._last and not 0.0 <= block.begin - self._last[-1][0] + block.end - block.begin <= _PAUSE_S:
+        if self._last and not 0.0 <= block.end - self._last[-1][0] <= _BELIEVED["pause"]:
             self._forget()
         self._detector.take(block.begin, block.end, block.g, block.sd)
         self._last.append((block.end, block.g, block.sd, block.flow, *block.duty))
@@ -263,25 +214,22 @@ class Watch:
         self._test_level(block)
         if self.baseline is None and self.leak is None:
             self._learning.add(block.g, block.flow, block.duty, GROUP)
-            if self._learning.blocks >= self.to_learn:
-                hours = self._learning.blocks * self.block_seconds / 3600.0
-                litres = self._litres and self.by == "volumes"
+            hours = self._learning.blocks * self.block_seconds / 3600.0
+            if self._learning.blocks >= LEARNED and hours >= self.learn_hours * (1.0 - 1e-12):
+                litres = self._estimator.litres and self._estimator.levels
                 self.baseline = self._learning.frozen(self._version, block.end, hours, litres)
                 self._learning = BaselineLearning()
         status = "alarm" if self.leak is not None else "learning" if self.baseline is None else "watched"
-        return self._estimate(status, block) if self.litres else BlockEstimate(self.blocks, block.end, status)
-
-    @property
-    def litres(self) -> bool:
-        """Whether L/min can be stated."""
-        return self._litres if self._pressures is None or self.by == "volumes" else self._pressures.litres
+        if not self._estimator.litres:
+            return BlockEstimate(self.blocks, block.end, status)
+        return self._estimate(self._estimator, status, block)
 
     def _test_step(self, block: BlockConductance) -> None:
         """Test for a step; an alarm that stands is stated anew while more blocks sharpen it."""
         leak = self.leak
         if leak is not None and (leak.test != "step" or block.end - leak.raised_s > RECENT * self.block_seconds):
             return
-        threshold = -math.log(probability_of("step", self.false_alarms_per_1000_h, block.end - block.begin))
+        threshold = -math.log(self._probability("step", block.end - block.begin))
         least = threshold if leak is None else 0.5 * leak.score
         if not self._detector.log_e(least) > least:
             return
@@ -299,13 +247,14 @@ class Watch:
 
     def _other_duty(self, onset: float, size: float) -> bool:
         """Return whether the duty changed with a rise, beyond what it was before and what a leak makes of it."""
+        assert self._estimator is not None
         ends, *_, pressure, motion = np.array(self._last).T
         after = ends > onset
         if np.count_nonzero(~after) < _RECENT or not after.any():
             return False
         low, high = ((float(f(pressure[~after])), float(f(motion[~after]))) for f in (np.min, np.max))
         now = float(np.median(pressure[after])), float(np.median(motion[after]))
-        lost = 1.0 - size * math.exp(now[0] - now[1]) if self.by == "volumes" else 1.0
+        lost = 1.0 - size * math.exp(now[0] - now[1]) if self._estimator.levels else 1.0
         net = now[0], now[1] + math.log(max(lost, np.finfo(float).tiny))  # the pump may give what leaks
         return not (within(now, low, high) or within(net, low, high))
 
@@ -314,83 +263,69 @@ class Watch:
         self._group.append((block.end, block.g, block.sd, block.offset))
         if len(self._group) < GROUP:
             return
-        at, g, _, offset = np.mean(self._group, axis=0)
+        at, g, _, offset = (float(value) for value in np.mean(self._group, axis=0))
         sd = math.sqrt(sum(row[2] ** 2 for row in self._group)) / GROUP
         self._group = []
         if self.leak is not None or self.baseline is None:
             return
         # what all conductances are off by is in the ceiling that many times
-        deviation = math.hypot(sd, float(offset) * (priors()["oil"]["warmest"].value - 1.0))
-        probability = probability_of("level", self.false_alarms_per_1000_h, GROUP * self.block_seconds)
-        rise = self.baseline.rise(float(at), float(g), deviation, probability)
+        deviation = math.hypot(sd, offset * (priors()["oil"]["warmest"].value - 1.0))
+        rise = self.baseline.rise(at, g, deviation, self._probability("level", GROUP * self.block_seconds))
         if rise is not None:
             self._raise(rise, block, self.baseline.level)
 
     def _raise(self, rise: WatchedRise, block: BlockConductance, before: float | None = None) -> None:
-        onset, low, high = rise.onset
+        assert self._estimator is not None
+        own, leak, (onset, *ends) = self._estimator, self.leak, rise.onset
         if before is None:
-            earlier = [row[1] for row in self._last if row[0] <= low] or [block.g - rise.size]
-            before = self.leak.before if self.leak is not None else float(np.mean(earlier[-GROUP:]))
-        cause, inside = _CAUSES[self.by]
-        size, half = rise.size, 1.96 * math.hypot(rise.deviation, self._size_error * rise.size)
-        lpm = size * block.flow
-        interval = inside * max(0.0, size - half) * block.flow, self._orifice * (size + half) * block.flow
+            earlier = [row[1] for row in self._last if row[0] <= ends[0]] or [block.g - rise.size]
+            before = leak.before if leak is not None else float(np.mean(earlier[-GROUP:]))
+        half = 1.96 * math.hypot(rise.deviation, own.size_error * rise.size)
+        low, high = own.inside * max(0.0, rise.size - half) * block.flow, own.orifice * (rise.size + half) * block.flow
         self.leak = WatchedLeak(
-            block.end if self.leak is None else self.leak.raised_s,
-            onset,
-            (low, high),
-            lpm if self.litres else None,
-            interval if self.litres else None,
-            before,
-            rise.deviation,
-            rise.test,
-            cause,
-            rise.reason,
-            rise.score,
-            rise.threshold,
+            raised_s=block.end if leak is None else leak.raised_s,
+            onset_s=onset,
+            onset_interval_s=(ends[0], ends[1]),
+            leak_lpm=rise.size * block.flow if own.litres else None,
+            leak_interval_lpm=(low, high) if own.litres else None,
+            before=before,
+            before_sd=rise.deviation,
+            test=rise.test,
+            cause=own.cause,
+            reason=rise.reason,
+            score=rise.score,
+            threshold=rise.threshold,
         )
 
-    @property
-    def _size_error(self) -> float:
-        return size_error(self._rig) if self.by == "volumes" else PressureEstimator.size_error
-
-    @property
-    def _orifice(self) -> float:
-        return 1.0 if self.by == "volumes" else PressureEstimator.orifice
-
-    def _estimate(self, status: str, block: BlockConductance) -> BlockEstimate:
+    def _estimate(self, own: LiveBalance | PressureEstimator, status: str, block: BlockConductance) -> BlockEstimate:
         """Return the block's estimate: total flow, and flow beyond the baseline's, or since the onset of the leak."""
-        flow = block.flow
-        beyond: tuple[float, float, float] | None = None
-        sd = block.sd * math.sqrt(self._detector.noise)
+        flow, sd = block.flow, block.sd * math.sqrt(self._detector.noise)
+        total = total_interval = leak = leak_interval = beyond = None
         if self.leak is not None:
-            beyond = self._beyond_leak(self.leak, block, sd)
+            beyond = self._beyond_leak(self.leak, own, block, sd)
         elif self.baseline is not None:
             base, half = self.baseline, 1.96 * sd
             beyond = block.g - base.level, block.g - base.high - half, block.g - base.low + half
-        total = total_interval = leak = leak_interval = None
-        if self.by == "volumes":
+        if own.levels:
             half = 1.96 * math.hypot(sd, block.offset)
             total = block.total * flow
             total_interval = max(0.0, block.total - half) * flow, max(0.0, block.total + half) * flow
         if beyond is not None:
             leak, low, high = (value * flow for value in beyond)
-            leak_interval = max(0.0, low), self._orifice * max(0.0, high)
+            leak_interval = max(0.0, low), own.orifice * max(0.0, high)
         return BlockEstimate(self.blocks, block.end, status, total, total_interval, leak, leak_interval)
 
-    def _beyond_leak(self, leak: WatchedLeak, block: BlockConductance, sd: float) -> tuple[float, float, float]:
+    def _beyond_leak(
+        self, leak: WatchedLeak, own: LiveBalance | PressureEstimator, block: BlockConductance, sd: float
+    ) -> tuple[float, float, float]:
         """Return the conductance since the onset of a leak, and its interval, in which the oil may have warmed."""
         recent = [row[1] for row in self._last if row[0] - self.block_seconds >= leak.onset_interval_s[1]][-_RECENT:]
-        now = float(np.mean(recent or [block.g]))
-        oil = priors()["oil"]
+        now, oil = float(np.mean(recent or [block.g])), priors()["oil"]
         hours = max(0.0, block.end - leak.onset_s) / 3600.0
         warmed = oil["warmest"].value ** min(1.0, hours / oil["shift"].value)
-        before = max(leak.before, 0.0)
-        spread = 1.96 * math.hypot(
-            sd / math.sqrt(max(len(recent), 1)), leak.before_sd, self._size_error * (now - leak.before)
-        )
-        inside = _CAUSES[self.by][1]
-        return now - leak.before, inside * (now - before * warmed - spread), now - before / warmed + spread
+        before, rise = max(leak.before, 0.0), now - leak.before
+        spread = 1.96 * math.hypot(sd / math.sqrt(max(len(recent), 1)), leak.before_sd, own.size_error * rise)
+        return rise, own.inside * (now - before * warmed - spread), now - before / warmed + spread
 
     def state(self) -> dict[str, Any]:
         """Return all that the watch knows as plain values that JSON holds; `from_state` continues with the same bits.
@@ -400,7 +335,6 @@ class Watch:
         dict
             Mappings, lists, texts and numbers; ``"version"`` is the format's.
         """
-        parts = {name: getattr(self, f"_{name}") for name in ("samples", "live", "pressures", "detector")}
         facts = {"learning": self._learning, "baseline": self.baseline, "leak": self.leak}
         return {
             "version": STATE_VERSION,
@@ -410,10 +344,11 @@ class Watch:
             "learn_hours": self.learn_hours,
             "blocks": self.blocks,
             "baseline_version": self._version,
-            "seconds": self._seconds,
-            **{name: None if part is None else part.state() for name, part in parts.items()},
+            "samples": self._samples.state(),
+            "detector": self._detector.state(),
+            "estimator": None if self._estimator is None else self._estimator.state(),
             **{name: None if fact is None else plain_fields(fact) for name, fact in facts.items()},
-            "last": plain_array(np.array(self._last).reshape(-1, _COLUMNS)),
+            "last": plain_array(np.array(self._last).reshape(-1, 6)),
             "group": plain_array(np.array(self._group).reshape(-1, 4)),
         }
 
@@ -439,37 +374,29 @@ class Watch:
         version = part_of(state, "version", int)
         if version != STATE_VERSION:
             raise InputError(f"saved state must have version {STATE_VERSION}, got {version}")
-        number = {name: part_of(state, name, (float, int)) for name in _NUMBERS}
+        names = ("false_alarms_per_1000_h", "learn_hours", "blocks", "baseline_version")
+        rate, hours, blocks, own_version = (part_of(state, name, (float, int)) for name in names)
         rig = _rig_of(part_of(state, "rig", str))
-        rate, hours = number["false_alarms_per_1000_h"], number["learn_hours"]
-        watch = cls(rig, rate, hours, litres=part_of(state, "litres", bool))
-        watch._seconds = number["seconds"]
-        watch.blocks, watch._version = int(number["blocks"]), int(number["baseline_version"])
-        kinds = {name: (Mapping, type(None)) if name in _OPTIONAL else Mapping for name in (*_PARTS, *_FACTS)}
-        saved = {name: part_of(state, name, kind) for name, kind in kinds.items()}
-        for name, restore in _PARTS.items():
-            setattr(watch, f"_{name}", None if saved[name] is None else restore(rig, saved[name]))
-        for name, kind in _FACTS.items():
-            fact = None if saved[name] is None else restored(kind, saved[name], name)
-            setattr(watch, "_learning" if name == "learning" else name, fact)
+        litres = part_of(state, "litres", Mapping)
+        watch = cls(rig, rate, hours, litres={kind.by: part_of(litres, kind.by, bool) for kind in _KINDS})
+        watch.blocks, watch._version = int(blocks), int(own_version)
+        watch._samples = SampleJoiner.from_state(part_of(state, "samples", Mapping))
+        watch._detector = StepDetector.from_state(part_of(state, "detector", Mapping))
+        if (own := part_of(state, "estimator", (Mapping, type(None)))) is not None:
+            kind = next(kind for kind in _KINDS if kind.by == watch.by)
+            watch._estimator = kind.from_state(rig, own)
+            if not {*watch._estimator.names} <= {*watch._samples.names}:
+                raise InputError("saved state's estimator must read channels of its samples")
+        watch._learning = restored(BaselineLearning, part_of(state, "learning", Mapping), "learning")
+        for name, fact in (("baseline", WatchBaseline), ("leak", WatchedLeak)):
+            if (own := part_of(state, name, (Mapping, type(None)))) is not None:
+                setattr(watch, name, restored(fact, own, name))
         last, group = (array_of(part_of(state, name, Mapping), name) for name in ("last", "group"))
-        if last.shape[1:] != (_COLUMNS,) or group.shape[1:] != (4,):
-            raise InputError(f"saved state's last blocks must have {_COLUMNS} columns, got {last.shape}, {group.shape}")
-        watch._last = deque((tuple(row) for row in last.tolist()), maxlen=RECENT)
+        if last.shape[1:] != (6,) or group.shape[1:] != (4,):
+            raise InputError(f"saved state's last blocks must have 6 and 4 columns, got {last.shape}, {group.shape}")
+        watch._last.extend(tuple(row) for row in last.tolist())
         watch._group = [tuple(row) for row in group.tolist()]
         return watch
-
-
-#: Parts of the state -> what restores each, of a rig; and those that are plain dataclasses.
-_PARTS: dict[str, Callable[[Any, Mapping[str, Any]], Any]] = {
-    "samples": lambda rig, state: SampleJoiner.from_state(state),
-    "live": LiveBalance.from_state,
-    "pressures": PressureEstimator.from_state,
-    "detector": lambda rig, state: StepDetector.from_state(state),
-}
-_FACTS: dict[str, type[Any]] = {"learning": BaselineLearning, "baseline": WatchBaseline, "leak": WatchedLeak}
-_OPTIONAL = ("live", "pressures", "baseline", "leak")
-_NUMBERS = ("false_alarms_per_1000_h", "learn_hours", "blocks", "baseline_version", "seconds")
 
 
 @lru_cache(maxsize=256)

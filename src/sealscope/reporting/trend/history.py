@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.trend.timeline import DAY
+from sealscope.diagnosis.trend.reading import DAY
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording

@@ -10,8 +10,8 @@ from textwrap import fill
 import numpy as np
 
 from sealscope.diagnosis.inference.onset import Interval
-from sealscope.diagnosis.trend.timeline import DAY
-from sealscope.diagnosis.trend.trend import Trend, TrendPoint
+from sealscope.diagnosis.trend.reading import DAY, TrendPoint
+from sealscope.diagnosis.trend.trend import Trend
 from sealscope.diagnosis.trend.wear import MONTH
 from sealscope.reporting.messages import machine_text, number
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sealscope.compiled import kernel
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.balance import BlockStream
 from sealscope.diagnosis.inference.blocks import Blocks, Columns
 from sealscope.diagnosis.inference.live.known import (
@@ -33,22 +34,22 @@ from sealscope.diagnosis.inference.terms import Equation, equations, priors
 from sealscope.diagnosis.inference.weak_form import stride_samples
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
-from sealscope.storage.plain_state import array_of, part_of, plain_array
+from sealscope.storage.plain_state import array_of, part_of, recall, saved
 from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: About how long a block is [s].
-BLOCK_SECONDS = 3.0
-#: Blocks before anything is said.
-LEARNED = 20
-#: A block that rests counts all the same where it tells of the leak more than so much of what the usual one does.
-TELLS = 0.1
-#: ... and after so many that move so much more, all before were of a machine at rest.
-WAKES = 3
+_BELIEVED = beliefs("inference.live")["block"]
+#: About how long a block is [s], and blocks before anything is said.
+BLOCK_SECONDS: float = _BELIEVED["seconds"]
+LEARNED: int = _BELIEVED["learned"]
+#: A block that rests counts all the same where it tells of the leak more than so much of what the usual one does, and
+#: after so many that move so much more, all before were of a machine at rest.
+TELLS: float = _BELIEVED["tells"]
+WAKES: int = _BELIEVED["wakes"]
 #: Two samples follow each other where their times differ by so many steps.
-_FOLLOWS = (0.5, 1.5)
+FOLLOWS = (0.5, 1.5)
 
 
 @dataclass(frozen=True)
@@ -101,47 +102,6 @@ def _says(known: Known, gram: Any, place: Any, rows: float, adds: bool) -> tuple
     return says(known, rows, adds)  # type: ignore[no-any-return]
 
 
-_SAVED = ("sums", "coefficients", "along", "numbers")
-
-
-class _Known:
-    """What the last blocks say of all coefficients of one equation (`known`)."""
-
-    def __init__(self, columns: Columns) -> None:
-        others = [k for k in columns.nuisance if k != columns.leak]
-        self._place = np.array([*others, columns.leak, columns.left])
-        self._sums = Known(*(np.zeros(shape) for shape in known_shapes(len(others))))
-
-    def relearn(self) -> None:
-        """Forget all."""
-        for name in _SAVED:
-            getattr(self._sums, name)[:] = 0.0
-
-    def learn(self, grams: Array, rows: Array) -> None:
-        """Take what the first blocks (K, m, m) say together."""
-        _learns(self._sums, np.ascontiguousarray(grams), self._place, rows)
-
-    def says(self, gram: Array, rows: float, adds: bool) -> Said:
-        """Return what a block says, beside what those before it say; with `adds` it is one of these from now on."""
-        return Said(*_says(self._sums, gram, self._place, rows, adds))
-
-    def moves(self, gram: Array, rows: float) -> float:
-        """Return the motion of a block over the usual one."""
-        return motion(float(gram[-1, -1]), rows, self._sums.numbers)
-
-    def state(self) -> dict[str, Any]:
-        """Return all of it as plain values."""
-        return {name: plain_array(getattr(self._sums, name)) for name in _SAVED}
-
-    def recall(self, state: Any) -> None:
-        """Continue from a `state`; raises InputError where it does not fit."""
-        for name in _SAVED:
-            values, own = array_of(part_of(state, name, Mapping), name), getattr(self._sums, name)
-            if values.shape != own.shape:
-                raise InputError(f"saved state's {name} must be {own.shape}, got {values.shape}")
-            own[:] = values
-
-
 class LiveBalance:
     """The balance of a running machine: samples in, conductances of blocks out, the same for pieces of any size.
 
@@ -158,21 +118,33 @@ class LiveBalance:
         Where the channels allow no balance.
     """
 
-    def __init__(self, rig: Rig, names: Sequence[str]) -> None:
+    by, levels, cause, inside, orifice = "volumes", True, "piston or pump leak", 1.0, 1.0
+    block_seconds, begun = BLOCK_SECONDS, True
+
+    def __init__(self, rig: Rig, names: Sequence[str], litres: bool | None = None) -> None:
         self._balances = live_equations(rig, names)
         if not self._balances:
-            raise InputError(f"a live balance must have {_needed(rig)}, got {', '.join(names) or 'nothing'}")
-        needed = {"x", "p_A", "p_B", *(name for each in self._balances for term in each.terms for name in term.needs)}
-        needed |= {next(name for name in ("theta", "omega", "u") if name in names)}
-        self.names = tuple(name for name in names if name in needed)
-        columns = [Columns(balance) for balance in self._balances]
-        self._known = [_Known(own) for own in columns]
-        self._precision = 0.0  # of the usual block
-        self._size_error = size_error(rig)
-        self._woken = 0
+            needed = "x, u, p_A, p_B, p_1 and p_2" if _valved(rig) else "x, p_A, p_B and theta, omega or u"
+            raise InputError(f"a live balance must have {needed}, got {', '.join(names) or 'nothing'}")
+        read = {"x", "p_A", "p_B", *(name for each in self._balances for term in each.terms for name in term.needs)}
+        read |= {next(name for name in ("theta", "omega", "u") if name in names)}
+        self.names = tuple(name for name in names if name in read)
+        self.size_error = size_error(rig)
+        self.litres = self.states_flow(rig) if litres is None else litres
+        self._places, self._known = [], []
+        for columns in map(Columns, self._balances):
+            others = [k for k in columns.nuisance if k != columns.leak]
+            self._places.append(np.array([*others, columns.leak, columns.left]))
+            self._known.append(Known(*(np.zeros(shape) for shape in known_shapes(len(others)))))
+        self._precision, self._woken = 0.0, 0  # of the usual block; blocks that moved as never before
         self._waiting: Blocks | None = None
         self._stream: BlockStream | None = None
         self._rate, self._next = 0.0, -math.inf
+
+    @staticmethod
+    def states_flow(rig: Rig) -> bool:
+        """Return whether a rig states what turns the balance into L/min."""
+        return rig.states(*(("cylinder.A_A", "cylinder.A_B") if _valved(rig) else ("pump.q_b",)))
 
     def take(self, t: Array, samples: Mapping[str, Array], rate: float) -> list[Shown]:
         """Take samples that follow each other at the times `t` [s]; return what each block says that they complete.
@@ -183,7 +155,7 @@ class LiveBalance:
         """
         shown: list[Shown] = []
         steps = (float(t[0]) - self._next) * rate + 1.0
-        if self._stream is None or rate != self._rate or not _FOLLOWS[0] < steps < _FOLLOWS[1]:
+        if self._stream is None or rate != self._rate or not FOLLOWS[0] < steps < FOLLOWS[1]:
             shown += self.finish()
             if self._stream is None or rate != self._rate:
                 before = self._stream
@@ -194,11 +166,6 @@ class LiveBalance:
         self._next = float(t[-1]) + 1.0 / rate
         return shown + self._said(self._stream.push({name: samples[name] for name in self.names}))
 
-    @property
-    def _stride(self) -> float:
-        """Time between rows [s]."""
-        return stride_samples(self._rate) / self._rate
-
     def interrupt(self) -> None:
         """Take the next samples as those after a gap, whatever their time is."""
         self._next = -math.inf
@@ -208,16 +175,14 @@ class LiveBalance:
         return [] if self._stream is None else self._said(self._stream.push({}, last=True))
 
     def _said(self, blocks: Blocks | None) -> list[Shown]:
-        if blocks is None:
-            return []
-        return [self._taken(block) for block in _parts(blocks)]
+        return [] if blocks is None else [self._taken(block) for block in _parts(blocks)]
 
     def _taken(self, block: Blocks) -> Shown:
-        end, rows = float(block.end[0]) + 0.5 * self._stride, float(block.rows[0])
+        end, rows = float(block.end[0]) + 0.5 * stride_samples(self._rate) / self._rate, float(block.rows[0])
         if not rows:
             return NotJudged(end, "missing values", "blocks: missing values")
         if self._precision > 0.0:
-            self._woken = self._woken + 1 if self._known[0].moves(block.gram[0, 0], rows) > 1.0 / RESTS else 0
+            self._woken = self._woken + 1 if self._moves(block) > 1.0 / RESTS else 0
             if self._woken >= WAKES:
                 self.relearn()
                 return NotJudged(end, "learning", "blocks: moves as never before", True)
@@ -229,28 +194,31 @@ class LiveBalance:
         if len(self._waiting) < LEARNED:
             return NotJudged(end, "learning")
         waiting, self._waiting = self._waiting, None
-        for e, known in enumerate(self._known):
-            known.learn(waiting.gram[:, e], waiting.rows)
+        for e, (known, place) in enumerate(zip(self._known, self._places, strict=True)):
+            _learns(known, np.ascontiguousarray(waiting.gram[:, e]), place, waiting.rows)
         self._precision = float(np.median([self._says(part, adds=False).precision for part in _parts(waiting)]))
         parts = [self._shown(part, adds=False) for part in _parts(waiting)]
         return [part for part in parts if not isinstance(part, NotJudged)] or NotJudged(end, "at rest")
 
+    def _moves(self, block: Blocks) -> float:
+        """Return the motion of a block over the usual one."""
+        return motion(float(block.gram[0, 0, -1, -1]), float(block.rows[0]), self._known[0].numbers)
+
     def _says(self, block: Blocks, adds: bool = True) -> Said:
-        """Return what a block says by all equations."""
-        rows = float(block.rows[0])
-        said = [known.says(gram, rows, adds) for known, gram in zip(self._known, block.gram[0], strict=True)]
+        """Return what a block says by all equations; with `adds` it is one of those that are known from now on."""
+        rows, each = float(block.rows[0]), zip(self._known, block.gram[0], self._places, strict=True)
+        said = [_says(known, gram, place, rows, adds) for known, gram, place in each]
         return Said(*(sum(values) for values in zip(*said, strict=True)))
 
     def _shown(self, block: Blocks, adds: bool = True) -> BlockConductance | NotJudged:
-        begin, end = float(block.start[0]) - 0.5 * self._stride, float(block.end[0]) + 0.5 * self._stride
-        at_rest = self._known[0].moves(block.gram[0, 0], float(block.rows[0])) < RESTS
+        half = 0.5 * stride_samples(self._rate) / self._rate
+        begin, end = float(block.start[0]) - half, float(block.end[0]) + half
+        at_rest = self._moves(block) < RESTS
         precision, lead, shift, leaning = self._says(block, adds)
         if not precision > (TELLS * self._precision if at_rest else 0.0):
             return NotJudged(end, "at rest", "blocks: at rest")
-        total, offset = (
-            lead / precision,
-            math.hypot(math.sqrt(leaning) / precision, self._size_error * lead / precision),
-        )
+        total = lead / precision
+        offset = math.hypot(math.sqrt(leaning) / precision, self.size_error * lead / precision)
         pressure, _, rate = (max(float(value), TINY) for value in block.means[0])
         duty = math.log(pressure), math.log(rate)
         g, sd = total - shift / precision, precision**-0.5
@@ -259,67 +227,55 @@ class LiveBalance:
     def relearn(self) -> None:
         """Forget all coefficients: the machine was repaired, or is another."""
         for known in self._known:
-            known.relearn()
+            for values in known:
+                values[:] = 0.0
         self._precision, self._woken, self._waiting = 0.0, 0, None
 
     def state(self) -> dict[str, Any]:
         """Return all of it as plain values that JSON holds."""
         waiting, stream = self._waiting, self._stream
         return {
-            "names": list(self.names),
-            "known": [known.state() for known in self._known],
-            "precision": self._precision,
-            "woken": self._woken,
-            "waiting": None
-            if waiting is None
-            else {name: plain_array(getattr(waiting, name)) for name in _BLOCK_FIELDS},
-            "rate": self._rate,
-            "next": self._next if math.isfinite(self._next) else None,
+            **saved(self, _SAVED),
+            "known": [saved(known, _KNOWN) for known in self._known],
+            "waiting": None if waiting is None else saved(waiting, _BLOCK),
             "stream": None if stream is None else stream.state(),
         }
 
     @classmethod
     def from_state(cls, rig: Rig, state: Mapping[str, Any]) -> LiveBalance:
         """Return the balance that `state` was of; raises InputError where it does not fit."""
-        live = cls(rig, tuple(part_of(state, "names", list)))
+        live = cls(rig, part_of(state, "names", list), part_of(state, "litres", bool))
+        recall(live, _SAVED, state)
         known = part_of(state, "known", list)
         if len(known) != len(live._known):
             raise InputError(f"saved state's known must be of {len(live._known)} equations, got {len(known)}")
-        for own, saved in zip(live._known, known, strict=True):
-            own.recall(saved)
-        live._precision, live._rate = (_number(state, name) for name in ("precision", "rate"))
-        live._woken = int(part_of(state, "woken", int))
+        for sums, before in zip(live._known, known, strict=True):
+            recall(sums, _KNOWN, before)
         waiting, stream = (part_of(state, name, (Mapping, type(None))) for name in ("waiting", "stream"))
-        after = part_of(state, "next", (float, int, type(None)))
         if waiting is not None:
-            live._waiting = Blocks(*(array_of(part_of(waiting, name, Mapping), name) for name in _BLOCK_FIELDS))
-        live._next = -math.inf if after is None else float(after)
+            live._waiting = Blocks(*(array_of(part_of(waiting, name, Mapping), name) for name in _BLOCK))
         if stream is not None:
             live._stream = BlockStream(live._balances, live._rate, BLOCK_SECONDS)
             live._stream.recall(stream)
         return live
 
 
-_BLOCK_FIELDS = tuple(Blocks.__dataclass_fields__)
+_SAVED = ("names", "litres", "_precision", "_woken", "_rate", "_next")
+_KNOWN, _BLOCK = ("sums", "coefficients", "along", "numbers"), tuple(Blocks.__dataclass_fields__)
 
 
 def _parts(blocks: Blocks) -> list[Blocks]:
     """Return the blocks one by one."""
-    return [Blocks(*(getattr(blocks, name)[k : k + 1] for name in _BLOCK_FIELDS)) for k in range(len(blocks))]
+    return [Blocks(*(getattr(blocks, name)[k : k + 1] for name in _BLOCK)) for k in range(len(blocks))]
 
 
-def _number(state: Any, name: str) -> float:
-    return float(part_of(state, name, (float, int)))
+def _valved(rig: Rig) -> bool:
+    return bool(rig.valve.spool == "present")
 
 
 def size_error(rig: Rig) -> float:
     """Return how far a flow by the rig's size is known, relative."""
-    return priors()["size"]["area" if rig.valve.spool == "present" else "displacement"].value
-
-
-def states_flow(rig: Rig) -> bool:
-    """Return whether a rig states what turns the balance into L/min."""
-    return rig.states(*(("cylinder.A_A", "cylinder.A_B") if rig.valve.spool == "present" else ("pump.q_b",)))
+    return priors()["size"]["area" if _valved(rig) else "displacement"].value
 
 
 def live_equations(rig: Rig, names: Sequence[str]) -> list[Equation]:
@@ -327,9 +283,3 @@ def live_equations(rig: Rig, names: Sequence[str]) -> list[Equation]:
     balances = equations(rig, frozenset(names))
     told = [tuple(term for term in own.terms if term.nuisance and term.name != "pump leak") for own in balances]
     return [own._replace(terms=terms) for own, terms in zip(balances, told, strict=True)]
-
-
-def _needed(rig: Rig) -> str:
-    if rig.valve.spool == "present":
-        return "x, u, p_A, p_B, p_1 and p_2"
-    return "x, p_A, p_B and theta, omega or u"

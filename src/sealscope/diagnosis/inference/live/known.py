@@ -15,20 +15,18 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from sealscope.compiled import large_law, law
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.row_weights import solve_in_place
 from sealscope.diagnosis.inference.weak_form import OVERLAP
 
-#: Blocks after which what they said of the other coefficients counts for 1/e.
-MEMORY = 60.0
-#: A block that leaves more than this many deviations counts for less.
-JUMP = 4.0
-#: A block rests whose motion is below this share of the usual one.
-RESTS = 1e-4
-#: What is left after a block of how far the series stands from the level that the coefficients give now.
-_RETURNS = math.exp(-1.0 / 1200.0)
-_KEEP = math.exp(-1.0 / MEMORY)
-TINY = 2.2250738585072014e-308
+JUMP: float = beliefs("inference.live")["coefficients"]["jump"]
+RESTS: float = beliefs("inference.live")["block"]["rests"]
+#: What is left after a block of what those before said, and of how far the series stands from the present level.
+_KEEP, _RETURNS = (math.exp(-1.0 / beliefs("inference.live")["coefficients"][name]) for name in ("memory", "returns"))
+TINY = float(np.finfo(float).tiny)
 
 #: Places in `Known.numbers`: rows and motion that the sums are of, variance of a row, energy of the leak's column, how
 #: far the series stands from the level, and the variance of the last block's rows over the usual one.

@@ -29,33 +29,34 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
-from sealscope.storage.plain_state import array_of, part_of, plain_array
+from sealscope.storage.plain_state import recall, saved
 
-#: Variances of the walk in a block that are tried, over that of a block's estimate.
-WALKS = np.array([0.0, 1e-3, 1e-2, 1e-1, 1.0, 10.0])[:, None]
-#: Variances of the step, over that of a block's estimate.
-SIZES = 10.0 ** np.arange(0.0, 9.0, 2.0)
+_BELIEVED = beliefs("inference.live")["step"]
+WALKS = np.array(_BELIEVED["walks"])[:, None]
+SIZES = np.array(_BELIEVED["sizes"])
+PARTS = np.array(_BELIEVED["parts"])
+JUMP, MEMORY = beliefs("inference.live")["coefficients"]["jump"], _BELIEVED["memory"]
 #: Onsets are all kept for `RECENT` blocks, then `RECENT / 4` of every doubling of age, up to `HORIZON` blocks.
 RECENT, HORIZON = 32, 4096
-#: Parts of the block that an onset lies in which leak.
-PARTS = np.array([0.25, 0.5, 0.75, 1.0])
-#: Deviations beyond which an innovation says nothing more of noise and walk: it may be a step.
-JUMP = 4.0
-#: What a block's noise, and the weights of the walks, are remembered by for each block that follows.
-MEMORY = 0.998
-#: Share of the prior of a walk that all sizes have in equal parts: it may change.
-ANY_WALK = 1e-3
-#: Blocks that the stated variance counts as in `StepDetector.noise`.
-STATED = 20.0
-#: Innovations from which the noise is known at all.
-_FEWEST = 4
 #: What is kept of each onset and walk, and of each onset.
 _FIELDS = ("answer", "along", "square", "total", "lead")
 _PLACES = ("number", "born", "onset", "begin")
-_ARRAYS = ("level", "spread", "total", "weight", "widths", "onsets", "places")
-_NUMBERS = ("unit", "known", "blocks", "last")
+_SAVED = tuple(f"_{name}" for name in ("level", "spread", "total", "weight", "widths", "onsets", "places", "unit",
+                                       "known", "blocks", "last"))  # fmt: skip
+
+
+def probability_of(rate: float, hours: float, seconds: float, name: str) -> float:
+    """Return the probability of a false alarm of a look every `seconds`, at a `rate` of alarms in so many hours.
+
+    `name`: of the rate, in the InputError that is raised where no threshold can be set for it.
+    """
+    looks, (least, most) = hours * 3600.0 / seconds, (1e-12, 0.05)
+    if not least * looks <= rate <= most * looks:
+        raise InputError(f"{name} must be {least * looks:.2g} to {most * looks:.3g}, got {rate:g}")
+    return rate / looks
 
 
 class Rise(NamedTuple):
@@ -94,7 +95,7 @@ class StepDetector:
         spread = self._spread + WALKS * max(elapsed, 1.0)
         sigma, error = spread + variance, g - self._level
         own, gain = error**2 / sigma, spread / sigma
-        begins = self._known >= _FEWEST
+        begins = self._known >= 4
         if begins:
             self._begin_onset(begin, end)
         if len(self._places):
@@ -105,7 +106,7 @@ class StepDetector:
 
     def _learn(self, sigma: Array, own: Array) -> None:
         """Learn noise and walk from an innovation of square `own` over `sigma`."""
-        if self._known >= _FEWEST:
+        if self._known >= 4:
             own = np.minimum(own, JUMP**2 * self._total / self._known)
             weight = MEMORY * self._weight - 0.5 * np.log(sigma * self._total)
             weight -= 0.5 * (self._known + 1.0) * np.log1p(own / self._total)
@@ -116,7 +117,7 @@ class StepDetector:
 
     def _begin_onset(self, begin: float, end: float) -> None:
         fresh = np.zeros((len(_FIELDS), len(WALKS), len(PARTS)))
-        weight = np.logaddexp(np.log1p(-ANY_WALK) + self._weight, np.log(ANY_WALK / len(WALKS)))
+        weight = np.logaddexp(np.log1p(-_BELIEVED["changes"]) + self._weight, np.log(_BELIEVED["changes"] / len(WALKS)))
         # p_q(e_j..e_k) = lead T_k^(-n/2) prod S^(-1/2) times what is the same for all q
         fresh[3], fresh[4] = self._total, weight + 0.5 * (self._known * np.log(self._total) + self._widths)
         places = np.array([[self._known, self._blocks, end - part * (end - begin), begin] for part in PARTS])
@@ -211,29 +212,19 @@ class StepDetector:
     @property
     def noise(self) -> float:
         """Variance of a block's estimate over what was stated of it, beside a walk of a tenth."""
-        return float((self._total[3, 0] + STATED) / (self._known + STATED))
+        return float((self._total[3, 0] + _BELIEVED["stated"]) / (self._known + _BELIEVED["stated"]))
 
     def state(self) -> dict[str, Any]:
         """Return all of it as plain values."""
-        numbers = {name: float(getattr(self, f"_{name}")) for name in _NUMBERS}
-        last = {"last": None} if np.isinf(self._last) else {}
-        return {**{name: plain_array(getattr(self, f"_{name}")) for name in _ARRAYS}, **numbers, **last}
+        return saved(self, _SAVED)
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> StepDetector:
         """Return the detector that `state` was of; raises InputError where it does not fit."""
         detector = cls()
-        for name in _ARRAYS:
-            values = array_of(part_of(state, name, Mapping), name)
-            shape = getattr(detector, f"_{name}").shape
-            if values.ndim != len(shape) or any(a != b for a, b in zip(values.shape, shape, strict=True) if b):
-                raise InputError(f"saved state's {name} must have the shape {shape}, got {values.shape}")
-            setattr(detector, f"_{name}", values)
+        recall(detector, _SAVED, state)
         if detector._onsets.shape[2] != len(detector._places):
             raise InputError(f"saved state's onsets must be {len(detector._places)}, got {detector._onsets.shape[2]}")
-        for name in _NUMBERS:
-            value = part_of(state, name, (float, int, type(None)))
-            setattr(detector, f"_{name}", -np.inf if value is None else value)
         return detector
 
 

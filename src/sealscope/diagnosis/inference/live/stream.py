@@ -16,16 +16,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sealscope.diagnosis.inference.live.balance import (
-    BLOCK_SECONDS,
-    BlockConductance,
-    LiveBalance,
-    NotJudged,
-    Shown,
-    size_error,
-    states_flow,
-)
-from sealscope.diagnosis.inference.live.sequential import Rise, StepDetector
+from sealscope.diagnosis.inference.live.balance import BLOCK_SECONDS, BlockConductance, LiveBalance, NotJudged, Shown
+from sealscope.diagnosis.inference.live.sequential import StepDetector, probability_of
 from sealscope.diagnosis.inference.terms import priors
 from sealscope.diagnosis.verdict.evidence import NO_RIG, Cause, Evidence, without_flow
 from sealscope.errors import InputError
@@ -34,11 +26,6 @@ from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
-
-#: Probabilities of a false alarm of a block for which the detector can be set.
-_PROBABILITIES = (1e-12, 0.05)
-_CHANNELS = ("u", "x", "theta", "omega", "p_A", "p_B", "p_1", "p_2")
-_95 = 1.96
 
 
 @dataclass(frozen=True)
@@ -104,14 +91,9 @@ class SequentialBalance:
     def __init__(self, rig: Rig | str | os.PathLike[str] = "thesis", *, alarms_per_hour: float = 0.01) -> None:
         from sealscope.parameters import load_rig
 
-        low, high = (probability * 3600.0 / BLOCK_SECONDS for probability in _PROBABILITIES)
-        if not low <= alarms_per_hour <= high:
-            raise InputError(f"alarms_per_hour must be {low:.2g} to {high:.3g}, got {alarms_per_hour}")
         self.alarms_per_hour = alarms_per_hour
-        self._threshold = -math.log(alarms_per_hour * BLOCK_SECONDS / 3600.0)
+        self._threshold = -math.log(probability_of(alarms_per_hour, 1.0, BLOCK_SECONDS, "alarms_per_hour"))
         self._rig = load_rig(rig)
-        self._cause: Cause = "piston leak" if self._rig.valve.spool == "present" else "piston or pump leak"
-        self._size = size_error(self._rig), states_flow(self._rig)
         self._live: LiveBalance | None = None
         self._detector = StepDetector()
         self._units: dict[str, str] = {}
@@ -142,10 +124,10 @@ class SequentialBalance:
             Where channels, units or rate are not those of the stream's beginning.
         """
         if self._live is None:
-            live = LiveBalance(self._rig, tuple(name for name in _CHANNELS if name in samples))
-            self._units, self._rate = {name: samples.units[name] for name in live.names}, samples.rate
-            self._live = live
-        chosen = samples.only(self._live.names)
+            read = ("u", "x", "theta", "omega", "p_A", "p_B", "p_1", "p_2")
+            self._live = LiveBalance(self._rig, tuple(name for name in read if name in samples))
+            self._units, self._rate = {name: samples.units[name] for name in self._live.names}, samples.rate
+        chosen, live = samples.only(self._live.names), self._live
         if samples.rate != self._rate or dict(chosen.units) != self._units:
             raise InputError(
                 f"samples must have the rate ({self._rate:g} Hz) and units of the stream's beginning, got "
@@ -153,10 +135,10 @@ class SequentialBalance:
             )
         if len(chosen):
             with np.errstate(all="ignore"):  # a block whose sums overflow says nothing
-                shown = self._live.take(chosen.t, chosen.channels, chosen.rate)
-            last = [self._taken(block) for block in shown][-1:]
-            if last and last[0] is not None:
-                self.state = replace(self.state, evidence=self._evidence(last[0]), total_lpm=self._total(last[0]))
+                shown = [self._taken(block) for block in live.take(chosen.t, chosen.channels, chosen.rate)]
+            if shown and (last := shown[-1]) is not None:
+                total = last.total * last.flow if live.litres else None
+                self.state = replace(self.state, evidence=self._evidence(last), total_lpm=total)
         return self.state
 
     def _taken(self, shown: Shown) -> BlockConductance | None:
@@ -171,37 +153,40 @@ class SequentialBalance:
             self._detector.take(block.begin, block.end, block.g, block.sd)
             least = self._threshold if alarm is None else 0.5 * (alarm.score or 0.0)
             if self._detector.log_e(least) > least:
-                alarm = self._leak(self._detector.rise(), block)
+                alarm = self._leak(block)
         self.state = replace(before, t=block.end, blocks=before.blocks + 1, alarm=alarm)
         return block
 
-    def _leak(self, rise: Rise, block: BlockConductance) -> Evidence:
-        onset, low, high = rise.onset
-        size, unit = rise.size, block.flow
-        half = _95 * math.hypot(rise.deviation, size * self._size[0])
+    def _leak(self, block: BlockConductance) -> Evidence:
+        assert self._live is not None
+        rise, unit = self._detector.rise(), block.flow
+        onset, *interval = rise.onset
+        half = 1.96 * math.hypot(rise.deviation, rise.size * self._live.size_error)
+        cause: Cause = "piston leak" if self._rig.valve.spool == "present" else "piston or pump leak"
         evidence = Evidence(
             "leak",
             "the leakage conductance steps up beyond its random walk",
             score=2.0 * rise.log_e,
             threshold=2.0 * self._threshold,
             onset_s=onset,
-            onset_interval_s=(low, high),
-            leak_lpm=size * unit,
-            leak_interval_lpm=(max(size - half, 0.0) * unit, (size + half) * unit),
-            cause=self._cause,
+            onset_interval_s=(interval[0], interval[1]),
+            leak_lpm=rise.size * unit,
+            leak_interval_lpm=(max(rise.size - half, 0.0) * unit, (rise.size + half) * unit),
+            cause=cause,
             detector="volume balance",
         )
-        return evidence if self._size[1] else without_flow(evidence, NO_RIG)
+        return evidence if self._live.litres else without_flow(evidence, NO_RIG)
 
     def _evidence(self, block: BlockConductance) -> Evidence:
         """Return the evidence as of the last block."""
-        log_e = self._detector.log_e()
+        assert self._live is not None
+        log_e, litres = self._detector.log_e(), self._live.litres
         if log_e > self._threshold:
-            return self._leak(self._detector.rise(), block)
+            return self._leak(block)
         bound, pump = self._detector.bound() * block.flow, math.exp(block.duty[1]) / LITRE_PER_MINUTE
         if not math.isfinite(bound):
             return _waits("for the next blocks")
-        limit = f"{bound:.2g} L/min" if self._size[1] else f"{100.0 * bound / pump:.2g} % of the pump's flow"
+        limit = f"{bound:.2g} L/min" if litres else f"{100.0 * bound / pump:.2g} % of the pump's flow"
         enough = bound <= priors()["worth"]["share"].value * pump
         return Evidence(
             "no leak" if enough else "cannot tell",
@@ -209,11 +194,8 @@ class SequentialBalance:
             score=max(2.0 * log_e, 0.0),
             threshold=2.0 * self._threshold,
             detector="volume balance",
-            bound_lpm=bound if self._size[1] else None,
+            bound_lpm=bound if litres else None,
         )
-
-    def _total(self, block: BlockConductance) -> float | None:
-        return block.total * block.flow if self._size[1] else None
 
 
 def _waits(what: str) -> Evidence:

@@ -22,20 +22,16 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Information, two_sided
 from sealscope.diagnosis.inference.terms import HALF_DIFFERENCE
 from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.recordings.recording import Array, Recording
 
-#: Blocks of a recording, the first number of which each moves both ways; what part of a block a way needs.
-BLOCKS, LEAST = (40, 20, 10), 0.1
 _RANK = 1e-9  # directions that carry less than this share of the largest carry nothing
 #: Oil that is lost lowers both levels; what raises them has many causes.
 CHARGE = "a loss of oil"
-#: What gives the direction of motion, in the order of preference.
-_POSITIONS, _SPEEDS = ("x", "theta"), ("omega", "u")
 
 
 class Pattern(NamedTuple):
@@ -67,12 +63,12 @@ class Level(NamedTuple):
 
 def directions(recording: Recording) -> Array | None:
     """Return the direction of motion at each sample, 1, -1 or 0; None where no channel shows it."""
-    for name in _POSITIONS:
-        if name in recording:
-            half = max(1, round(HALF_DIFFERENCE * recording.rate))
-            padded = np.pad(recording[name], half, mode="edge")
-            return np.asarray(np.sign(padded[2 * half :] - padded[: -2 * half]))
-    return next((np.sign(recording[name]) for name in _SPEEDS if name in recording), None)
+    name = next((name for name in ("x", "theta", "omega", "u") if name in recording), None)
+    if name not in ("x", "theta"):
+        return None if name is None else np.asarray(np.sign(recording[name]))
+    half = max(1, round(HALF_DIFFERENCE * recording.rate))
+    padded = np.pad(recording[name], half, mode="edge")
+    return np.asarray(np.sign(padded[2 * half :] - padded[: -2 * half]))
 
 
 def levels(recording: Recording) -> tuple[Array, Array] | None:
@@ -83,7 +79,8 @@ def levels(recording: Recording) -> tuple[Array, Array] | None:
     if not {"p_A", "p_B"} <= set(recording.channels):
         return None
     way = directions(recording)
-    for count in BLOCKS:
+    believed = beliefs("inference.other_steps")["levels"]
+    for count in believed["blocks"]:
         length = len(recording) // count
         if length < 2:
             continue
@@ -94,7 +91,7 @@ def levels(recording: Recording) -> tuple[Array, Array] | None:
             return time, np.column_stack([level, np.zeros_like(level)])
         own = way[: count * length].reshape(count, length)
         shares = np.stack([(own > 0.0).mean(axis=1), (own < 0.0).mean(axis=1)])
-        if shares.min() < LEAST:
+        if shares.min() < believed["least"]:
             continue
         out, back = ((p * (own == sign)).mean(axis=2) / share for sign, share in zip((1.0, -1.0), shares, strict=True))
         return time, np.vstack([0.5 * (out + back), 0.5 * (out - back)]).T
@@ -131,13 +128,10 @@ def level_tests(recording: Recording) -> tuple[Level, ...]:
         tests = [_test(pattern, own @ root.T, values @ root.T, time) for own in pattern.bases]
         least = min((test for test in tests if test is not None), key=lambda test: test.rank, default=None)
         if least is not None:
-            rises = pattern.name == CHARGE and _rises(values[:, :2].sum(axis=1), time > least.onset)
-            tested.append(least._replace(cause=None) if rises else least)
+            after, both = time > least.onset, values[:, :2].sum(axis=1)
+            falls = after.any() and not after.all() and both[after].mean() <= both[~after].mean()
+            tested.append(least._replace(cause=None) if pattern.name == CHARGE and not falls else least)
     return tuple(sorted(tested, key=lambda test: -test.rank))
-
-
-def _rises(values: Array, after: NDArray[np.bool_]) -> bool:
-    return bool(after.all() or not after.any() or values[after].mean() > values[~after].mean())
 
 
 def _test(pattern: Pattern, rows: Array, whitened: Array, time: Array) -> Level | None:

@@ -5,19 +5,16 @@ The duty is asked for first: it is the operator's, and whatever else moved may h
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import StepTest, two_sided
 from sealscope.diagnosis.inference.other_steps.features import BLOCKS, DUTY, ORDER, features
 from sealscope.diagnosis.inference.other_steps.levels import level_tests
 from sealscope.diagnosis.verdict.evidence import RAREST, Cause
 from sealscope.recordings.recording import Recording, remembered
-
-#: Fewest samples, a noise in each block, and least length of a block [s]: within a stroke all of them move.
-FEWEST_SAMPLES, SHORTEST = BLOCKS * (ORDER + 2), 0.5
 
 
 class OtherStep(NamedTuple):
@@ -29,6 +26,12 @@ class OtherStep(NamedTuple):
     onset: float
     doubt: float
 
+    @classmethod
+    def of(cls, cause: Cause, name: str, test: StepTest) -> OtherStep:
+        """Return the step of a number a block."""
+        onset = test.onset()
+        return cls(cause, f"near {onset.value:.0f} s the {name} steps", test.score, onset.value, onset.high - onset.low)
+
 
 def other_step(recording: Recording) -> OtherStep | None:
     """Return what stepped beside a leak, computed once; None where nothing does that is as rare as `RAREST`."""
@@ -37,7 +40,8 @@ def other_step(recording: Recording) -> OtherStep | None:
 
 @np.errstate(all="ignore")
 def _other_step(recording: Recording) -> OtherStep | None:
-    if len(recording) < max(FEWEST_SAMPLES, BLOCKS * SHORTEST * recording.rate):
+    shortest = beliefs("inference.other_steps")["features"]["shortest"]
+    if len(recording) < BLOCKS * max(ORDER + 2, shortest * recording.rate):
         return None
     try:
         return _duty(recording) or _feature(recording) or _level(recording)
@@ -46,18 +50,19 @@ def _other_step(recording: Recording) -> OtherStep | None:
 
 
 def _duty(recording: Recording) -> OtherStep | None:
+    """Return a step of command and motion nearer to (1, 1) than to (1, 0) and (0, 1): not the answer to a leak."""
     sizes = [test for _, own in features(recording, DUTY) if (test := two_sided(own)) is not None]
-    if sizes and max(2.0 * test.chance for test in sizes) < RAREST and _alike(sizes):
-        return _of_test("changed duty", "size of the duty", min(sizes, key=lambda test: test.score))
-    return None
+    steps = np.abs([test.fitted[0] for test in sizes])
+    rare = bool(sizes) and max(2.0 * test.chance for test in sizes) < RAREST
+    if not rare or not steps.min() > np.tan(np.pi / 8.0) * steps.max():
+        return None
+    return OtherStep.of("changed duty", "size of the duty", min(sizes, key=lambda test: test.score))
 
 
 def _feature(recording: Recording) -> OtherStep | None:
     tests = [(feature, test) for feature, own in features(recording) if (test := two_sided(own)) is not None]
-    for feature, test in tests:
-        if 2.0 * len(tests) * test.chance < RAREST:
-            return _of_test(feature.cause, feature.name, test)
-    return None
+    rare = (own for own in tests if 2.0 * len(tests) * own[1].chance < RAREST)
+    return next((OtherStep.of(feature.cause, feature.name, test) for feature, test in rare), None)
 
 
 def _level(recording: Recording) -> OtherStep | None:
@@ -67,16 +72,3 @@ def _level(recording: Recording) -> OtherStep | None:
         return None
     text = f"near {best.onset:.0f} s the pressures step as of {best.name}"
     return OtherStep(best.cause, text, best.score, best.onset, 2.0 * best.block)
-
-
-def _of_test(cause: Cause, name: str, test: StepTest) -> OtherStep:
-    onset = test.onset()
-    return OtherStep(
-        cause, f"near {onset.value:.0f} s the {name} steps", test.score, onset.value, onset.high - onset.low
-    )
-
-
-def _alike(sizes: Sequence[StepTest]) -> bool:
-    """Whether steps of command and motion are nearer to (1, 1) than to (1, 0) and (0, 1): not the answer to a leak."""
-    steps = np.abs([test.fitted[0] for test in sizes])
-    return bool(steps.min() > np.tan(np.pi / 8.0) * steps.max())
