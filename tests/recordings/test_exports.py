@@ -56,7 +56,7 @@ def refused(path: Path, **options: object) -> str:
         ("\n".join(f'{{"n{k}": 1}}' for k in range(2000)), "records must have at most 1024 names, got more (FILE)"),
         ("[" + "[]," * 50_000, "JSON must hold records or columns of samples, got none (FILE)"),
         ('{"a": "' + "x" * 3_000_000, "JSON must be whole, got: Unterminated string starting at (line 1, FILE)"),
-        ('{"a":[' + "{}," * 4_300_000 + "0]}", "JSON must have at most 4194304 parts in one value (FILE)"),
+        ('{"a":[' + "{}," * 4_300_000 + "0]}", "JSON must hold records or columns of samples, got none (FILE)"),
     ],
 )  # fmt: skip
 def test_json_that_is_no_log(content: str, message: str, tmp_path: Path) -> None:
@@ -96,16 +96,6 @@ def test_words_and_missing_values_among_the_numbers(tmp_path: Path) -> None:
     path = tmp_path / "log.jsonl"
     path.write_text("".join(json.dumps(row) + "\n" for row in records).replace(repr(A[6]), "NaN", 1))
     assert np.flatnonzero(np.isnan(read(path)["p_A"])).tolist() == [3, 4, 5, 6]
-
-
-def test_a_value_is_as_long_as_may_be_read_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sealscope.recordings.formats.structured.json_log.LARGEST_DOCUMENT", 300_000)
-    monkeypatch.setattr("sealscope.recordings.formats.structured.json_log._CHUNK", 10_000)
-    path = tmp_path / "log.json"
-    path.write_text('{"p_A [Pa]": [' + "0," * 140_000 + "0]}")
-    assert len(read(path, rate=RATE)) == 140_001
-    path.write_text('{"p_A [Pa]": [' + "0," * 160_000 + "0]}")
-    assert refused(path) == ("JSON must be whole, got: over 300000 signs in one, write a record a line (line 1, FILE)")
 
 
 def test_a_large_document_is_read_in_blocks(tmp_path: Path) -> None:
@@ -236,11 +226,10 @@ def test_a_table_with_a_column_of_names_is_read_as_it_was_where_a_map_names_its_
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("Name,Time,Value\n" + "p_A,yesterday,1\n" * 3, "time must be a stamp such as"),
+        ("Name,Time,Value\n" + "p_A,yesterday,1\n" * 3, "a sample must be a number, got 'yesterday'"),
         ("Name,Time,Value\n" + "".join(f"n{k},{k},1\n" for k in range(5000)), "a long table must have at most 4096"),
-        ("Name,Time,Value\np_A,0,1\n" + "p_A,1," + "x" * 2**21, "a text log must have lines, got 1048576 signs"),
         ("Name,Time,Value\n" + "p_A [Pa],3,1\n" * 9, "time must increase between some samples (FILE)"),
-        ("Name,Time,Value\n" + "".join(f"p_A [Pa],{k},word\np_B [Pa],{k},1\n" for k in range(99)),
+        ("Name,Time,Value\n" + "".join(f"p_A [Pa],{k / 50},word\np_B [Pa],{k / 50},1\n" for k in range(99)),
          "p_A [Pa] must hold numbers, got text (FILE)"),
         ("t,p_A [Pa],t,p_B [Pa]\n" + "0,1,,2\n1,1,,2\n", "time must have a number in some row, got none in column t"),
         ("t,p_A [Pa],t,p_B [Pa]\n" + "0,1,0,2\n1,1,1,2\n2,1,1,3\n", "the times of p_B [Pa] must increase"),

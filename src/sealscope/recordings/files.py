@@ -20,7 +20,6 @@ from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
 from sealscope.recordings.formats.columns import ChannelMap, check_call, choose_columns
 from sealscope.recordings.formats.matlab import is_matlab_4
 from sealscope.recordings.formats.structured.json_log import is_json
-from sealscope.recordings.formats.structured.logs import is_one_table
 from sealscope.recordings.formats.structured.lvm import is_lvm
 from sealscope.recordings.formats.table import Choose, RawTable
 from sealscope.recordings.formats.text import read_text_parts
@@ -73,7 +72,7 @@ _NAMES = {
     "spreadsheet": "a spreadsheet",
 }
 #: Format -> module that reads it, where it is none of its own name.
-_MODULES = {"text": "structured.logs", "lvm": "structured.lvm", "json": "structured.json_log"}
+_MODULES = {"lvm": "structured.lvm", "json": "structured.json_log"}
 #: First bytes -> format.
 _MAGIC = {
     b"PAR1": "parquet",
@@ -127,7 +126,7 @@ _PROPRIETARY = {
     ".trc": "a file of an oscilloscope: export it as CSV",
 }
 #: Formats that are read in the program itself; the others' libraries end it, or fill its memory, on some files.
-_TEXTS = ("text", "lvm", "json")
+_TEXTS = ("text", "lvm")
 #: Longest time that such a file may take [s], and what is added for its size [bytes/s]; most memory [bytes], and so
 #: many times its size.
 _LONGEST, _SLOWEST, _SLOWEST_SHEETS = 10.0, 20e6, 5e5
@@ -175,7 +174,7 @@ def _table(kind: str, file: Path, choose: Choose) -> RawTable:
     if kind in _TEXTS:
         return _read_here(file, kind, choose)
     size = file.stat().st_size
-    limit = _LONGEST + size / (_SLOWEST_SHEETS if kind == "spreadsheet" else _SLOWEST)
+    limit = _LONGEST + size / (_SLOWEST_SHEETS if kind in ("spreadsheet", "json") else _SLOWEST)
     memory = _MEMORY + _MEMORY_SHARE * size
     return file_apart(_read_here, file, kind, choose, limit=limit, memory=memory, disk=most_unpacked(file))
 
@@ -310,7 +309,7 @@ def _parts(file: Path, every: float, channel_map: ChannelMap, rate: float | None
         def recording_of(table: RawTable) -> Recording:
             return Recording(*table.samples({"file": file.name}, rate=rate, infer_rate=bool(channel_map)))
 
-        if _format_of(inner) != "text" or not is_one_table(inner):
+        if _format_of(inner) != "text":
             whole_file = _read(inner, file.name, channel_map, rate, None)
             size = max(1, round(every * whole_file.rate))
             for first in range(0, len(whole_file), size):

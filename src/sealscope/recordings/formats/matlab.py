@@ -15,10 +15,9 @@ from sealscope.errors import UnreadableFile
 from sealscope.recordings.formats.headings.preamble import stated_rate
 from sealscope.recordings.formats.libraries import library
 from sealscope.recordings.formats.netcdf import refuse_elsewhere
-from sealscope.recordings.formats.series import table_of
 from sealscope.recordings.formats.structured.streams import STREAMS, streamed_series
 from sealscope.recordings.formats.structured.tree import number_of, series_in
-from sealscope.recordings.formats.table import MAX_VALUES, Choose, RawTable
+from sealscope.recordings.formats.table import MAX_VALUES, Choose, RawTable, table_of
 
 
 def is_matlab_4(head: bytes) -> bool:

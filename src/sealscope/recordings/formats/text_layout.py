@@ -11,12 +11,12 @@ from dataclasses import dataclass, field
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import CHANNEL_UNITS
 from sealscope.recordings.formats.columns import counted
-from sealscope.recordings.formats.headings.described import LABEL_ROWS, described
+from sealscope.recordings.formats.headings.described import described, scope_heading
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.preamble import of_lines, stated_rate
 from sealscope.recordings.formats.headings.proposal import knows, measures
 from sealscope.recordings.formats.headings.quantities import units_in, with_units, without_units
-from sealscope.recordings.formats.headings.scope import scope_heading
+from sealscope.recordings.formats.headings.words import WORDS
 from sealscope.recordings.timebase import is_stamp
 from sealscope.units import parse_unit
 
@@ -24,9 +24,7 @@ SNIFF = 64 * 1024
 OWN_MARK = "# sealscope: "
 COMMENTS = ("#", "%", "//", '"#', "!")
 #: What loggers write where a sample is missing, in lower case.
-MISSING = frozenset(
-    {"", "nan", "-", "--", "---", "na", "n/a", "#n/a", "null", "none", "-nan", "+nan", "1.#qnan", "-1.#ind", "nan(ind)"}
-)
+MISSING = frozenset({"", *WORDS["missing"]})
 _SAMPLE_ROWS = 200
 _LONGEST_NUMBER = 400
 _NUMBER = {
@@ -42,15 +40,8 @@ _LOOKS = (
     ("\t", "."), ("\t", ","), (";", "."), (";", ","), (",", "."), ("|", "."), ("|", ","), (",", ","), (" ", "."),
     (" ", ","),
 )  # fmt: skip
-#: First cells of the rows of a heading that say what the others of the row are.
-_NAME_KEYS = frozenset({
-    "name", "names", "channel", "channels", "channel name", "channel names", "trace name", "tracename", "signal",
-    "signals", "signal name", "kanal", "kanalname", "kanalbezeichnung", "messstelle", "bezeichnung", "voie", "canal",
-    "canale",
-})  # fmt: skip
-_UNIT_KEYS = frozenset({
-    "unit", "units", "einheit", "einheiten", "vunit", "unité", "unités", "unidad", "unità", "单位", "単位",
-})  # fmt: skip
+#: A number, and what may be its unit, in one cell.
+_QUANTITY = re.compile(r"\d[ \u00a0\u202f]{0,2}(?![eEdDT][+-]?\d)(?:[^\W\d_]|[%\u00b0])")
 _RULER = re.compile(r"[-=_:+]{1,80}")
 #: Most lines above the samples that are looked at for names and units.
 _DEEPEST_HEADING = 12
@@ -158,7 +149,11 @@ def _width(row: Sequence[str]) -> int:
 def _look(body: Sequence[str]) -> tuple[str, str, int]:
     """Return (delimiter, decimal sign, cells a row) with which most cells of the body are values."""
     best: tuple[tuple[float, float, bool, int], tuple[str, str, int]] | None = None
+    text = "\n".join(body)
+    blank = any(sign in text for sign in " \t\v\f")
     for delimiter, decimal in _LOOKS:
+        if delimiter not in text and not (delimiter == " " and blank):
+            continue
         rows = [cells_of(line, delimiter) for line in body]
         values = [sum(_is_value(cell, decimal) for cell in row) for row in rows]
         valued = [(row, many) for row, many in zip(rows, values, strict=True) if many and len(row) > 1]
@@ -234,7 +229,9 @@ def _heading(lines: Sequence[str], first: int, delimiter: str, width: int, decim
         rows.append(row)
     if rows:
         labels, taken = _keyed(rows) or _stacked(rows)
-        own = [index for index, row in zip(above, rows, strict=False) if row[0].strip().casefold() in LABEL_ROWS]
+        own = [
+            index for index, row in zip(above, rows, strict=False) if row[0].strip().casefold() in WORDS["row"]["label"]
+        ]
         return described(labels, [cells_of(lines[index], delimiter) for index in sorted([*above[taken:], *own])]), taken
     commented = names(above[0], commented=True) if not lines[above[0]].startswith(OWN_MARK) else None
     return ([Label.parse(name) for name in commented], 1) if commented else ([], 0)
@@ -246,8 +243,8 @@ def _keyed(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int] | None:
     `rows`: the lowest first.
     """
     keys = [row[0].strip().rstrip(":").casefold() for row in rows]
-    at = next((i for i, key in enumerate(keys) if key in _NAME_KEYS and _width(rows[i]) > 1), None)
-    unit = next((i for i, key in enumerate(keys) if key in _UNIT_KEYS), None)
+    at = next((i for i, key in enumerate(keys) if key in WORDS["row"]["name"] and _width(rows[i]) > 1), None)
+    unit = next((i for i, key in enumerate(keys) if key in WORDS["row"]["unit"]), None)
     if at is None or unit is None:
         return None
     texts = list(rows[at])
@@ -384,6 +381,8 @@ def layout_of(head: bytes, encoding: str, whole: bool, place: str) -> Layout:
 
 def _units_in_cells(body: Sequence[str]) -> dict[int, str]:
     """Return column -> unit of the columns whose cells hold it beside their number, by the delimiter with most such."""
+    if not any(map(_QUANTITY.search, body)):
+        return {}
     tried = [
         units_in(
             [cells_of(line, delimiter) for line in body], lambda cell: _is_value(cell, ".") or _is_value(cell, ",")

@@ -9,23 +9,14 @@ import numpy as np
 
 from sealscope.errors import InputError
 from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.words import WORDS
 from sealscope.units import parse_unit, to_si
 
 #: Most entries that are kept, and the longest name and text of each.
 _MOST, _LONGEST_NAME, _LONGEST_TEXT = 40, 60, 200
 _PAIR = re.compile(r"([^:=]{1,60}?)[ \t]{0,8}[:=](?!\\|//)[ \t]{0,8}(.{1,400})")
 #: What loggers call the sampling rate, and the time from one sample to the next.
-_RATE = re.compile(
-    r"(?:fs|f_s|(?:sampl(?:e|es|ing)|scan|data|log(?:ging)?)[ _-]?(?:rate|freq\w*)|abtast(?:rate|frequenz)|messrate|"
-    r"fr[\u00e9e]quence d.[\u00e9e]chantillonnage|frecuencia de muestreo|frequenza di campionamento|"
-    r"\u91c7\u6837(?:\u7387|\u9891\u7387)|\u30b5\u30f3\u30d7\u30ea\u30f3\u30b0(?:\u5468\u6ce2\u6570|\u30ec\u30fc\u30c8))",
-    re.IGNORECASE,
-)
-_INTERVAL = re.compile(
-    r"(?:dt|ts|delta[ _]?[tx]|\u0394t|sampl(?:e|ing)[ _-]?(?:interval|period|time)|abtast(?:zeit|intervall|periode)|"
-    r"horizontal interval|hresolution|increment|\u91c7\u6837(?:\u5468\u671f|\u95f4\u9694))",
-    re.IGNORECASE,
-)
+_STATED = [re.compile(WORDS["stated"][kind], re.IGNORECASE) for kind in ("rate", "interval")]
 #: TwinCAT's start of an export: 100 ns since 1601.
 _FILETIME = re.compile(r"(1[23]\d{16})\b")
 _FROM_1601_TO_1970 = 11_644_473_600 * 10**9  # [ns]
@@ -36,7 +27,7 @@ def stated_rate(about: Mapping[str, str]) -> float | None:
     """Return the sampling rate [Hz] that a file's entries state, as a rate or as an interval; None without."""
     for name, text in about.items():
         label = Label.parse(name)
-        matches = [pattern.fullmatch(label.name) for pattern in (_RATE, _INTERVAL)]
+        matches = [pattern.fullmatch(label.name) for pattern in _STATED]
         cells = re.split(r"[;,\t]\s*", text.strip())  # one a channel, all the same
         quantity = _QUANTITY.fullmatch(cells[0] if len(set(cells)) == 1 else text.strip())
         if quantity is None or not any(matches):

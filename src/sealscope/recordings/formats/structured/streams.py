@@ -10,7 +10,7 @@ import numpy as np
 
 from sealscope.recordings.channels import Array
 from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.series import Series, uniform
+from sealscope.recordings.formats.table import Series, uniform
 
 #: Group of the streams, by which such a file is known; what refers to them.
 STREAMS, _REFERENCES = "#sigstream#", "#refs#"
