@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from math import isfinite
 from pathlib import Path
-from typing import cast
+from typing import Any, NamedTuple
 
 from sealscope.calls import checked_call
 from sealscope.errors import InputError, UnreadableFile
@@ -29,63 +29,33 @@ from sealscope.storage.atomic import atomic_write
 from sealscope.storage.opening import open_regular, whole
 from sealscope.storage.unpacking import most_unpacked
 
-Reader = Callable[[Path, Choose], RawTable]
-Writer = Callable[..., None]
-#: Suffix -> format of a file to write.
-SUFFIXES: Mapping[str, str] = {
-    ".nc": "netcdf",
-    ".nc4": "netcdf",
-    ".h5": "netcdf",
-    ".hdf5": "netcdf",
-    ".csv": "text",
-    ".tsv": "text",
-    ".txt": "text",
-    ".parquet": "parquet",
-    ".pq": "parquet",
+
+class _Format(NamedTuple):
+    """A format in words, the module that reads it, and suffixes and first bytes of its files."""
+
+    words: str
+    module: str
+    suffixes: str
+    magic: tuple[bytes, ...] = ()
+
+
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+_FORMATS = {
+    "netcdf": _Format("a NetCDF or HDF5", "netcdf", ".nc .nc4 .h5 .hdf5", (_HDF5,)),
+    "text": _Format("a text", "text", ".csv .tsv .txt"),
+    "parquet": _Format("a Parquet", "parquet", ".parquet .pq", (b"PAR1", b"ARROW1")),
+    "matlab": _Format("a MATLAB", "matlab", ".mat", (b"MATLAB 5.0", b"MATLAB 7.")),
+    "tdms": _Format("a TDMS", "tdms", ".tdms", (b"TDSm",)),
+    "mdf": _Format("an MDF", "mdf", ".mdf .mf4", (b"MDF     ", b"UnFinMF ")),
+    "lvm": _Format("a LabVIEW measurement", "structured.lvm", ".lvm"),
+    "json": _Format("a JSON", "structured.json_log", ".json .jsonl .ndjson"),
+    "spreadsheet": _Format(
+        "a spreadsheet", "spreadsheet", ".xlsx .xlsm .xlsb .xls .ods", (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
+    ),
 }
-#: Suffix -> format of a file that is read only.
-_READ_ONLY = {
-    ".mat": "matlab",
-    ".tdms": "tdms",
-    ".mdf": "mdf",
-    ".mf4": "mdf",
-    ".lvm": "lvm",
-    ".json": "json",
-    ".jsonl": "json",
-    ".ndjson": "json",
-    ".xlsx": "spreadsheet",
-    ".xlsm": "spreadsheet",
-    ".xlsb": "spreadsheet",
-    ".xls": "spreadsheet",
-    ".ods": "spreadsheet",
-}
-#: Formats that are read, and what each is in words.
-_NAMES = {
-    "netcdf": "a NetCDF or HDF5",
-    "parquet": "a Parquet",
-    "text": "a text",
-    "matlab": "a MATLAB",
-    "tdms": "a TDMS",
-    "mdf": "an MDF",
-    "lvm": "a LabVIEW measurement",
-    "json": "a JSON",
-    "spreadsheet": "a spreadsheet",
-}
-#: Format -> module that reads it, where it is none of its own name.
-_MODULES = {"lvm": "structured.lvm", "json": "structured.json_log"}
-#: First bytes -> format.
-_MAGIC = {
-    b"PAR1": "parquet",
-    b"ARROW1": "parquet",
-    b"MATLAB 5.0": "matlab",
-    b"MATLAB 7.": "matlab",
-    b"TDSm": "tdms",
-    b"MDF     ": "mdf",
-    b"UnFinMF ": "mdf",
-    b"PK\x03\x04": "spreadsheet",
-    b"\xd0\xcf\x11\xe0": "spreadsheet",
-    b"\x89HDF\r\n\x1a\n": "netcdf",
-}
+#: Suffix -> format of a file to write, and of any file.
+_SUFFIXES = {suffix: kind for kind, form in _FORMATS.items() for suffix in form.suffixes.split()}
+SUFFIXES = {suffix: kind for suffix, kind in _SUFFIXES.items() if kind in ("netcdf", "text", "parquet")}
 _CSV = "export it as CSV"
 #: First bytes of formats that are known and not read.
 _FOREIGN = {
@@ -133,40 +103,35 @@ _LONGEST, _SLOWEST, _SLOWEST_SHEETS = 10.0, 20e6, 5e5
 _MEMORY, _MEMORY_SHARE = 2**31, 64
 #: Archives within archives that are unpacked.
 _DEEPEST_ARCHIVE = 3
-_HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
 def _format_of(path: Path) -> str:
     """Return the format of a file by its content; raise UnreadableFile where it is none that is read."""
     with open_regular(path, "a recording") as file:
         head = file.read(SNIFF)
-        for magic, kind in _MAGIC.items():
-            if head.startswith(magic):
+        for kind, form in _FORMATS.items():
+            if head.startswith(form.magic):
                 return kind
-        for magic, name in _FOREIGN.items():
-            if head.startswith(magic):
-                raise UnreadableFile(f"a recording must be in a format that is read, got {name} ({path})")
         for offset in (512, 1024, 2048, 4096):  # HDF5 may begin after a block of the user's
             file.seek(offset)
             if file.read(8) == _HDF5:
                 return "netcdf"
-    if b"<usi:tdm" in head:
-        raise UnreadableFile(
-            f"a recording must be in a format that is read, got a DIAdem header (.tdm): export it as TDMS ({path})"
-        )
-    if is_matlab_4(head):
+    foreign = next((name for magic, name in _FOREIGN.items() if head.startswith(magic)), None)
+    if foreign is None and b"<usi:tdm" in head:
+        foreign = "a DIAdem header (.tdm): export it as TDMS"
+    if foreign is None and is_matlab_4(head):
         return "matlab"
-    if path.suffix.lower() in _PROPRIETARY and encoding_of(head) is None:
-        name = _PROPRIETARY[path.suffix.lower()]
-        raise UnreadableFile(f"a recording must be in a format that is read, got {name} ({path})")
+    if foreign is None and encoding_of(head) is None:
+        foreign = _PROPRIETARY.get(path.suffix.lower())
+    if foreign is not None:
+        raise UnreadableFile(f"a recording must be in a format that is read, got {foreign} ({path})")
     return "lvm" if is_lvm(head) else "json" if is_json(head) else "text"
 
 
-def _reader(kind: str) -> Reader:
-    """Return ``read_KIND`` of the format's module; its library is loaded now."""
-    return cast(
-        "Reader", getattr(import_module(f"sealscope.recordings.formats.{_MODULES.get(kind, kind)}"), f"read_{kind}")
-    )
+def _member(kind: str, verb: str) -> Callable[..., Any]:
+    """Return ``read_KIND`` or ``write_KIND`` of the format's module; its library is loaded now."""
+    module = import_module(f"sealscope.recordings.formats.{_FORMATS[kind].module}")
+    return getattr(module, f"{verb}_{kind}")  # type: ignore[no-any-return]
 
 
 def _table(kind: str, file: Path, choose: Choose) -> RawTable:
@@ -180,12 +145,7 @@ def _table(kind: str, file: Path, choose: Choose) -> RawTable:
 
 
 def _read_here(file: Path, kind: str, choose: Choose) -> RawTable:
-    return _reader(kind)(file, choose)
-
-
-def _writer(kind: str) -> Writer:
-    """Return ``write_KIND`` of the format's module; its library is loaded now."""
-    return cast("Writer", getattr(import_module(f"sealscope.recordings.formats.{kind}"), f"write_{kind}"))
+    return _member(kind, "read")(file, choose)  # type: ignore[no-any-return]
 
 
 @checked_call
@@ -245,8 +205,8 @@ def read(
     """
     file, channel_map = Path(path), map or {}
     check_call(channel_map, rate)
-    if format is not None and format not in _NAMES:
-        raise InputError(f"format must be one of {', '.join(sorted(_NAMES))}, got {format}")
+    if format is not None and format not in _FORMATS:
+        raise InputError(f"format must be one of {', '.join(sorted(_FORMATS))}, got {format}")
     with _inner(file) as inner:
         return _read(inner, file.name, channel_map, rate, format)
 
@@ -325,24 +285,22 @@ def _inner(file: Path) -> Iterator[Path]:
     """Yield the file, or what is packed in it; what is wrong with either is an UnreadableFile."""
     try:
         archive = archive_of(file)
-        if archive is None:
-            yield file
-            return
     except UnreadableFile:
         raise
-    except InputError as error:
-        raise UnreadableFile(str(error)) from None
     except FileNotFoundError:
         raise UnreadableFile(f"a recording must exist, got no such file ({file})") from None
+    except InputError as error:
+        raise UnreadableFile(str(error)) from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise UnreadableFile(f"a recording must be readable, got: {reason} ({file})") from error
     with ExitStack() as folders:
-        inner, depth, most = file, 0, most_unpacked(file)
+        inner, most = file, 0 if archive is None else most_unpacked(file)
         try:
-            while archive is not None and depth < _DEEPEST_ARCHIVE:  # a .tar.gz is an archive in an archive
-                inner, depth = folders.enter_context(unpacked(inner, archive, most)), depth + 1
-                archive = archive_of(inner)
+            for _ in range(_DEEPEST_ARCHIVE):  # a .tar.gz is an archive in an archive
+                if archive is not None:
+                    inner = folders.enter_context(unpacked(inner, archive, most))
+                    archive = archive_of(inner)
             yield inner
         except UnreadableFile as error:
             if inner == file:
@@ -356,9 +314,9 @@ def _read(file: Path, name: str, channel_map: ChannelMap, rate: float | None, fo
     if format not in (None, kind):
         raise UnreadableFile(f"a file read as {format} must be {format}, got {kind} ({file})")
     choose = partial(choose_columns, channel_map=channel_map, rate=rate, place=str(file))
-    with whole(f"{_NAMES[kind]} file", file):
+    with whole(f"{_FORMATS[kind].words} file", file):
         table = _table(kind, file, choose)
-        if format is None and {**SUFFIXES, **_READ_ONLY}.get(file.suffix.lower(), kind) != kind:
+        if format is None and _SUFFIXES.get(file.suffix.lower(), kind) != kind:
             table = replace(table, notes=(f"name ends in {file.suffix}, content is {table.kind}", *table.notes))
         return Recording(*table.samples({"file": name}, rate=rate, infer_rate=bool(channel_map)))
 
@@ -417,8 +375,7 @@ def write(recording: Recording, path: str | os.PathLike[str]) -> None:
             raise InputError(f"a channel to write must be one of {', '.join(CHANNEL_UNITS)}, got {name}")
         if unit not in (CHANNEL_UNITS[name], COUNTS):
             raise InputError(f"channel {name} must be in {CHANNEL_UNITS[name]} or {COUNTS} to be written, got {unit}")
-    write_table = _writer(kind)
     delimiter = {"delimiter": "," if file.suffix.lower() == ".csv" else "\t"} if kind == "text" else {}
     values, units, description = recording.series()
     with atomic_write(file) as temporary:
-        write_table(temporary, values, units, description, **delimiter)
+        _member(kind, "write")(temporary, values, units, description, **delimiter)

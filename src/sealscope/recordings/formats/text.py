@@ -53,9 +53,10 @@ from sealscope.recordings.formats.text_layout import (
 )
 from sealscope.recordings.timebase import is_stamp, stamps
 
-_CHUNK = 8 * 1024 * 1024
-#: Logs of so many bytes are worth the import of pyarrow, which reads so many of them at a time.
-_LARGE, _AT_ONCE = 2**20, 2**20
+#: Bytes that are read at a time, which fit a processor's cache, and of the longest line.
+_CHUNK, _LONGEST_LINE = 2**19, 2**23
+#: Logs of so many bytes are worth the import of pyarrow.
+_LARGE = 2**20
 #: Signs that begin quoted cells and comments.
 _MARKS = (b'"', b"#", b"%", b"/", b"!")
 _LONGEST_OWN_LINE = 64 * 1024 * 1024
@@ -275,7 +276,7 @@ class _Log:
         try:
             table = csv.read_csv(
                 py_buffer(block).slice(start),
-                csv.ReadOptions(column_names=names, block_size=_AT_ONCE),
+                csv.ReadOptions(column_names=names, block_size=len(block)),
                 csv.ParseOptions(delimiter=layout.delimiter, quote_char=False),
                 csv.ConvertOptions(
                     include_columns=[names[column] for column in columns],
@@ -459,7 +460,7 @@ def _blocks(file: BinaryIO, encoding: str, place: str) -> Iterator[tuple[int, by
         end = block.rfind(newline)
         while width == 2 and end >= 0 and end % 2:  # a newline's bytes across two characters
             end = block.rfind(newline, 0, end + 1)
-        if end < 0 and len(data) == _CHUNK:
+        if end < 0 and len(block) >= _LONGEST_LINE:
             if b"\r" not in block or width == 2:
                 raise UnreadableFile(f"a text log must have lines, got {len(block)} bytes without ({place})")
             end = block.rfind(b"\r")

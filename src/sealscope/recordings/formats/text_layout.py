@@ -25,7 +25,7 @@ OWN_MARK = "# sealscope: "
 COMMENTS = ("#", "%", "//", '"#', "!")
 #: What loggers write where a sample is missing, in lower case.
 MISSING = frozenset({"", *WORDS["missing"]})
-_SAMPLE_ROWS = 200
+_SAMPLE_ROWS = 100
 _LONGEST_NUMBER = 400
 _NUMBER = {
     ".": re.compile(r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eEdD][+-]?\d+)?|[+-]?inf(?:inity)?", re.IGNORECASE),
