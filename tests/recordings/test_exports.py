@@ -13,7 +13,7 @@ from sealscope.errors import UnreadableFile
 from sealscope.recordings import read
 
 from .dialects import RATE, N, T, deviations
-from .exports import EXPORTS, NAMED, POSITION, RECORDS, A, twincat
+from .exports import EXPORTS, POSITION, RECORDS, A, twincat
 
 
 @pytest.mark.parametrize("name", EXPORTS)
@@ -96,14 +96,6 @@ def test_words_and_missing_values_among_the_numbers(tmp_path: Path) -> None:
     path = tmp_path / "log.jsonl"
     path.write_text("".join(json.dumps(row) + "\n" for row in records).replace(repr(A[6]), "NaN", 1))
     assert np.flatnonzero(np.isnan(read(path)["p_A"])).tolist() == [3, 4, 5, 6]
-
-
-def test_a_large_document_is_read_in_blocks(tmp_path: Path) -> None:
-    path, many = tmp_path / "log.json", 100
-    path.write_text(json.dumps({name: cells * many for name, cells in NAMED.items() if name != "t [s]"}, indent=1))
-    assert path.stat().st_size > 2**20
-    recording = read(path, rate=RATE)
-    assert np.array_equal(recording["p_A"], np.tile(np.array(A) * 1e5, many))
 
 
 def test_whole_seconds_of_a_controller_s_log_are_shared_among_its_samples(tmp_path: Path) -> None:
@@ -266,16 +258,6 @@ def test_a_last_cell_that_is_cut_within_its_unit_is_missing(tmp_path: Path) -> N
     path.write_text(path.read_text()[:-1])
     recording = read(path)
     assert np.flatnonzero(np.isnan(recording["x"])).tolist() == [399]
-
-
-def test_units_in_the_cells_of_a_workbook(tmp_path: Path) -> None:
-    openpyxl = pytest.importorskip("openpyxl")
-    book = openpyxl.Workbook()
-    book.active.append(["Time", "p_A"])
-    for t, value in zip(T.tolist(), A, strict=True):
-        book.active.append([t, f"{value:.6f} bar"])
-    book.save(tmp_path / "log.xlsx")
-    assert read(tmp_path / "log.xlsx")["p_A"] == pytest.approx(1e5 * np.array(A), abs=0.05)
 
 
 def test_cells_that_only_look_like_quantities_are_left_alone(tmp_path: Path) -> None:
