@@ -234,7 +234,6 @@ def test_uniform_segments_of_a_sound_recording_and_of_parts() -> None:
     holed = recording({"p_A": p, "x": healthy()["x"]})
     assert uniform_segments(holed) == [slice(0, 10), slice(20, 20_000)]
     assert uniform_segments(holed, ["x"]) == [slice(0, 20_000)]
-    assert uniform_segments(holed, shortest=226) == [slice(20, 20_000)]
     with pytest.raises(InputError, match="p_B is not in this recording"):
         uniform_segments(holed, ["p_B"])
 

@@ -154,7 +154,6 @@ def read(
     *,
     map: ChannelMap | None = None,
     rate: float | None = None,
-    format: str | None = None,
 ) -> Recording:
     r"""Read the recording in a file: the text of any logger, or the file of a measurement program.
 
@@ -175,8 +174,6 @@ def read(
         the mapping does not name.
     rate : float, optional
         Sampling rate [Hz], in place of a time column.
-    format : {"text", "netcdf", "parquet", "matlab", "tdms", "mdf", "lvm", "json", "spreadsheet"}, optional
-        What the content must be.
 
     Returns
     -------
@@ -188,7 +185,7 @@ def read(
     UnreadableFile
         If the file cannot be read as a recording; the message names the file, the place and the rule.
     InputError
-        If `map`, `rate` or `format` is wrong.
+        If `map` or `rate` is wrong.
     MissingExtra
         If the library that reads the format is not installed.
 
@@ -205,10 +202,8 @@ def read(
     """
     file, channel_map = Path(path), map or {}
     check_call(channel_map, rate)
-    if format is not None and format not in _FORMATS:
-        raise InputError(f"format must be one of {', '.join(sorted(_FORMATS))}, got {format}")
     with _inner(file) as inner:
-        return _read(inner, file.name, channel_map, rate, format)
+        return _read(inner, file.name, channel_map, rate)
 
 
 @checked_call
@@ -270,7 +265,7 @@ def _parts(file: Path, every: float, channel_map: ChannelMap, rate: float | None
             return Recording(*table.samples({"file": file.name}, rate=rate, infer_rate=bool(channel_map)))
 
         if _format_of(inner) != "text":
-            whole_file = _read(inner, file.name, channel_map, rate, None)
+            whole_file = _read(inner, file.name, channel_map, rate)
             size = max(1, round(every * whole_file.rate))
             for first in range(0, len(whole_file), size):
                 yield whole_file.samples(slice(first, first + size))
@@ -308,15 +303,13 @@ def _inner(file: Path) -> Iterator[Path]:
             raise UnreadableFile(str(error).replace(str(inner), f"{inner.name} in {file}")) from error
 
 
-def _read(file: Path, name: str, channel_map: ChannelMap, rate: float | None, format: str | None) -> Recording:
+def _read(file: Path, name: str, channel_map: ChannelMap, rate: float | None) -> Recording:
     """Read a file that is no archive; `name`: what the recording's provenance calls it."""
     kind = _format_of(file)
-    if format not in (None, kind):
-        raise UnreadableFile(f"a file read as {format} must be {format}, got {kind} ({file})")
     choose = partial(choose_columns, channel_map=channel_map, rate=rate, place=str(file))
     with whole(f"{_FORMATS[kind].words} file", file):
         table = _table(kind, file, choose)
-        if format is None and _SUFFIXES.get(file.suffix.lower(), kind) != kind:
+        if _SUFFIXES.get(file.suffix.lower(), kind) != kind:
             table = replace(table, notes=(f"name ends in {file.suffix}, content is {table.kind}", *table.notes))
         return Recording(*table.samples({"file": name}, rate=rate, infer_rate=bool(channel_map)))
 

@@ -243,12 +243,11 @@ def _ordinal(number: int) -> str:
     return f"{number}{ending}"
 
 
-def uniform_segments(recording: Recording, channels: Sequence[str] | None = None, *, shortest: int = 1) -> list[slice]:
+def uniform_segments(recording: Recording, channels: Sequence[str] | None = None) -> list[slice]:
     """Return the maximal stretches, as slices, sampled uniformly with the named channels finite.
 
-    `channels`: by default all but those that change slowly.
-    A stretch has at least `shortest` samples; each interval in it lies between half and one and a half steps of
-    `recording.rate`. Raises InputError for a channel that the recording does not have.
+    `channels`: by default all but those that change slowly. Each interval of a stretch lies between half and one and a
+    half steps of `recording.rate`. Raises InputError for a channel that the recording does not have.
     """
     count = len(recording)
     whole = np.isfinite(recording.t)
@@ -257,7 +256,7 @@ def uniform_segments(recording: Recording, channels: Sequence[str] | None = None
     joined = whole[1:] & whole[:-1] & even_steps(recording)
     starts = np.flatnonzero(whole & np.r_[True, ~joined][:count])
     stops = np.flatnonzero(whole & np.r_[~joined, True][-count:]) + 1 if count else starts
-    return [slice(int(a), int(b)) for a, b in zip(starts, stops, strict=True) if b - a >= shortest]
+    return [slice(int(a), int(b)) for a, b in zip(starts, stops, strict=True)]
 
 
 def even_steps(recording: Recording) -> NDArray[np.bool_]:

@@ -430,6 +430,7 @@ class _Log:
             part.clear()
             if no_time:  # the rows of a summary, where a word stands in place of the time
                 joined[-1] = np.delete(joined[-1], no_time)
+            joined[-1].setflags(write=False)  # made here: a recording takes it as it is
         for words, (column, _) in zip(self.words, self.columns, strict=True):
             what = f"column {labels[column].whole}: {counted(words.count, 'cell')} without a number read as missing"
             notes += words.note(what, MOST_WORDS * self.total)
