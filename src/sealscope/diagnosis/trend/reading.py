@@ -18,7 +18,7 @@ from sealscope.diagnosis.trend.wear import DayToDay, Level
 from sealscope.diagnosis.verdict.machine import AssumedMachine, assumed_rig
 from sealscope.parameters import Rig
 from sealscope.recordings.chambers import CHAMBERS, chambers_of
-from sealscope.recordings.formats.headings.oil_temperature import stated_oil_temperature
+from sealscope.recordings.formats.headings.preamble import stated_oil_temperature
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.recording import Recording
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
@@ -28,7 +29,7 @@ from sealscope.recordings.formats.headings.preamble import exported_from
 from sealscope.recordings.formats.headings.proposal import is_time, unit_of_time
 from sealscope.recordings.formats.headings.split_time import joined_time
 from sealscope.recordings.formats.headings.words import WORDS
-from sealscope.recordings.timebase import falling, nominal_rate, stamps, time_base
+from sealscope.recordings.formats.timebase import falling, nominal_rate, stamps, time_base
 from sealscope.units import to_si
 
 #: Most values that one file may hold in the columns used: 2 GiB of doubles, 16 hours of 9 channels at 500 Hz.
@@ -505,17 +506,14 @@ def check_texts(cells: int, width: int, name: str, place: str) -> None:
 
 def from_text(cells: Sequence[str], time: bool, name: str, place: str) -> NDArray[Any]:
     """Convert cells of text to doubles, or to stamps for the `time`; an empty cell is missing, and a few words are."""
-    try:
+    with suppress(ValueError):
         if time:
             return stamps(cells)
-        values = np.array([_number(cell) for cell in cells])
-        if sum(1 for cell, value in zip(cells, values, strict=True) if cell and np.isnan(value)) <= (
-            MOST_WORDS * len(cells)
-        ):
-            return values
-    except ValueError:
-        pass
-    raise UnreadableFile(f"{name} must hold numbers, got text ({place})")
+    values = np.array([_number(cell) for cell in cells])
+    words = sum(1 for cell, value in zip(cells, values, strict=True) if cell and np.isnan(value))
+    if words > MOST_WORDS * len(cells):
+        raise UnreadableFile(f"{name} must hold numbers, got text ({place})")
+    return values
 
 
 def _number(cell: str) -> float:

@@ -51,7 +51,7 @@ from sealscope.recordings.formats.text_layout import (
     layout_of,
     ungrouped,
 )
-from sealscope.recordings.timebase import is_stamp, stamps
+from sealscope.recordings.formats.timebase import is_stamp, stamps
 
 #: Bytes that are read at a time, which fit a processor's cache, and of the longest line.
 _CHUNK, _LONGEST_LINE = 2**19, 2**23

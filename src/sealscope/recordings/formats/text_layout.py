@@ -18,7 +18,7 @@ from sealscope.recordings.formats.headings.preamble import of_lines, stated_rate
 from sealscope.recordings.formats.headings.proposal import knows, measures
 from sealscope.recordings.formats.headings.quantities import is_unit, units_in, with_units, without_units
 from sealscope.recordings.formats.headings.words import WORDS
-from sealscope.recordings.timebase import is_stamp
+from sealscope.recordings.formats.timebase import is_stamp
 
 SNIFF = 64 * 1024
 OWN_MARK = "# sealscope: "

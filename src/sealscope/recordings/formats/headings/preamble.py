@@ -20,6 +20,11 @@ _STATED = [re.compile(WORDS["stated"][kind], re.IGNORECASE) for kind in ("rate",
 #: TwinCAT's start of an export: 100 ns since 1601.
 _FILETIME = re.compile(r"(1[23]\d{16})\b")
 _FROM_1601_TO_1970 = 11_644_473_600 * 10**9  # [ns]
+_TEMPERATURE = re.compile(
+    r"(?P<value>[-+]?\d{1,3}(?:[.,]\d{1,3})?)\s*(?P<unit>°\s?[CF]|deg\s?[CF]|[CFK]\b|℃)", re.IGNORECASE
+)
+_UNIT_OF_NAME = re.compile(r"[\[(]\s*([^\])]{1,6}?)\s*[\])]")
+_OIL = re.compile(r"temp|oil|öl|oel|fluid|huile|olio|aceite", re.IGNORECASE)
 _QUANTITY = re.compile(r"(?P<number>[+-]?\d{1,12}(?:[.,]\d{1,12})?(?:[eE][+-]?\d{1,3})?)\s*(?P<unit>\S{0,10}).*")
 
 
@@ -90,3 +95,19 @@ def of_lines(lines: Sequence[str], delimiter: str) -> dict[str, str]:
 def _line(text: str, longest: int) -> str:
     printable = "".join(sign if sign.isprintable() else " " for sign in text[: 4 * longest])
     return " ".join(printable.split()).strip("\"'")[:longest]
+
+
+def stated_oil_temperature(provenance: Mapping[str, object]) -> float | None:
+    """Return the oil's temperature [deg C] by a recording's provenance, None where it does not state it."""
+    for name, text in remarks_of(provenance).items():
+        if not _OIL.search(name):
+            continue
+        unit_of_name = _UNIT_OF_NAME.search(name)
+        match = _TEMPERATURE.search(text if unit_of_name is None else f"{text} {unit_of_name[1]}")
+        if match is None:
+            continue
+        value, unit = float(match["value"].replace(",", ".")), match["unit"].upper().replace("℃", "C")[-1]
+        celsius = (value - 32.0) / 1.8 if unit == "F" else value - 273.15 if unit == "K" else value
+        if -60.0 < celsius < 200.0:
+            return celsius
+    return None

@@ -19,7 +19,7 @@ from sealscope.recordings.formats.headings.preamble import entries, stated_rate
 from sealscope.recordings.formats.headings.proposal import is_time
 from sealscope.recordings.formats.structured.tree import series_in
 from sealscope.recordings.formats.table import Choose, RawTable, Series, check_size, check_texts, table_of
-from sealscope.recordings.formats.text_layout import MISSING, SNIFF, encoding_of, is_number, ungrouped
+from sealscope.recordings.formats.text_layout import MISSING, SNIFF, encoding_of
 
 #: Most names that records may have, deepest nesting of a record, and longest vector in one.
 _MOST_NAMES, _DEEPEST, _LONGEST_VECTOR = 1024, 4, 256
@@ -174,28 +174,18 @@ def _block_length(member: Mapping[str, Any]) -> int | None:
 
 
 def _array(cells: Sequence[Any], name: str, place: str) -> NDArray[Any]:
-    """Return cells as doubles (n,), missing ones as NaN; as texts where some are texts and no numbers."""
-    numbers, texts = np.full(len(cells), np.nan), dict[int, str]()
-    for row, cell in enumerate(cells):
-        value = cell
-        if isinstance(value, str) and is_number(value, "."):
-            value = float(ungrouped(value.strip(), ".").lower().replace("d", "e"))
-        if isinstance(value, str):
-            if value.strip().casefold() not in MISSING:
-                check_texts(len(texts) + 1, len(value), name, place)
-                texts[row] = value
-        elif value is not None:
-            try:
-                numbers[row] = value
-            except OverflowError:
-                numbers[row] = np.inf
-            if np.isinf(numbers[row]):
-                raise UnreadableFile(f"a sample must be a finite number, got {name} = {str(cell)[:40]} ({place})")
-    if not texts:
-        return numbers
-    mixed = np.where(np.isnan(numbers), "", numbers.astype(str)).astype(object)
-    mixed[list(texts)] = list(texts.values())
-    return mixed.astype(str)
+    """Return cells as doubles (n,), missing ones as NaN; as texts where some are texts."""
+    if any(isinstance(cell, str) for cell in cells):
+        texts = ["" if cell is None or str(cell).strip().casefold() in MISSING else str(cell) for cell in cells]
+        check_texts(len(texts), max(map(len, texts)), name, place)
+        return np.array(texts)
+    try:
+        values = np.array([np.nan if cell is None else cell for cell in cells], dtype=np.float64)
+    except OverflowError:
+        values = np.full(1, np.inf)
+    if np.isinf(values).any():
+        raise UnreadableFile(f"a sample must be a finite number, got an infinite one for {name} ({place})")
+    return values
 
 
 def _arrays(value: Any, place: str, depth: int = 0) -> Any:
