@@ -28,7 +28,7 @@ from sealscope.errors import InputError
 from sealscope.parameters import load_rig, parse_overrides
 from sealscope.recordings import read, split_map_option
 from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.timebase import is_stamp
+from sealscope.recordings.formats.timebase import is_stamp
 from sealscope.simulation.commands import parse_command
 from sealscope.simulation.faults import parse_fault, parse_leak
 from sealscope.units import parse_quantity, parse_unit

@@ -1,8 +1,4 @@
-"""Logs in the dialects of test benches: written by the libraries of the formats, or by hand from their descriptions.
-
-``python -m tests.recordings.dialects`` writes each, and each of `exports`, reads it, and prints how far each channel is
-from what was written.
-"""
+"""Logs in the dialects of test benches: written by the libraries of the formats, or by hand from their descriptions."""
 
 from __future__ import annotations
 
@@ -10,7 +6,6 @@ import bz2
 import datetime as dt
 import gzip
 import lzma
-import tempfile
 import warnings
 import zipfile
 from collections.abc import Callable, Mapping
@@ -20,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from sealscope.recordings import Recording, read
+from sealscope.recordings import Recording
 
 RATE = 500.0
 N = 200
@@ -445,16 +440,6 @@ def among_documents(folder: Path) -> Path:
     return folder / "log.tar.gz"
 
 
-def packed(ending: str) -> Writer:
-    """Return what writes a log inside an archive."""
-
-    def write(folder: Path) -> Path:
-        content = log("t [s],p_A [bar],p_B [bar],x [mm]\n")(folder).read_bytes()
-        return pack(content, folder, ending)
-
-    return write
-
-
 def parquet(folder: Path) -> Path:
     import pandas as pd
 
@@ -652,7 +637,6 @@ TEXTS: dict[str, Dialect] = {
             "ports": "Time (s),Port A Pressure (bar),Port B Pressure (bar),Displacement (mm)",
         }.items()
     },
-    **{f"archive, {ending}": Dialect(packed(ending)) for ending in ("gz", "bz2", "xz", "zst", "zip")},
 }
 DIALECTS: dict[str, Dialect] = {
     **{name: Dialect(write) for name, write in FILES.items()},
@@ -701,24 +685,3 @@ def deviations(recording: Recording) -> dict[str, float]:
     """Return the largest deviation of each channel from what was written [bar, bar, mm], but missing samples."""
     sources = {"p_A": (P_A, 1e5), "p_B": (P_B, 1e5), "x": (X, 1e-3)}
     return {name: float(np.nanmax(np.abs(recording[name] / unit - values))) for name, (values, unit) in sources.items()}
-
-
-def main() -> None:
-    """Print the table."""
-    print(
-        f"{'dialect':<40}{'samples':>8}{'missing':>8}{'rate [Hz]':>10}{'p_A [bar]':>11}{'p_B [bar]':>11}{'x [mm]':>11}"
-    )
-    from .exports import EXPORTS
-
-    every = {**DIALECTS, **EXPORTS}
-    for name, dialect in every.items():
-        with tempfile.TemporaryDirectory() as folder:
-            recording = read(dialect.write(Path(folder)), **dialect.options)
-        missing = sum(int(np.isnan(recording[channel]).sum()) for channel in ("p_A", "p_B", "x"))
-        figures = "".join(f"{value:>11.1e}" for value in deviations(recording).values())
-        print(f"{name:<40}{len(recording):>8}{missing:>8}{recording.rate:>11g}{figures}")
-    print(f"{len(every)} dialects")
-
-
-if __name__ == "__main__":
-    main()

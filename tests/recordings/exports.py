@@ -131,11 +131,9 @@ JSONS: dict[str, Dialect] = {
             }
         )
     ),
-    **{f"JSON, pandas {orient}": Dialect(pandas_json(orient)) for orient in ("records", "columns", "index", "split")},
+    **{f"JSON, pandas {orient}": Dialect(pandas_json(orient)) for orient in ("records", "split")},
     "JSON, pandas lines": Dialect(pandas_json("records", lines=True)),
     "JSON, pandas table": Dialect(pandas_json("table", True)),
-    "JSON, pandas split with times": Dialect(pandas_json("split", True)),
-    "JSON, pandas columns with times": Dialect(pandas_json("columns", True)),
 }
 
 

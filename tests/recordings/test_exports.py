@@ -13,7 +13,7 @@ from sealscope.errors import UnreadableFile
 from sealscope.recordings import read
 
 from .dialects import RATE, N, T, deviations
-from .exports import EXPORTS, NAMED, POSITION, RECORDS, A, twincat
+from .exports import EXPORTS, POSITION, RECORDS, A, twincat
 
 
 @pytest.mark.parametrize("name", EXPORTS)
@@ -42,8 +42,8 @@ def refused(path: Path, **options: object) -> str:
     [
         ('{"t": 0, "p_A": 1}\n{"t": 1, "p_A": }\n{"t": 2, "p_A": 3}\n',
          "JSON must be whole, got: Expecting value (line 2, FILE)"),
-        ('{"t": 0, "p_A [Pa]": 1e999}\n', "a sample must be a finite number, got p_A [Pa] = inf (FILE)"),
-        ('{"t": 0, "p_A [Pa]": 1%s}\n' % ("0" * 400), "a sample must be a finite number, got p_A [Pa] = 1000"),
+        ('{"t": 0, "p_A [Pa]": 1e999}\n', "a sample must be a finite number, got an infinite one for p_A [Pa] (FILE)"),
+        ('{"t": 0, "p_A [Pa]": 1%s}\n' % ("0" * 400), "a sample must be a finite number, got an infinite one"),
         ('{"t": 0, "p_A [Pa]": 1%s}\n' % ("0" * 9000), "JSON must be plain, got: Exceeds the limit"),
         ('{"t": 0, "p": ' + "[" * 100_000, "JSON must be plain, got: maximum recursion depth"),
         ('[{"t": 0, "p_A": {"value": 1, "unit": "bar"}}, {"t": 1, "p_A": {"value": 1, "unit": "psi"}}]',
@@ -56,7 +56,7 @@ def refused(path: Path, **options: object) -> str:
         ("\n".join(f'{{"n{k}": 1}}' for k in range(2000)), "records must have at most 1024 names, got more (FILE)"),
         ("[" + "[]," * 50_000, "JSON must hold records or columns of samples, got none (FILE)"),
         ('{"a": "' + "x" * 3_000_000, "JSON must be whole, got: Unterminated string starting at (line 1, FILE)"),
-        ('{"a":[' + "{}," * 4_300_000 + "0]}", "JSON must have at most 4194304 parts in one value (FILE)"),
+        ('{"a":[' + "{}," * 4_300_000 + "0]}", "JSON must hold records or columns of samples, got none (FILE)"),
     ],
 )  # fmt: skip
 def test_json_that_is_no_log(content: str, message: str, tmp_path: Path) -> None:
@@ -96,24 +96,6 @@ def test_words_and_missing_values_among_the_numbers(tmp_path: Path) -> None:
     path = tmp_path / "log.jsonl"
     path.write_text("".join(json.dumps(row) + "\n" for row in records).replace(repr(A[6]), "NaN", 1))
     assert np.flatnonzero(np.isnan(read(path)["p_A"])).tolist() == [3, 4, 5, 6]
-
-
-def test_a_value_is_as_long_as_may_be_read_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sealscope.recordings.formats.structured.json_log.LARGEST_DOCUMENT", 300_000)
-    monkeypatch.setattr("sealscope.recordings.formats.structured.json_log._CHUNK", 10_000)
-    path = tmp_path / "log.json"
-    path.write_text('{"p_A [Pa]": [' + "0," * 140_000 + "0]}")
-    assert len(read(path, rate=RATE)) == 140_001
-    path.write_text('{"p_A [Pa]": [' + "0," * 160_000 + "0]}")
-    assert refused(path) == ("JSON must be whole, got: over 300000 signs in one, write a record a line (line 1, FILE)")
-
-
-def test_a_large_document_is_read_in_blocks(tmp_path: Path) -> None:
-    path, many = tmp_path / "log.json", 100
-    path.write_text(json.dumps({name: cells * many for name, cells in NAMED.items() if name != "t [s]"}, indent=1))
-    assert path.stat().st_size > 2**20
-    recording = read(path, rate=RATE)
-    assert np.array_equal(recording["p_A"], np.tile(np.array(A) * 1e5, many))
 
 
 def test_whole_seconds_of_a_controller_s_log_are_shared_among_its_samples(tmp_path: Path) -> None:
@@ -236,11 +218,10 @@ def test_a_table_with_a_column_of_names_is_read_as_it_was_where_a_map_names_its_
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("Name,Time,Value\n" + "p_A,yesterday,1\n" * 3, "time must be a stamp such as"),
+        ("Name,Time,Value\n" + "p_A,yesterday,1\n" * 3, "a sample must be a number, got 'yesterday'"),
         ("Name,Time,Value\n" + "".join(f"n{k},{k},1\n" for k in range(5000)), "a long table must have at most 4096"),
-        ("Name,Time,Value\np_A,0,1\n" + "p_A,1," + "x" * 2**21, "a text log must have lines, got 1048576 signs"),
         ("Name,Time,Value\n" + "p_A [Pa],3,1\n" * 9, "time must increase between some samples (FILE)"),
-        ("Name,Time,Value\n" + "".join(f"p_A [Pa],{k},word\np_B [Pa],{k},1\n" for k in range(99)),
+        ("Name,Time,Value\n" + "".join(f"p_A [Pa],{k / 50},word\np_B [Pa],{k / 50},1\n" for k in range(99)),
          "p_A [Pa] must hold numbers, got text (FILE)"),
         ("t,p_A [Pa],t,p_B [Pa]\n" + "0,1,,2\n1,1,,2\n", "time must have a number in some row, got none in column t"),
         ("t,p_A [Pa],t,p_B [Pa]\n" + "0,1,0,2\n1,1,1,2\n2,1,1,3\n", "the times of p_B [Pa] must increase"),
@@ -277,16 +258,6 @@ def test_a_last_cell_that_is_cut_within_its_unit_is_missing(tmp_path: Path) -> N
     path.write_text(path.read_text()[:-1])
     recording = read(path)
     assert np.flatnonzero(np.isnan(recording["x"])).tolist() == [399]
-
-
-def test_units_in_the_cells_of_a_workbook(tmp_path: Path) -> None:
-    openpyxl = pytest.importorskip("openpyxl")
-    book = openpyxl.Workbook()
-    book.active.append(["Time", "p_A"])
-    for t, value in zip(T.tolist(), A, strict=True):
-        book.active.append([t, f"{value:.6f} bar"])
-    book.save(tmp_path / "log.xlsx")
-    assert read(tmp_path / "log.xlsx")["p_A"] == pytest.approx(1e5 * np.array(A), abs=0.05)
 
 
 def test_cells_that_only_look_like_quantities_are_left_alone(tmp_path: Path) -> None:

@@ -143,12 +143,6 @@ def test_without_the_libraries_the_extra_is_named(monkeypatch: pytest.MonkeyPatc
             call()
 
 
-def test_short_representations() -> None:
-    assert repr(plain()) == "Recording(p_A [Pa], x [m], p_B [count]; 600 samples, 500 Hz, 1.2 s)"
-    assert repr(plain().only([])) == "Recording(no channels; 600 samples, 500 Hz, 1.2 s)"
-    assert repr(plain(1).only(["x"])) == "Recording(x [m]; 1 sample, 500 Hz, 0.002 s)"
-
-
 def test_the_page_of_a_notebook_is_escaped() -> None:
     hostile = Recording([0, 1], {"<script>x": [1, np.nan]}, {"<script>x": "<b>&"}, 1.0)
     page = hostile._repr_html_()

@@ -95,7 +95,7 @@ def test_whatever_a_format_library_raises_names_the_file(
         pytest.importorskip("pyarrow")
     write(Recording(T, {"p_A": P}, {"p_A": "Pa"}, 500.0), path)
     module = {"log.csv": "text", "log.h5": "netcdf", "log.parquet": "parquet"}[name]
-    inner = {"text": "_row_blocks", "netcdf": "_values", "parquet": "_values"}[module]
+    inner = {"text": "_blocks", "netcdf": "_values", "parquet": "_values"}[module]
 
     def fail(*args: object) -> None:
         raise error("odd\nthing")

@@ -110,27 +110,11 @@ def _process() -> _Process:
 
 
 def apart(work: Callable[..., T], *arguments: Any, limit: float, memory: int = MOST_MEMORY, disk: int = LARGEST) -> T:
-    """Return ``work(*arguments)``, carried out in a process of its own.
+    """Return ``work(*arguments)``, carried out in a process of its own; arguments and result are pickled.
 
-    Parameters
-    ----------
-    work : callable
-        A function of a module, with arguments and a result that can be pickled.
-    *arguments
-        What it is called with.
-    limit : float
-        Longest time that it may take [s].
-    memory : int
-        Most memory that it may take [bytes]; `MOST_MEMORY` and half the machine's at most.
-    disk : int
-        Longest file that it may write [bytes].
-
-    Raises
-    ------
-    CrashedApartError
-        The process crashed or took longer.
-    SealscopeError, MemoryError, RuntimeError
-        What the function raised; other kinds are a RuntimeError of the same text.
+    `limit`: longest time that it may take [s]; `memory`: most that it may take [bytes], `MOST_MEMORY` and half the
+    machine's at most; `disk`: longest file that it may write [bytes]. Raises CrashedApartError where the process
+    crashed or took longer, and what the function raised: kinds that are not our own as a RuntimeError of its text.
     """
     with _places:
         process = _process()

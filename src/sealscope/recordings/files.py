@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from math import isfinite
 from pathlib import Path
-from typing import cast
+from typing import Any, NamedTuple
 
 from sealscope.calls import checked_call
 from sealscope.errors import InputError, UnreadableFile
@@ -20,7 +20,6 @@ from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
 from sealscope.recordings.formats.columns import ChannelMap, check_call, choose_columns
 from sealscope.recordings.formats.matlab import is_matlab_4
 from sealscope.recordings.formats.structured.json_log import is_json
-from sealscope.recordings.formats.structured.logs import is_one_table
 from sealscope.recordings.formats.structured.lvm import is_lvm
 from sealscope.recordings.formats.table import Choose, RawTable
 from sealscope.recordings.formats.text import read_text_parts
@@ -30,63 +29,33 @@ from sealscope.storage.atomic import atomic_write
 from sealscope.storage.opening import open_regular, whole
 from sealscope.storage.unpacking import most_unpacked
 
-Reader = Callable[[Path, Choose], RawTable]
-Writer = Callable[..., None]
-#: Suffix -> format of a file to write.
-SUFFIXES: Mapping[str, str] = {
-    ".nc": "netcdf",
-    ".nc4": "netcdf",
-    ".h5": "netcdf",
-    ".hdf5": "netcdf",
-    ".csv": "text",
-    ".tsv": "text",
-    ".txt": "text",
-    ".parquet": "parquet",
-    ".pq": "parquet",
+
+class _Format(NamedTuple):
+    """A format in words, the module that reads it, and suffixes and first bytes of its files."""
+
+    words: str
+    module: str
+    suffixes: str
+    magic: tuple[bytes, ...] = ()
+
+
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+_FORMATS = {
+    "netcdf": _Format("a NetCDF or HDF5", "netcdf", ".nc .nc4 .h5 .hdf5", (_HDF5,)),
+    "text": _Format("a text", "text", ".csv .tsv .txt"),
+    "parquet": _Format("a Parquet", "parquet", ".parquet .pq", (b"PAR1", b"ARROW1")),
+    "matlab": _Format("a MATLAB", "matlab", ".mat", (b"MATLAB 5.0", b"MATLAB 7.")),
+    "tdms": _Format("a TDMS", "tdms", ".tdms", (b"TDSm",)),
+    "mdf": _Format("an MDF", "mdf", ".mdf .mf4", (b"MDF     ", b"UnFinMF ")),
+    "lvm": _Format("a LabVIEW measurement", "structured.lvm", ".lvm"),
+    "json": _Format("a JSON", "structured.json_log", ".json .jsonl .ndjson"),
+    "spreadsheet": _Format(
+        "a spreadsheet", "spreadsheet", ".xlsx .xlsm .xlsb .xls .ods", (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
+    ),
 }
-#: Suffix -> format of a file that is read only.
-_READ_ONLY = {
-    ".mat": "matlab",
-    ".tdms": "tdms",
-    ".mdf": "mdf",
-    ".mf4": "mdf",
-    ".lvm": "lvm",
-    ".json": "json",
-    ".jsonl": "json",
-    ".ndjson": "json",
-    ".xlsx": "spreadsheet",
-    ".xlsm": "spreadsheet",
-    ".xlsb": "spreadsheet",
-    ".xls": "spreadsheet",
-    ".ods": "spreadsheet",
-}
-#: Formats that are read, and what each is in words.
-_NAMES = {
-    "netcdf": "a NetCDF or HDF5",
-    "parquet": "a Parquet",
-    "text": "a text",
-    "matlab": "a MATLAB",
-    "tdms": "a TDMS",
-    "mdf": "an MDF",
-    "lvm": "a LabVIEW measurement",
-    "json": "a JSON",
-    "spreadsheet": "a spreadsheet",
-}
-#: Format -> module that reads it, where it is none of its own name.
-_MODULES = {"text": "structured.logs", "lvm": "structured.lvm", "json": "structured.json_log"}
-#: First bytes -> format.
-_MAGIC = {
-    b"PAR1": "parquet",
-    b"ARROW1": "parquet",
-    b"MATLAB 5.0": "matlab",
-    b"MATLAB 7.": "matlab",
-    b"TDSm": "tdms",
-    b"MDF     ": "mdf",
-    b"UnFinMF ": "mdf",
-    b"PK\x03\x04": "spreadsheet",
-    b"\xd0\xcf\x11\xe0": "spreadsheet",
-    b"\x89HDF\r\n\x1a\n": "netcdf",
-}
+#: Suffix -> format of a file to write, and of any file.
+_SUFFIXES = {suffix: kind for kind, form in _FORMATS.items() for suffix in form.suffixes.split()}
+SUFFIXES = {suffix: kind for suffix, kind in _SUFFIXES.items() if kind in ("netcdf", "text", "parquet")}
 _CSV = "export it as CSV"
 #: First bytes of formats that are known and not read.
 _FOREIGN = {
@@ -127,47 +96,42 @@ _PROPRIETARY = {
     ".trc": "a file of an oscilloscope: export it as CSV",
 }
 #: Formats that are read in the program itself; the others' libraries end it, or fill its memory, on some files.
-_TEXTS = ("text", "lvm", "json")
+_TEXTS = ("text", "lvm")
 #: Longest time that such a file may take [s], and what is added for its size [bytes/s]; most memory [bytes], and so
 #: many times its size.
 _LONGEST, _SLOWEST, _SLOWEST_SHEETS = 10.0, 20e6, 5e5
 _MEMORY, _MEMORY_SHARE = 2**31, 64
 #: Archives within archives that are unpacked.
 _DEEPEST_ARCHIVE = 3
-_HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
 def _format_of(path: Path) -> str:
     """Return the format of a file by its content; raise UnreadableFile where it is none that is read."""
     with open_regular(path, "a recording") as file:
         head = file.read(SNIFF)
-        for magic, kind in _MAGIC.items():
-            if head.startswith(magic):
+        for kind, form in _FORMATS.items():
+            if head.startswith(form.magic):
                 return kind
-        for magic, name in _FOREIGN.items():
-            if head.startswith(magic):
-                raise UnreadableFile(f"a recording must be in a format that is read, got {name} ({path})")
         for offset in (512, 1024, 2048, 4096):  # HDF5 may begin after a block of the user's
             file.seek(offset)
             if file.read(8) == _HDF5:
                 return "netcdf"
-    if b"<usi:tdm" in head:
-        raise UnreadableFile(
-            f"a recording must be in a format that is read, got a DIAdem header (.tdm): export it as TDMS ({path})"
-        )
-    if is_matlab_4(head):
+    foreign = next((name for magic, name in _FOREIGN.items() if head.startswith(magic)), None)
+    if foreign is None and b"<usi:tdm" in head:
+        foreign = "a DIAdem header (.tdm): export it as TDMS"
+    if foreign is None and is_matlab_4(head):
         return "matlab"
-    if path.suffix.lower() in _PROPRIETARY and encoding_of(head) is None:
-        name = _PROPRIETARY[path.suffix.lower()]
-        raise UnreadableFile(f"a recording must be in a format that is read, got {name} ({path})")
+    if foreign is None and encoding_of(head) is None:
+        foreign = _PROPRIETARY.get(path.suffix.lower())
+    if foreign is not None:
+        raise UnreadableFile(f"a recording must be in a format that is read, got {foreign} ({path})")
     return "lvm" if is_lvm(head) else "json" if is_json(head) else "text"
 
 
-def _reader(kind: str) -> Reader:
-    """Return ``read_KIND`` of the format's module; its library is loaded now."""
-    return cast(
-        "Reader", getattr(import_module(f"sealscope.recordings.formats.{_MODULES.get(kind, kind)}"), f"read_{kind}")
-    )
+def _member(kind: str, verb: str) -> Callable[..., Any]:
+    """Return ``read_KIND`` or ``write_KIND`` of the format's module; its library is loaded now."""
+    module = import_module(f"sealscope.recordings.formats.{_FORMATS[kind].module}")
+    return getattr(module, f"{verb}_{kind}")  # type: ignore[no-any-return]
 
 
 def _table(kind: str, file: Path, choose: Choose) -> RawTable:
@@ -175,18 +139,13 @@ def _table(kind: str, file: Path, choose: Choose) -> RawTable:
     if kind in _TEXTS:
         return _read_here(file, kind, choose)
     size = file.stat().st_size
-    limit = _LONGEST + size / (_SLOWEST_SHEETS if kind == "spreadsheet" else _SLOWEST)
+    limit = _LONGEST + size / (_SLOWEST_SHEETS if kind in ("spreadsheet", "json") else _SLOWEST)
     memory = _MEMORY + _MEMORY_SHARE * size
     return file_apart(_read_here, file, kind, choose, limit=limit, memory=memory, disk=most_unpacked(file))
 
 
 def _read_here(file: Path, kind: str, choose: Choose) -> RawTable:
-    return _reader(kind)(file, choose)
-
-
-def _writer(kind: str) -> Writer:
-    """Return ``write_KIND`` of the format's module; its library is loaded now."""
-    return cast("Writer", getattr(import_module(f"sealscope.recordings.formats.{kind}"), f"write_{kind}"))
+    return _member(kind, "read")(file, choose)  # type: ignore[no-any-return]
 
 
 @checked_call
@@ -195,7 +154,6 @@ def read(
     *,
     map: ChannelMap | None = None,
     rate: float | None = None,
-    format: str | None = None,
 ) -> Recording:
     r"""Read the recording in a file: the text of any logger, or the file of a measurement program.
 
@@ -216,8 +174,6 @@ def read(
         the mapping does not name.
     rate : float, optional
         Sampling rate [Hz], in place of a time column.
-    format : {"text", "netcdf", "parquet", "matlab", "tdms", "mdf", "lvm", "json", "spreadsheet"}, optional
-        What the content must be.
 
     Returns
     -------
@@ -229,7 +185,7 @@ def read(
     UnreadableFile
         If the file cannot be read as a recording; the message names the file, the place and the rule.
     InputError
-        If `map`, `rate` or `format` is wrong.
+        If `map` or `rate` is wrong.
     MissingExtra
         If the library that reads the format is not installed.
 
@@ -246,10 +202,8 @@ def read(
     """
     file, channel_map = Path(path), map or {}
     check_call(channel_map, rate)
-    if format is not None and format not in _NAMES:
-        raise InputError(f"format must be one of {', '.join(sorted(_NAMES))}, got {format}")
     with _inner(file) as inner:
-        return _read(inner, file.name, channel_map, rate, format)
+        return _read(inner, file.name, channel_map, rate)
 
 
 @checked_call
@@ -310,8 +264,8 @@ def _parts(file: Path, every: float, channel_map: ChannelMap, rate: float | None
         def recording_of(table: RawTable) -> Recording:
             return Recording(*table.samples({"file": file.name}, rate=rate, infer_rate=bool(channel_map)))
 
-        if _format_of(inner) != "text" or not is_one_table(inner):
-            whole_file = _read(inner, file.name, channel_map, rate, None)
+        if _format_of(inner) != "text":
+            whole_file = _read(inner, file.name, channel_map, rate)
             size = max(1, round(every * whole_file.rate))
             for first in range(0, len(whole_file), size):
                 yield whole_file.samples(slice(first, first + size))
@@ -326,24 +280,22 @@ def _inner(file: Path) -> Iterator[Path]:
     """Yield the file, or what is packed in it; what is wrong with either is an UnreadableFile."""
     try:
         archive = archive_of(file)
-        if archive is None:
-            yield file
-            return
     except UnreadableFile:
         raise
-    except InputError as error:
-        raise UnreadableFile(str(error)) from None
     except FileNotFoundError:
         raise UnreadableFile(f"a recording must exist, got no such file ({file})") from None
+    except InputError as error:
+        raise UnreadableFile(str(error)) from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise UnreadableFile(f"a recording must be readable, got: {reason} ({file})") from error
     with ExitStack() as folders:
-        inner, depth, most = file, 0, most_unpacked(file)
+        inner, most = file, 0 if archive is None else most_unpacked(file)
         try:
-            while archive is not None and depth < _DEEPEST_ARCHIVE:  # a .tar.gz is an archive in an archive
-                inner, depth = folders.enter_context(unpacked(inner, archive, most)), depth + 1
-                archive = archive_of(inner)
+            for _ in range(_DEEPEST_ARCHIVE):  # a .tar.gz is an archive in an archive
+                if archive is not None:
+                    inner = folders.enter_context(unpacked(inner, archive, most))
+                    archive = archive_of(inner)
             yield inner
         except UnreadableFile as error:
             if inner == file:
@@ -351,15 +303,13 @@ def _inner(file: Path) -> Iterator[Path]:
             raise UnreadableFile(str(error).replace(str(inner), f"{inner.name} in {file}")) from error
 
 
-def _read(file: Path, name: str, channel_map: ChannelMap, rate: float | None, format: str | None) -> Recording:
+def _read(file: Path, name: str, channel_map: ChannelMap, rate: float | None) -> Recording:
     """Read a file that is no archive; `name`: what the recording's provenance calls it."""
     kind = _format_of(file)
-    if format not in (None, kind):
-        raise UnreadableFile(f"a file read as {format} must be {format}, got {kind} ({file})")
     choose = partial(choose_columns, channel_map=channel_map, rate=rate, place=str(file))
-    with whole(f"{_NAMES[kind]} file", file):
+    with whole(f"{_FORMATS[kind].words} file", file):
         table = _table(kind, file, choose)
-        if format is None and {**SUFFIXES, **_READ_ONLY}.get(file.suffix.lower(), kind) != kind:
+        if _SUFFIXES.get(file.suffix.lower(), kind) != kind:
             table = replace(table, notes=(f"name ends in {file.suffix}, content is {table.kind}", *table.notes))
         return Recording(*table.samples({"file": name}, rate=rate, infer_rate=bool(channel_map)))
 
@@ -418,8 +368,7 @@ def write(recording: Recording, path: str | os.PathLike[str]) -> None:
             raise InputError(f"a channel to write must be one of {', '.join(CHANNEL_UNITS)}, got {name}")
         if unit not in (CHANNEL_UNITS[name], COUNTS):
             raise InputError(f"channel {name} must be in {CHANNEL_UNITS[name]} or {COUNTS} to be written, got {unit}")
-    write_table = _writer(kind)
     delimiter = {"delimiter": "," if file.suffix.lower() == ".csv" else "\t"} if kind == "text" else {}
     values, units, description = recording.series()
     with atomic_write(file) as temporary:
-        write_table(temporary, values, units, description, **delimiter)
+        _member(kind, "write")(temporary, values, units, description, **delimiter)

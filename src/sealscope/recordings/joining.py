@@ -10,8 +10,8 @@ import numpy as np
 
 from sealscope.calls import checked_call
 from sealscope.errors import InputError
+from sealscope.recordings.formats.timebase import seconds_of
 from sealscope.recordings.recording import Recording
-from sealscope.recordings.timebase import seconds_of
 
 #: Files of the same start [s] have a clock that goes on from file to file.
 _SAME_START = 1e-6

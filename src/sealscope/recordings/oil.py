@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sealscope.recordings.formats.headings.oil_temperature import stated_oil_temperature
+from sealscope.recordings.formats.headings.preamble import stated_oil_temperature
 from sealscope.recordings.recording import Recording
 
 

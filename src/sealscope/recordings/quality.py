@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,56 +112,47 @@ def _moment(recording: Recording, index: int) -> float | None:
 
 
 def _time_findings(recording: Recording) -> list[Finding]:
-    t, findings = recording.t, list[Finding]()
-    step = 1.0 / recording.rate
+    t, findings, step = recording.t, list[Finding](), 1.0 / recording.rate
 
-    def add(code: str, severity: Severity, where: Array | np.ndarray, text: str) -> None:
+    def add(code: str, where: NDArray[Any], text: str, severity: Severity = "fatal") -> None:
         findings.append(Finding(code, severity, None, len(where), _moment(recording, int(where[0])), text))
 
     unknown = np.flatnonzero(~np.isfinite(t))
     if unknown.size:
-        add("missing_time", "fatal", unknown, f"{counted(unknown.size, 'sample')} without a time")
+        add("missing_time", unknown, f"{counted(unknown.size, 'sample')} without a time")
     known = np.flatnonzero(np.isfinite(t))
     steps = np.diff(t[known])
     back = np.flatnonzero(steps < 0)
     if back.size:
         worst = float(-steps[back].min())
-        add("reversed_time", "fatal", known[back + 1], f"time goes back {_times(back.size)}, by up to {worst:g} s")
+        add("reversed_time", known[back + 1], f"time goes back {_times(back.size)}, by up to {worst:g} s")
     same = np.flatnonzero(steps == 0)
     if same.size:
-        add("duplicated_time", "fatal", known[same + 1], f"{counted(same.size, 'time stamp')} equal to the one before")
+        add("duplicated_time", known[same + 1], f"{counted(same.size, 'time stamp')} equal to the one before")
     forward = steps[steps > 0]
     if forward.size:
         typical = float(np.median(forward))
         if abs(typical / step - 1.0) > _RATE_ERROR and not (same.size and typical < 2.5 * step):
             text = f"time stamps tell {1.0 / typical:.6g} Hz, the recording's rate is {recording.rate:g} Hz"
-            add("rate_mismatch", "fatal", known[:1], text)
+            add("rate_mismatch", known[:1], text)
             step = typical
         gaps = np.flatnonzero(steps > _GAP * step)
         if gaps.size:
             lost = np.round(steps[gaps] / step - 1.0).sum()
+            samples = counted(int(lost), "sample") if lost < 1e15 else f"{lost:.3g} samples"
             longest = float(steps[gaps].max())
-            text = f"{counted(gaps.size, 'gap')}, about {_lost(lost)} lost, the longest {longest:g} s"
-            add("gap", "fatal", known[gaps], text)
+            text = f"{counted(gaps.size, 'gap')}, about {samples} lost, the longest {longest:g} s"
+            add("gap", known[gaps], text)
         usual = forward[forward <= _GAP * step] / step
         scatter = float(usual.std()) if usual.size else 0.0
         if scatter > _JITTER:
             odd = np.flatnonzero((steps > 0) & (steps <= _GAP * step) & (np.abs(steps / step - 1.0) > _JITTER))
-            severity: Severity = "fatal" if scatter > _WORST_JITTER else "warning"
-            add(
-                "irregular_sampling",
-                severity,
-                known[odd],
-                f"intervals scatter by {100 * scatter:.0f} % of the sampling step",
-            )
+            text = f"intervals scatter by {100 * scatter:.0f} % of the sampling step"
+            add("irregular_sampling", known[odd], text, "fatal" if scatter > _WORST_JITTER else "warning")
     if len(recording) < SHORTEST:
         text = f"{counted(len(recording), 'sample')}; the slowest detail needs {SHORTEST}"
         findings.append(Finding("too_short", "warning", None, len(recording), None, text))
     return findings
-
-
-def _lost(samples: float) -> str:
-    return counted(int(samples), "sample") if samples < 1e15 else f"{samples:.3g} samples"
 
 
 def _times(count: int) -> str:
@@ -188,60 +179,63 @@ def _creep_findings(recording: Recording) -> list[Finding]:
 
 
 def _channel_findings(recording: Recording, name: str, values: Array) -> list[Finding]:
-    findings: list[Finding] = []
-    rate = recording.rate
+    findings, rate, unit = list[Finding](), recording.rate, recording.units[name]
+    pressure, steady = name.startswith("p_"), name in ("u", "q_leak", "q_comp")
 
-    def add(code: str, severity: Severity, count: int, first: int, text: str) -> None:
+    def add(code: str, count: int, first: int, text: str, severity: Severity = "warning") -> None:
         findings.append(Finding(code, severity, name, count, _moment(recording, first), f"{name}: {text}"))
 
-    if name.startswith("p_") and recording.units[name] == COUNTS:
+    if pressure and unit == COUNTS:
         text = f"is in raw counts: state the unit (--map '{name}=COLUMN bar'), or a leak's size stays relative"
-        add("raw_counts", "note", values.size, 0, text)
-    holes = missing(values)
-    if holes is not None:
-        if holes.every:
-            rest = rate / holes.every
-            text = f"has a value on every {_ordinal(holes.every)} row only ({rest:g} Hz among {rate:g} Hz)"
-            add("mixed_rate", "warning", holes.samples, holes.first, text)
-        elif holes.samples == values.size:
-            add("missing", "warning", holes.samples, 0, "has no values at all")
+        add("raw_counts", values.size, 0, text, "note")
+    absent = np.isnan(values)
+    if absent.any():
+        runs = runs_of(absent)
+        samples, first = int(np.count_nonzero(absent)), int(runs[0, 0])
+        every = _every(np.flatnonzero(~absent))
+        if every:
+            text = f"has a value on every {_ordinal(every)} row only ({rate / every:g} Hz among {rate:g} Hz)"
+            add("mixed_rate", samples, first, text)
+        elif samples == values.size:
+            add("missing", samples, 0, "has no values at all")
         else:
-            missed = f"{counted(holes.samples, 'sample')} missing in {counted(holes.runs, 'stretch')}"
-            text = f"{missed}, the longest {holes.longest / rate:g} s"
-            add("missing", "warning", holes.samples, holes.first, text)
+            missed = f"{counted(samples, 'sample')} missing in {counted(len(runs), 'stretch')}"
+            add("missing", samples, first, f"{missed}, the longest {runs[:, 1].max() / rate:g} s")
     extreme = np.flatnonzero(np.isinf(values))
     if extreme.size:
-        add("infinite", "warning", extreme.size, int(extreme[0]), f"{counted(extreme.size, 'infinite sample')}")
+        add("infinite", extreme.size, int(extreme[0]), f"{counted(extreme.size, 'infinite sample')}")
     present = np.flatnonzero(np.isfinite(values))
     kept = values[present]
     if kept.size < 2:
         return findings
     if constant(kept):
         # a command may rest, and a flow meter on a closed bypass reads one value; a pressure never does
-        severity: Severity = "note" if name in ("u", "q_leak", "q_comp") else "warning"
-        add("constant", severity, kept.size, int(present[0]), f"is constant at {kept[0]:g} {recording.units[name]}")
+        text = f"is constant at {kept[0]:g} {unit}"
+        add("constant", kept.size, int(present[0]), text, "note" if steady else "warning")
         return findings
     held = stuck(kept)
-    if name.startswith("p_") or name == "q_leak":
-        for rail in clipped(kept, held, low=name != "q_leak"):
-            at_end = f"{counted(rail.samples, 'sample')} at the {rail.side} end"
-            text = f"{at_end}, {rail.value:g} {recording.units[name]}: clipped"
-            add("clipped", "warning", rail.samples, int(present[rail.first]), text)
-    if name not in ("u", "q_leak", "q_comp"):
-        if name.startswith("p_"):  # at an end of its values it is clipped
-            held = held[(kept[held[:, 0]] > kept.min()) & (kept[held[:, 0]] < kept.max())]
-        if held.size:
-            first, length = (int(v) for v in held[0])
-            text = f"does not move {_times(len(held))} while it should, first for {length / rate:g} s"
-            add("stuck", "warning", int(held[:, 1].sum()), int(present[first]), text)
-    if kept.size > 0.9 * values.size:
-        for line in hum(kept, rate):
-            text = f"mains hum of {line.frequency:g} Hz, amplitude {line.amplitude:.3g} {recording.units[name]}"
-            text += f", {100 * line.share:.2g} % of the power over 20 Hz"
-            if line.share > _UNCONNECTED:
-                text += ": is the sensor connected?"
-            add("mains_hum", "warning" if line.share > _LOUD_HUM else "note", kept.size, int(present[0]), text)
+    for rail in clipped(kept, held, low=pressure) if pressure or name == "q_leak" else ():
+        text = f"{counted(rail.samples, 'sample')} at the {rail.side} end, {rail.value:g} {unit}: clipped"
+        add("clipped", rail.samples, int(present[rail.first]), text)
+    if pressure:  # at an end of its values it is clipped
+        held = held[(kept[held[:, 0]] > kept.min()) & (kept[held[:, 0]] < kept.max())]
+    if held.size and not steady:
+        first, length = (int(v) for v in held[0])
+        text = f"does not move {_times(len(held))} while it should, first for {length / rate:g} s"
+        add("stuck", int(held[:, 1].sum()), int(present[first]), text)
+    for frequency, amplitude, share in hum(kept, rate) if kept.size > 0.9 * values.size else ():
+        text = f"mains hum of {frequency:g} Hz, amplitude {amplitude:.3g} {unit}"
+        text += f", {100 * share:.2g} % of the power over 20 Hz"
+        text += ": is the sensor connected?" if share > _UNCONNECTED else ""
+        add("mains_hum", kept.size, int(present[0]), text, "warning" if share > _LOUD_HUM else "note")
     return findings
+
+
+def _every(present: NDArray[np.intp]) -> int:
+    """Return k where only each k-th row has a value, as of a slower channel among others; else 0."""
+    apart = np.diff(present)
+    usual = int(np.median(apart)) if present.size >= 3 else 0
+    return usual if usual >= 2 and np.mean(apart == usual) > 0.95 else 0
 
 
 def _ordinal(number: int) -> str:
@@ -249,12 +243,11 @@ def _ordinal(number: int) -> str:
     return f"{number}{ending}"
 
 
-def uniform_segments(recording: Recording, channels: Sequence[str] | None = None, *, shortest: int = 1) -> list[slice]:
+def uniform_segments(recording: Recording, channels: Sequence[str] | None = None) -> list[slice]:
     """Return the maximal stretches, as slices, sampled uniformly with the named channels finite.
 
-    `channels`: by default all but those that change slowly.
-    A stretch has at least `shortest` samples; each interval in it lies between half and one and a half steps of
-    `recording.rate`. Raises InputError for a channel that the recording does not have.
+    `channels`: by default all but those that change slowly. Each interval of a stretch lies between half and one and a
+    half steps of `recording.rate`. Raises InputError for a channel that the recording does not have.
     """
     count = len(recording)
     whole = np.isfinite(recording.t)
@@ -263,7 +256,7 @@ def uniform_segments(recording: Recording, channels: Sequence[str] | None = None
     joined = whole[1:] & whole[:-1] & even_steps(recording)
     starts = np.flatnonzero(whole & np.r_[True, ~joined][:count])
     stops = np.flatnonzero(whole & np.r_[~joined, True][-count:]) + 1 if count else starts
-    return [slice(int(a), int(b)) for a, b in zip(starts, stops, strict=True) if b - a >= shortest]
+    return [slice(int(a), int(b)) for a, b in zip(starts, stops, strict=True)]
 
 
 def even_steps(recording: Recording) -> NDArray[np.bool_]:
@@ -273,16 +266,6 @@ def even_steps(recording: Recording) -> NDArray[np.bool_]:
     return np.asarray((steps > _CROWDED) & (steps < _GAP))
 
 
-class Holes(NamedTuple):
-    """Missing samples: how many, where first, runs, the longest; `every`: k where only each k-th row has one."""
-
-    samples: int
-    first: int
-    runs: int
-    longest: int
-    every: int
-
-
 class Rail(NamedTuple):
     """Samples at one end of a clipped channel: `low` or `high` side, the value there, how many, where first."""
 
@@ -290,30 +273,6 @@ class Rail(NamedTuple):
     value: float
     samples: int
     first: int
-
-
-class HumLine(NamedTuple):
-    """A spectral line: frequency [Hz], amplitude [the channel's unit], its share of the power over 20 Hz."""
-
-    frequency: float
-    amplitude: float
-    share: float
-
-
-def missing(values: Array) -> Holes | None:
-    """Describe the NaN samples, and whether they are a slower channel's rows in between; None where there are none."""
-    absent = np.isnan(values)
-    if not absent.any():
-        return None
-    runs = runs_of(absent)
-    present = np.flatnonzero(~absent)
-    every = 0
-    if present.size >= 3:
-        spacing = np.diff(present)
-        usual = int(np.median(spacing))
-        if usual >= 2 and np.mean(spacing == usual) > 0.95:
-            every = usual
-    return Holes(int(absent.sum()), int(runs[0, 0]), len(runs), int(runs[:, 1].max()), every)
 
 
 def clipped(values: Array, held: NDArray[np.intp] | None = None, low: bool = True) -> list[Rail]:
@@ -350,8 +309,10 @@ def clipped(values: Array, held: NDArray[np.intp] | None = None, low: bool = Tru
     return rails
 
 
-def hum(values: Array, rate: float) -> list[HumLine]:
-    """Find lines of the mains, 50 or 60 Hz, that stand clear of the spectrum within 5 Hz.
+def hum(values: Array, rate: float) -> list[tuple[float, float, float]]:
+    """Return (frequency [Hz], amplitude, share of the power over 20 Hz) of the lines of the mains, 50 or 60 Hz.
+
+    They stand clear of the spectrum within 5 Hz.
 
     Hann-windowed periodogram of the values less their straight line; the amplitude of a line is 2 |X| / sum(w). Clear
     means 10 times the median and 4 times the largest of what lies beside it. Nothing is looked for in under 1.5 s.
@@ -384,7 +345,7 @@ def hum(values: Array, rate: float) -> list[HumLine]:
         beside = (off > max(0.5, 2.5 * rate / count)) & (off <= _HUM_BAND)
         peak, rest = float(amplitudes[near].max(initial=0.0)), amplitudes[beside]
         if rest.size >= 10 and peak > _HUM_OVER_REST * rest.max() and peak > _HUM_OVER_FLOOR * np.median(rest):
-            lines.append(HumLine(mains, peak, min(1.0, peak**2 / 2 / power)))
+            lines.append((mains, peak, min(1.0, peak**2 / 2 / power)))
     return lines
 
 

@@ -23,7 +23,7 @@ from sealscope.diagnosis.verdict.machine import AssumedMachine, assumed_rig
 from sealscope.errors import InputError
 from sealscope.parameters import Rig
 from sealscope.recordings.chambers import CHAMBERS, chambers_of
-from sealscope.recordings.formats.headings.oil_temperature import stated_oil_temperature
+from sealscope.recordings.formats.headings.preamble import stated_oil_temperature
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording

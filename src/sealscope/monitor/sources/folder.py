@@ -18,7 +18,7 @@ from sealscope.monitor.supervisor import DATABASE, PartAway, place_of
 from sealscope.parameters import load_rig
 from sealscope.recordings import Recording, read
 from sealscope.recordings.formats.columns import ChannelMap
-from sealscope.recordings.formats.headings.oil_temperature import stated_oil_temperature
+from sealscope.recordings.formats.headings.preamble import stated_oil_temperature
 
 _log = logging.getLogger(__name__)
 #: Names of files that are still being written.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from sealscope.recordings.channels import LONG_NAMES, Array
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.libraries import library
 from sealscope.recordings.formats.netcdf import attributes
-from sealscope.recordings.formats.table import FORMAT_VERSION, Choose, RawTable, from_text, parse_description
+from sealscope.recordings.formats.table import FORMAT_VERSION, Choose, RawTable, Series, parse_description, table_of
 
 if TYPE_CHECKING:
     import pandas
@@ -23,15 +24,11 @@ if TYPE_CHECKING:
 _PLACE = "data frame"
 
 
-def _pandas() -> Any:
-    return library("pandas", "a data frame", "pandas")
-
-
 def to_pandas(
     values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]
 ) -> pandas.DataFrame:
     """Make a data frame with the index `t [s]` and columns such as `p_A [Pa]`; the description is in its `attrs`."""
-    pandas = _pandas()
+    pandas = library("pandas", "a data frame", "pandas")
     columns = {f"{name} [{units[name]}]": series.copy() for name, series in values.items() if name != "t"}
     frame = pandas.DataFrame(columns, index=pandas.Index(values["t"].copy(), name="t [s]"))
     kept = {key: description[key] for key in ("rate", "provenance", "history")}
@@ -41,7 +38,7 @@ def to_pandas(
 
 def read_pandas(frame: pandas.DataFrame, choose: Choose) -> RawTable:
     """Read the chosen columns of a data frame; an index other than row numbers is a column, too."""
-    pandas = _pandas()
+    pandas = library("pandas", "a data frame", "pandas")
     if not isinstance(frame, pandas.DataFrame):
         raise InputError(f"frame must be a pandas.DataFrame, got a {type(frame).__name__}")
     columns = [(str(name), frame.iloc[:, i]) for i, name in enumerate(frame.columns)]
@@ -50,37 +47,32 @@ def read_pandas(frame: pandas.DataFrame, choose: Choose) -> RawTable:
         columns.append(("t" if index.name is None else str(index.name), index.to_series()))
     units = frame.attrs.get("units")
     units = units if isinstance(units, Mapping) else {}
-    labels = []
-    for name, series in columns:
-        unit = units.get(name, series.attrs.get("units"))
-        elapsed = "s" if pandas.api.types.is_timedelta64_dtype(series.dtype) else None
-        labels.append(Label.parse(name, unit if isinstance(unit, str) else elapsed))
-    choice = choose(labels)
-    arrays = [_values(pandas, columns[i][1], time, labels[i].whole) for i, time in choice.columns]
-    return RawTable("pandas", choice, arrays, _description(frame.attrs))
-
-
-def _description(attrs: Mapping[Any, Any]) -> dict[str, Any] | None:
-    """Return the description that `to_pandas` has left in a frame's `attrs`; None for another frame."""
+    series = []
+    for name, column in columns:
+        unit = units.get(name, column.attrs.get("units"))
+        elapsed = "s" if pandas.api.types.is_timedelta64_dtype(column.dtype) else None
+        label = Label.parse(name, unit if isinstance(unit, str) else elapsed)
+        series.append(Series("", label, len(frame), partial(_values, pandas, column, name)))
     try:
-        return parse_description(json.dumps({"format": FORMAT_VERSION, **attrs}), _PLACE)
-    except (InputError, ValueError, TypeError, RecursionError):
-        return None
+        own = parse_description(json.dumps({"format": FORMAT_VERSION, **frame.attrs}), _PLACE)
+    except (InputError, ValueError, TypeError, RecursionError):  # it is not of our making
+        own = None
+    return table_of(series, choose, "pandas", _PLACE, own=own)
 
 
-def _values(pandas: Any, series: Any, time: bool, name: str) -> NDArray[Any]:
+def _values(pandas: Any, series: Any, name: str) -> NDArray[Any]:
     types = pandas.api.types
-    if types.is_timedelta64_dtype(series.dtype):
-        return np.asarray(series.dt.total_seconds(), dtype=np.float64)
-    if time and types.is_datetime64_any_dtype(series.dtype):
+    if types.is_datetime64_any_dtype(series.dtype):
         if getattr(series.dtype, "tz", None) is not None:
             series = series.dt.tz_convert("UTC").dt.tz_localize(None)
         return np.asarray(series.to_numpy().astype("datetime64[ns]"))
+    if types.is_timedelta64_dtype(series.dtype):
+        return np.asarray(series.to_numpy())
     if types.is_numeric_dtype(series.dtype) and not types.is_complex_dtype(series.dtype):
         return np.asarray(series.to_numpy(dtype=np.float64, na_value=np.nan))
     if types.is_string_dtype(series.dtype) or types.is_object_dtype(series.dtype):
         cells = ["" if missing else str(cell) for cell, missing in zip(series, series.isna(), strict=True)]
-        return from_text(cells, time, name, _PLACE)
+        return np.array(cells, dtype=object)
     raise InputError(f"{name} must hold numbers, got the type {series.dtype} ({_PLACE})")
 
 

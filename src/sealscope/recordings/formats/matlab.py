@@ -7,18 +7,24 @@ from __future__ import annotations
 
 import struct
 import warnings
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from sealscope.errors import UnreadableFile
+from sealscope.recordings.channels import Array
+from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.preamble import stated_rate
 from sealscope.recordings.formats.libraries import library
 from sealscope.recordings.formats.netcdf import refuse_elsewhere
-from sealscope.recordings.formats.series import table_of
-from sealscope.recordings.formats.structured.streams import STREAMS, streamed_series
 from sealscope.recordings.formats.structured.tree import number_of, series_in
-from sealscope.recordings.formats.table import MAX_VALUES, Choose, RawTable
+from sealscope.recordings.formats.table import MAX_VALUES, Choose, RawTable, Series, table_of, uniform
+
+#: Group of the streams, by which such a file is known; what refers to them.
+_STREAMS, _REFERENCES = "#sigstream#", "#refs#"
 
 
 def is_matlab_4(head: bytes) -> bool:
@@ -66,10 +72,10 @@ def _streamed(path: Path, choose: Choose, place: str) -> RawTable | None:
     if not h5py.is_hdf5(path):
         return None
     with h5py.File(path, "r") as file:
-        if STREAMS not in file:
+        if _STREAMS not in file:
             return None
         _refuse_elsewhere(path, place)
-        return table_of(list(streamed_series(file)), choose, "MATLAB", place)
+        return table_of(list(_streamed_series(file)), choose, "MATLAB", place)
 
 
 def _refuse_elsewhere(path: Path, place: str) -> None:
@@ -91,3 +97,35 @@ def _refuse_elsewhere(path: Path, place: str) -> None:
                         folders.append(item)
                     elif isinstance(item, h5py.Dataset):
                         refuse_elsewhere(name, item, place)
+
+
+def _streamed_series(file: Any) -> Iterator[Series]:
+    """Yield the signals of doubles of an open HDF5 file that has `_STREAMS`.
+
+    `Values/DataR2` of a signal is the number of its stream, `Values/CompressedTime` first time, step and count.
+    """
+    import h5py
+
+    for item in file.get(_REFERENCES, {}).values():
+        values = item.get("Values") if isinstance(item, h5py.Group) else None
+        if not isinstance(values, h5py.Group) or not {"DataR2", "CompressedTime"} <= set(values):
+            continue
+        number, times = np.ravel(values["DataR2"][()]), np.ravel(values["CompressedTime"][()])
+        stream = file.get(f"{_STREAMS}/{number[0]:.0f}") if number.size == 1 else None
+        if stream is None or times.size != 3 or stream["#sampleSize#"][0] != np.dtype(np.float64).itemsize:
+            continue
+        data, count = stream["#data#"], int(stream["#length#"][0])
+        name, unit = (_utf16(item.get(path)) for path in ("Name", "Values/DataUnits/Value"))
+        clock = uniform("stream", count, float(times[1]), float(times[0]))
+        yield Series("", Label.parse(name.strip("<>"), unit or None), count, partial(_doubles, data, count), clock)
+
+
+def _utf16(characters: Any) -> str:
+    """Return a MATLAB text, which is an array of UTF-16; empty where there is none."""
+    if characters is None or characters.dtype != np.uint16:
+        return ""
+    return np.ravel(characters[()]).tobytes().decode("utf-16-le", errors="replace")
+
+
+def _doubles(data: Any, count: int) -> Array:
+    return np.frombuffer(data[: count * np.dtype(np.float64).itemsize].tobytes(), dtype=np.float64, count=count)

@@ -15,8 +15,7 @@ from sealscope.recordings.channels import Array
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.preamble import entries
 from sealscope.recordings.formats.libraries import library
-from sealscope.recordings.formats.series import Clock, Series, table_of
-from sealscope.recordings.formats.table import MOST_WORDS, Choose, RawTable
+from sealscope.recordings.formats.table import MOST_WORDS, Choose, Clock, RawTable, Series, table_of
 
 
 def read_mdf(path: Path, choose: Choose) -> RawTable:
@@ -31,7 +30,7 @@ def read_mdf(path: Path, choose: Choose) -> RawTable:
         for number, group in enumerate(groups):
             count = int(group.channel_group.cycles_nr)
             master = file.masters_db.get(number)
-            clock = None if master is None else Clock(number, partial(_seconds, file, number), start)
+            clock = None if master is None else Clock(number, partial(_seconds, file, number, start))
             name = str(getattr(group.channel_group, "comment", "") or "").strip() or f"group {number + 1}"
             for index, channel in enumerate(group.channels):
                 if index != master:
@@ -67,8 +66,8 @@ def _values(file: Any, group: int, index: int) -> NDArray[Any]:
     return np.where(named, np.nan, numbers)
 
 
-def _seconds(file: Any, group: int) -> Array:
-    return np.asarray(file.get_master(group), dtype=np.float64)
+def _seconds(file: Any, group: int, start: np.datetime64 | None) -> tuple[Array, np.datetime64 | None]:
+    return np.asarray(file.get_master(group), dtype=np.float64), start
 
 
 def _start(file: Any) -> np.datetime64 | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from io import BytesIO
 from pathlib import Path
@@ -16,15 +17,15 @@ from sealscope.errors import UnreadableFile
 from sealscope.recordings.channels import LONG_NAMES, Array
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.preamble import entries, stated_rate
-from sealscope.recordings.formats.series import Series, table_of
 from sealscope.recordings.formats.table import (
     FORMAT_VERSION,
     Choose,
     RawTable,
+    Series,
     check_size,
     check_texts,
-    from_text,
     parse_description,
+    table_of,
 )
 
 #: Most values that stand for a missing sample: the CF conventions know one, a few tools write two.
@@ -37,68 +38,37 @@ _ORDER = {name: place for place, name in enumerate(LONG_NAMES)}
 
 
 def read_netcdf(path: Path, choose: Choose) -> RawTable:
-    """Read the chosen one-dimensional data sets of a NetCDF-4 or HDF5 file, of all its groups."""
+    """Read the chosen one-dimensional data sets, and fields of tables, of all groups of a NetCDF-4 or HDF5 file."""
     import h5py
 
     place = str(path)
     with h5py.File(path, "r") as file:
-        if OWN not in file.attrs:
-            return _foreign(file, choose, place)
         names: list[str] = []
         file.visititems(lambda name, item: names.append(name) if _is_series(item) else None)
         names.sort(key=lambda name: (name.count("/"), _ORDER.get(name, len(_ORDER)), name))
-        choice = choose([_label(name, file[name]) for name in names])
-        chosen = [(names[column], file[names[column]]) for column, _ in choice.columns]
-        first, data = chosen[-1]
-        for name, other in reversed(chosen[:-1]):
-            if other.shape != data.shape:
-                raise UnreadableFile(
-                    f"{name} must have as many samples as {first} ({data.size}), got {other.size} ({place})"
-                )
-        for name, data in chosen:
-            refuse_elsewhere(name, data, place)
-        check_size(data.size, len(chosen), place)
-        columns = [
-            _values(data, name, time, place) for (_, time), (name, data) in zip(choice.columns, chosen, strict=True)
-        ]
-        description = _description(file, place)
-        return RawTable("NetCDF" if "_NCProperties" in file.attrs else "HDF5", choice, columns, description)
-
-
-def _foreign(file: Any, choose: Choose, place: str) -> RawTable:
-    """Read a file that others wrote: the data sets of all its groups, and the fields of its tables."""
-    names: list[str] = []
-    file.visititems(lambda name, item: names.append(name) if _is_series(item) else None)
-    names.sort(key=lambda name: (name.count("/"), _ORDER.get(name, len(_ORDER)), name))
-    series = []
-    for name in names:
-        data = file[name]
-        group, _, leaf = name.rpartition("/")
-        if data.dtype.names:
+        series = []
+        for name in names:
+            data = file[name]
+            group, _, leaf = name.rpartition("/")
+            if not data.dtype.names:
+                series.append(Series(group, _label(leaf, data), data.size, partial(_values, data, name, place)))
+                continue
             series += [
                 Series(name, Label.parse(field), data.size, partial(_field, data, name, field, place))
                 for field in data.dtype.names
                 if data.dtype[field].kind in "fiub"
             ]
-            continue
-        label = _label(leaf, data)
-        series.append(Series(group, label, data.size, partial(_checked, data, name, place)))
-    about = entries((name, text) for name, value in file.attrs.items() if (text := _text(value)) is not None)
-    kind = "NetCDF" if "_NCProperties" in file.attrs else "HDF5"
-    return table_of(series, choose, kind, place, rate=stated_rate(about))
+        pairs = () if OWN in file.attrs else file.attrs.items()
+        about = entries((name, text) for name, value in pairs if (text := _text(value)) is not None)
+        kind = "NetCDF" if "_NCProperties" in file.attrs else "HDF5"
+        table = table_of(series, choose, kind, place, rate=stated_rate(about))
+        return replace(table, description=_description(file, place))
 
 
 def _field(data: Any, name: str, field: str, place: str) -> NDArray[Any]:
     refuse_elsewhere(name, data, place)
     check_size(data.size, len(data.dtype.names), place)
     return np.asarray(data[field], dtype=np.float64)
-
-
-def _checked(data: Any, name: str, place: str) -> NDArray[Any]:
-    refuse_elsewhere(name, data, place)
-    if data.dtype.kind in "OSU":
-        return np.array(_texts(data, name, place), dtype=object)
-    return _values(data, name, False, place)
 
 
 def _is_series(item: Any) -> bool:
@@ -135,10 +105,11 @@ def _label(name: str, data: Any) -> Label:
     return Label(name, label.name, label.unit)
 
 
-def _values(data: Any, name: str, time: bool, place: str) -> NDArray[Any]:
-    """Read a data set as doubles (or, for time, stamps), with scale, offset and fill value of the CF conventions."""
+def _values(data: Any, name: str, place: str) -> NDArray[Any]:
+    """Read a data set as doubles, with scale, offset and fill value of the CF conventions, or as texts."""
+    refuse_elsewhere(name, data, place)
     if data.dtype.kind in "OSU":
-        return from_text(_texts(data, name, place), time, name, place)
+        return np.array(_texts(data, name, place), dtype=object)
     if data.dtype.kind not in "fiub":
         raise UnreadableFile(f"{name} must hold numbers, got the type {data.dtype} ({place})")
     raw = data[...]

@@ -9,30 +9,24 @@ from __future__ import annotations
 import datetime as dt
 import tempfile
 import zipfile
-from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from sealscope.errors import UnreadableFile
 from sealscope.recordings.formats.columns import listed
 from sealscope.recordings.formats.libraries import library
-from sealscope.recordings.formats.structured.logs import read_text
-from sealscope.recordings.formats.structured.sheets import joined_sheets
 from sealscope.recordings.formats.table import Choose, RawTable, check_size
+from sealscope.recordings.formats.text import read_text
 from sealscope.storage.unpacking import check_unpacked, most_unpacked
 
-#: Most sheets that are looked at for more of a run.
-_MOST_SHEETS = 32
 _CHUNK = 2**20
 
 
 def read_spreadsheet(path: Path, choose: Choose) -> RawTable:
     """Read the chosen columns of the first sheet that holds them: hidden sheets last, those with most rows first.
 
-    Visible sheets that belong to its run are joined. Raises MissingExtra where python-calamine is absent, and what the
-    largest sheet lacks where no sheet holds a log.
+    Raises MissingExtra where python-calamine is absent, and what the largest sheet lacks where no sheet holds a log.
     """
     place = str(path)
     _check_members(path)
@@ -41,30 +35,18 @@ def read_spreadsheet(path: Path, choose: Choose) -> RawTable:
     hidden = {member.name for member in workbook.sheets_metadata if not str(member.visible).endswith(".Visible")}
     sheets = [sheet for sheet in sheets if sheet.total_height]
     sheets.sort(key=lambda sheet: (sheet.name in hidden, -sheet.total_height))
-    if not sheets:
-        raise UnreadableFile(f"a workbook must have a sheet with rows, got none ({place})")
-    reason: UnreadableFile | None = None
-    tables: list[tuple[str, RawTable]] = []
-    for sheet in sheets:
-        if tables and (sheet.name in hidden or len(tables) == _MOST_SHEETS):
-            break
+    reason = UnreadableFile(f"a workbook must have a sheet with rows, got none ({place})")
+    for number, sheet in enumerate(sheets):
         check_size(sheet.total_height, sheet.total_width, place)
         try:
-            tables.append((sheet.name, _read_sheet(sheet, choose, place)))
+            table = _read_sheet(sheet, choose, place)
         except UnreadableFile as error:
-            reason = reason or error
-    if tables:
-        table, used = joined_sheets(tables, place)
-    else:
-        assert reason is not None
-        table, used = _shared_map([sheet for sheet in sheets if sheet.name not in hidden], choose, place, reason)
-    others = [name for name in workbook.sheet_names if name not in used]
-    notes = (
-        (f"{'sheet' if len(used) == 1 else 'sheets'} {listed(used, 8)} read, not {listed(others, 4)}",)
-        if others
-        else ()
-    )
-    return replace(table, kind="spreadsheet", notes=(*notes, *table.notes))
+            reason = reason if number else error
+            continue
+        others = [name for name in workbook.sheet_names if name != sheet.name]
+        notes = (f"sheet {sheet.name} read, not {listed(others, 4)}",) if others else ()
+        return replace(table, kind="spreadsheet", notes=(*notes, *table.notes))
+    raise reason
 
 
 def _check_members(path: Path) -> None:
@@ -81,30 +63,6 @@ def _check_members(path: Path) -> None:
             with archive.open(member) as file:
                 while file.read(_CHUNK):
                     pass
-
-
-def _shared_map(
-    sheets: Sequence[Any], choose: Choose, place: str, reason: UnreadableFile
-) -> tuple[RawTable, tuple[str, ...]]:
-    """Return the table of sheets that hold the columns of a map together, and their names.
-
-    Raises `reason` where no sheet holds any, and UnreadableFile where a column is in none of one time.
-    """
-    tables = []
-    for sheet in sheets[:_MOST_SHEETS] if len(sheets) > 1 else ():
-        try:
-            tables.append((sheet.name, _read_sheet(sheet, partial(choose, some=True), place)))
-        except UnreadableFile:
-            continue
-    if not tables:
-        raise reason
-    table, used = joined_sheets(tables, place)
-    lost = [name for name in tables[0][1].choice.missing if name not in (*table.choice.channels, "t")]
-    if lost:
-        raise UnreadableFile(
-            f"mapped columns must be in sheets of one time, got none for {', '.join(lost)} in {listed(used)} ({place})"
-        )
-    return table, used
 
 
 def _read_sheet(sheet: Any, choose: Choose, place: str) -> RawTable:

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.preamble import entries, stated_rate
 from sealscope.recordings.formats.libraries import library
-from sealscope.recordings.formats.series import Clock, Series, table_of, uniform
-from sealscope.recordings.formats.table import Choose, RawTable
+from sealscope.recordings.formats.table import Choose, Clock, RawTable, Series, table_of, uniform
 
 _UNITS = ("unit_string", "NI_UnitDescription", "units", "unit", "Unit")
 

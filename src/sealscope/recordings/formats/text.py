@@ -1,15 +1,19 @@
-"""Text logs: Sealscope's own CSV, and those that other people's loggers write."""
+"""Text logs: Sealscope's own CSV, and those that other people's loggers write.
+
+A log is read in blocks of whole lines. A block that is a plain rectangle of numbers is read by pyarrow, where it is
+installed, any other one row by row.
+"""
 
 from __future__ import annotations
 
 import csv
 import json
-import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.util import find_spec
+from math import isnan
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -18,9 +22,23 @@ from numpy.typing import NDArray
 
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import Array
-from sealscope.recordings.formats.columns import ColumnMap, counted
+from sealscope.recordings.formats.columns import counted
+from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.preamble import exported_from
+from sealscope.recordings.formats.headings.proposal import is_time
 from sealscope.recordings.formats.headings.quantities import plain_cells
-from sealscope.recordings.formats.table import MOST_WORDS, Choose, RawTable, check_size, parse_description
+from sealscope.recordings.formats.table import (
+    MOST_WORDS,
+    Choose,
+    Clock,
+    RawTable,
+    Series,
+    check_size,
+    check_texts,
+    parse_description,
+    seconds_of_series,
+    table_of,
+)
 from sealscope.recordings.formats.text_layout import (
     COMMENTS,
     MISSING,
@@ -33,9 +51,10 @@ from sealscope.recordings.formats.text_layout import (
     layout_of,
     ungrouped,
 )
-from sealscope.recordings.timebase import is_stamp, stamps
+from sealscope.recordings.formats.timebase import is_stamp, stamps
 
-_CHUNK = 8 * 1024 * 1024
+#: Bytes that are read at a time, which fit a processor's cache, and of the longest line.
+_CHUNK, _LONGEST_LINE = 2**19, 2**23
 #: Logs of so many bytes are worth the import of pyarrow.
 _LARGE = 2**20
 #: Signs that begin quoted cells and comments.
@@ -43,56 +62,111 @@ _MARKS = (b'"', b"#", b"%", b"/", b"!")
 _LONGEST_OWN_LINE = 64 * 1024 * 1024
 _ROWS_WRITTEN_AT_ONCE = 8192
 #: Most lines of text among the samples, however few these are: marks of events, a summary at the end.
-_MOST_REMARKS = 8
+_MOST_REMARKS, _LONGEST_REMARK = 8, 400
 _STAMP_RULE = "time must be a stamp such as 2024-05-31T12:00:00.002"
-_LONGEST_REMARK = 400
 _HALF_A_NUMBER = re.compile(r"[\s+\-\d.,:TeE]{0,40}")
+#: The number of a column of times: `t.1` of pandas, `Time 2 - slow` of catman.
+_NUMBER = re.compile(r"[\s._(-]{0,4}\d{1,4}\b.{0,60}")
+#: Rows as cells, or as numbers (n, k) of the columns asked for.
+_Rows = list[list[str]] | NDArray[np.float64]
 
 
-def read_table(path: Path, choose: Choose, layout: Layout) -> RawTable:
-    """Read the chosen columns of a text log of one table."""
-    place = str(path)
-    choice = choose(layout.labels, layout.rate)
-    taken, loose = _Columns(layout, choice, place), _Loose()
-    with path.open("rb") as file:
-        for rows, numbers, cut in _row_blocks(file, layout, choice, place, loose):
-            taken.take(rows, numbers, cut)
-    return _table(layout, taken, loose.notes(taken.total))
+def read_text(path: Path, choose: Choose) -> RawTable:
+    """Read the chosen columns of a text log: a table with one time, or a time for each channel, or a long table."""
+    place, layout = str(path), look_at(path)
+    own = None if layout.own is None else parse_description(layout.own, place)
+    held: dict[int, NDArray[Any]] = {}
+    times = _times_of_channels(layout.labels)
+    table = partial(table_of, choose=choose, kind=layout.kind, place=place, about=layout.about, rate=layout.rate)
+
+    def prepare(wanted: Sequence[tuple[int, str]], date: int | None) -> Sequence[str]:
+        log = _Log(path, layout, wanted, date)
+        for rows, numbers, cut in log.blocks():
+            log.take(rows, numbers, cut)
+        columns, notes = log.finish()
+        held.update(zip((column for column, _ in wanted), columns, strict=True))
+        return [*layout.notes, *notes, *log.remarks_and_headings(len(columns[0]))]
+
+    def series(column: int, clock: Clock | None = None) -> Series:
+        return Series("", layout.labels[column], 0, partial(held.__getitem__, column), clock)
+
+    if times:
+        values = [column for column in range(len(layout.labels)) if column not in times]
+        owner = {column: max(time for time in times if time < column) for column in values}
+        start = exported_from(layout.about)
+
+        def prepare_each(wanted: Sequence[tuple[int, str]], date: int | None) -> Sequence[str]:
+            columns = {values[column]: kind for column, kind in wanted}
+            read = {owner[column]: "time" for column in columns}
+            notes = prepare([*columns.items(), *read.items()], None)
+            return [*notes, f"{len(read)} columns of times, one for each channel"]
+
+        clocks = {time: Clock(time, partial(seconds_of_series, series(time), start)) for time in times}
+        each = [series(column, clocks[owner[column]]) for column in values]
+        try:
+            return table(each, prepare=prepare_each)
+        except InputError:
+            try:
+                choose(layout.labels, layout.rate)
+            except InputError:
+                pass
+            else:
+                times = []
+            if times:
+                raise
+    return table([series(column) for column in range(len(layout.labels))], own=own, prepare=prepare)
+
+
+def _times_of_channels(labels: Sequence[Label]) -> list[int]:
+    """Return the columns of times of a table in which each channel, or group of channels, follows its own; else none.
+
+    They bear one name, but for a number at its end.
+    """
+    names = [_NUMBER.sub("", label.name.casefold()) for label in labels]
+    if names.count(names[0]) < 2 or not is_time(labels[0]):
+        return []
+    times = [column for column, label in enumerate(labels) if is_time(label)]
+    apart = all(after - before > 1 for before, after in zip(times, [*times[1:], len(labels)], strict=True))
+    return times if len({names[column] for column in times}) == 1 and len(times) > 1 and apart else []
 
 
 def read_text_parts(path: Path, choose: Choose, rows_of: Callable[[RawTable], int]) -> Iterator[RawTable]:
     """Yield the chosen columns of a text log part by part, in bounded memory.
 
-    `rows_of`: returns how many rows a part shall have, from the beginning of the log.
+    `rows_of`: returns how many rows a part shall have, from the beginning of the log. Where the log has several clocks
+    or is a long table, the whole of it is the only part.
     """
-    place = str(path)
     layout = look_at(path)
-    choice = choose(layout.labels, layout.rate)
-    taken, loose, size, total = _Columns(layout, choice, place), _Loose(), 0, 0
-    with path.open("rb") as file:
-        for block, numbers, cut in _row_blocks(file, layout, choice, place, loose):
-            if not size:
-                beginning = _Columns(layout, choice, place)
-                beginning.take(block, numbers, cut)
-                size = rows_of(_table(layout, beginning, []))
-            first = 0
-            while first < len(block):
-                last = min(len(block), first + size - taken.total)
-                taken.take(block[first:last], numbers[first:last], cut and last == len(block))
-                total, first = total + last - first, last
-                if taken.total == size:
-                    yield _table(layout, taken, [])
-                    taken = _Columns(layout, choice, place)
-    notes = loose.notes(total)
-    if taken.total or not total:
-        yield _table(layout, taken, notes)
+    try:
+        choice = choose(layout.labels, layout.rate)
+    except InputError:
+        choice = None
+    if choice is None or _times_of_channels(layout.labels):
+        yield read_text(path, choose)
+        return
+    wanted = [(column, "time" if time else "numbers") for column, time in choice.columns]
+    own = None if layout.own is None else parse_description(layout.own, str(path))
+    log, size, total = _Log(path, layout, wanted, choice.date), 0, 0
 
+    def part(source: _Log, more: Sequence[str] = ()) -> RawTable:
+        columns, notes = source.finish()
+        return RawTable(layout.kind, choice, columns, own, (*layout.notes, *notes, *more), layout.about)
 
-def _table(layout: Layout, taken: _Columns, notes: Sequence[str]) -> RawTable:
-    """Return the table of the columns taken; `notes`: more lines for the history."""
-    columns, own = taken.finish()
-    description = None if layout.own is None else parse_description(layout.own, taken.place)
-    return RawTable(layout.kind, taken.choice, columns, description, (*layout.notes, *own, *notes), layout.about)
+    for block, numbers, cut in log.blocks():
+        if not size:
+            beginning = _Log(path, layout, wanted, choice.date)
+            beginning.take(block, numbers, cut)
+            size = rows_of(part(beginning))
+        first = 0
+        while first < len(block):
+            last = min(len(block), first + size - log.total)
+            log.take(block[first:last], numbers[first:last], cut and last == len(block))
+            total, first = total + last - first, last
+            if log.total == size:
+                yield part(log)
+    notes = log.remarks_and_headings(total)
+    if log.total or not total:
+        yield part(log, notes)
 
 
 def look_at(path: Path) -> Layout:
@@ -105,20 +179,273 @@ def look_at(path: Path) -> Layout:
         encoding = encoding_of(head)
         if encoding is None:
             raise UnreadableFile(f"a recording must be text, NetCDF, HDF5 or Parquet, got other binary data ({place})")
-        if head.startswith(OWN_MARK.encode()):
-            head += _own_line(file, head)
+        while head.startswith(OWN_MARK.encode()) and b"\n" not in head[:-SNIFF] and len(head) < _LONGEST_OWN_LINE:
+            if not (data := file.read(SNIFF)):  # our first line may be long
+                break
+            head += data
         return layout_of(head, encoding, len(file.read(1)) == 0, place)
 
 
-def _own_line(file: BinaryIO, head: bytes) -> bytes:
-    """Read the rest of a long first line of our own, and as much after it as is needed to see the layout."""
-    more = b""
-    while b"\n" not in head and b"\n" not in more and len(more) < _LONGEST_OWN_LINE:
-        data = file.read(SNIFF)
-        if not data:
-            return more
-        more += data
-    return more + file.read(SNIFF) if more else b""
+@dataclass
+class _Words:
+    """Cells that hold a word in place of a number (`OVERLOAD`), or lines of words.
+
+    `count`, `first`, `where`: how many, the first and its place; `at`: their rows.
+    """
+
+    rule: str = "a sample must be a number"
+    count: int = 0
+    first: str = ""
+    where: str = ""
+    at: list[int] = field(default_factory=list)
+
+    def add(self, text: str, where: str, row: int = 0) -> None:
+        if not self.count:
+            self.first, self.where = text[:40], where
+        self.count += 1
+        self.at.append(row)
+
+    def note(self, what: str, most: float) -> list[str]:
+        """Return a line for the history, where there are any; raise UnreadableFile where there are more than `most`."""
+        if self.count > most:
+            raise UnreadableFile(f"{self.rule}, got {self.first!r} {self.where}")
+        return [f"{what}, first {self.first!r} {self.where}"] if self.count else []
+
+
+class _Log:
+    """The rows of a text log, and the columns of those taken so far.
+
+    `columns`: (column, kind) as `Prepare` has them; `date`: the column of the date beside a time of the day.
+    """
+
+    def __init__(self, path: Path, layout: Layout, columns: Sequence[tuple[int, str]], date: int | None) -> None:
+        self.path, self.layout, self.columns, self.date, self.place = path, layout, columns, date, str(path)
+        self.least = max(column for column, _ in columns) + 1
+        self.remarks, self.repeated = _Words(), 0
+        plain = layout.encoding in ("utf-8", "utf-8-sig", "cp1252") and layout.delimiter != " "
+        numbers = not layout.cell_units and all(kind != "texts" for _, kind in columns)
+        self.fast = plain and numbers and path.stat().st_size >= _LARGE and find_spec("pyarrow") is not None
+        self.stamped: bool | None = None
+        self.dated = False
+        self._begin()
+
+    def _begin(self) -> None:
+        self.total = 0
+        self.parts: list[list[NDArray[Any]]] = [[] for _ in self.columns]
+        self.words = [_Words() for _ in self.columns]
+
+    def blocks(self) -> Iterator[tuple[_Rows, Sequence[int], bool]]:
+        """Yield blocks of rows, their lines' numbers, and whether the last one was not written whole."""
+        layout, usual, first = self.layout, 0, True
+        with self.path.open("rb") as file:
+            for number, block, cut in _blocks(file, layout.encoding, self.place):
+                if self.fast and not cut:
+                    values = self._plain(number, block)
+                    self.fast, first = values is not None or not first, False
+                    if values is not None:
+                        usual = self.width
+                        yield values, range(number, number + len(values)), False
+                        continue
+                lines = _lines(block, layout)
+                kept = self._samples(lines, max(0, layout.first_row + 1 - number))
+                if not kept:
+                    continue
+                numbers: Sequence[int] = [number + i for i in kept]
+                rows = self._cells([lines[i] for i in kept], numbers, cut)
+                if cut and len(rows[-1]) < usual and _HALF_A_NUMBER.fullmatch(rows[-1][-1]):
+                    # a last line without an end was not written whole: half a number and what follows it are missing
+                    rows[-1] = [*rows[-1][:-1], *[""] * (self.least - len(rows[-1]) + 1)]
+                usual = len(rows[-1])
+                rows, numbers = self._checked(rows, numbers)
+                if rows:
+                    yield rows, numbers, cut
+
+    def _plain(self, number: int, block: bytes) -> NDArray[np.float64] | None:
+        """Return the columns (n, k) of a block from line `number` on; None where a row is no row of plain numbers."""
+        from pyarrow import ArrowInvalid, csv, float64, py_buffer
+
+        layout, columns, start = self.layout, [column for column, _ in self.columns], 0
+        for _ in range(max(0, layout.first_row + 1 - number)):
+            start = block.find(b"\n", start) + 1
+        self.width = width = block.count(layout.delimiter.encode(), start, block.find(b"\n", start)) + 1
+        if any(block.find(mark, start) >= 0 for mark in _MARKS) or not self.least <= width <= len(layout.labels):
+            return None
+        if b"\r" in block and block.count(b"\r") != block.count(b"\r\n"):
+            return None
+        names = [str(column) for column in range(width)]
+        try:
+            table = csv.read_csv(
+                py_buffer(block).slice(start),
+                csv.ReadOptions(column_names=names, block_size=len(block)),
+                csv.ParseOptions(delimiter=layout.delimiter, quote_char=False),
+                csv.ConvertOptions(
+                    include_columns=[names[column] for column in columns],
+                    column_types={names[column]: float64() for column in columns},
+                    null_values=["NaN", *MISSING],
+                    decimal_point=layout.decimal,
+                ),
+            )
+        except ArrowInvalid:
+            return None
+        values = np.empty((table.num_rows, len(columns)), order="F")
+        for index, column in enumerate(table.columns):
+            values[:, index] = column.to_numpy()
+        return None if np.isinf(values).any() else values
+
+    def _samples(self, lines: Sequence[str], first: int) -> list[int]:
+        """Return the indices of the lines from `first` on that are no comments, blank or repeated headings."""
+        blank = " " if self.layout.delimiter == "\t" else None  # tabs alone are a row of missing samples
+        kept = [
+            i for i in range(first, len(lines)) if lines[i].strip(blank) and not lines[i].lstrip().startswith(COMMENTS)
+        ]
+        own = [i for i in kept if lines[i].strip() not in self.layout.above] if self.layout.above else kept
+        self.repeated += len(kept) - len(own)
+        return own
+
+    def _cells(self, lines: list[str], numbers: Sequence[int], cut: bool) -> list[list[str]]:
+        """Split lines into cells; a quotation mark must be closed on its line, but on one that was `cut` short."""
+        delimiter = self.layout.delimiter
+        if delimiter == " ":
+            return [blank_cells(line) for line in lines]
+        if not any('"' in line for line in lines):
+            return [line.split(delimiter) for line in lines]
+        reader = csv.reader([*lines, ""], delimiter=delimiter, skipinitialspace=True)
+        rows: list[list[str]] = []
+        for line, row in enumerate(reader):
+            if reader.line_num > line + 1:  # the line goes on in the next
+                if cut and line == len(lines) - 1:
+                    return [*rows, [*row[:-1], ""]]
+                raise UnreadableFile(
+                    f"a quotation mark must be closed on its line, got an open one (line {numbers[line]}, {self.place})"
+                )
+            rows.append(row)
+        return rows[:-1]
+
+    def _checked(self, rows: list[list[str]], numbers: Sequence[int]) -> tuple[list[list[str]], Sequence[int]]:
+        """Return rows and their numbers without short ones of words, which are counted.
+
+        Raises UnreadableFile for rows with too few cells, and with more than the header and not empty.
+        """
+        layout, most, kept = self.layout, len(self.layout.labels), []
+        if min(map(len, rows)) >= self.least and max(map(len, rows)) <= most:
+            return rows, numbers
+        for i, row in enumerate(rows):
+            short = len(row) < self.least
+            valued = sum(map(len, row)) > _LONGEST_REMARK or any(
+                is_number(cell, layout.decimal) or is_stamp(cell) for cell in (row if short else ())
+            )
+            if short and not valued:
+                self.remarks.add(layout.delimiter.join(row), f"(line {numbers[i]}, {self.place})")
+            elif short or any(cell.strip() for cell in row[most:]):
+                raise UnreadableFile(
+                    f"a row must have {counted(most, 'cell')}, got {len(row)} (line {numbers[i]}, {self.place})"
+                )
+            else:
+                kept.append(i)
+        return [rows[i] for i in kept], [numbers[i] for i in kept]
+
+    def take(self, rows: _Rows, numbers: Sequence[int], cut: bool) -> None:
+        """Read more rows; `cut`: whether the last one was not written whole."""
+        before, self.total = self.total, self.total + len(rows)
+        check_size(self.total, len(self.columns), self.place)
+        if isinstance(rows, np.ndarray):
+            self.stamped = False
+            for part, values in zip(self.parts, rows.T, strict=True):
+                part.append(values)
+            return
+        for part, words, (column, kind) in zip(self.parts, self.words, self.columns, strict=True):
+            cells = [row[column] for row in rows]
+            where = partial(self._place_of, numbers=numbers, column=column)
+            if unit := self.layout.cell_units.get(column):
+                cells = plain_cells(cells, unit, cut, where)
+            if kind == "texts":
+                check_texts(self.total, max(map(len, cells)), self.layout.labels[column].whole, self.place)
+                part.append(np.array(cells, dtype=object))
+            elif kind == "time" and self._is_stamped(cells, rows):
+                if self.dated and self.date is not None:
+                    days = [row[self.date].strip() for row in rows]
+                    cells = [f"{day} {cell.strip()}" if cell.strip() else "" for day, cell in zip(days, cells)]  # noqa: B905
+                part.append(self._dates(cells, where, words, before))
+            else:
+                part.append(self._numbers(cells, where, None if kind == "any" else words, before))
+
+    def _is_stamped(self, cells: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
+        """Return whether the time holds stamps, by its first cell; it may be a time of the day beside a date."""
+        if self.stamped is None:
+            index = next((i for i, cell in enumerate(cells) if cell.strip().lower() not in MISSING), 0)
+            self.stamped = not is_number(cells[index], self.layout.decimal) and is_stamp(cells[index])
+            day = rows[index][self.date] if self.date is not None and self.date < len(rows[index]) else ""
+            self.dated = self.stamped and ":" in cells[index][:3] and is_stamp(day) and ":" not in day
+        return self.stamped
+
+    def _place_of(self, index: int, numbers: Sequence[int], column: int) -> str:
+        return f"(line {numbers[index]}, column {self.layout.labels[column].whole}, {self.place})"
+
+    def _dates(
+        self, cells: list[str], where: Callable[[int], str], words: _Words, before: int
+    ) -> NDArray[np.datetime64]:
+        texts = ["" if cell.strip().lower() in MISSING else cell for cell in cells]
+        try:
+            return stamps(texts)
+        except ValueError:
+            for index, text in enumerate(texts):
+                if text.strip() and not is_stamp(text) and not any(sign.isdigit() for sign in text):
+                    words.rule = _STAMP_RULE
+                    words.add(text.strip(), where(index), before + index)
+                    texts[index] = ""
+        try:
+            return stamps(texts)
+        except ValueError as error:
+            bad = int(error.args[0])
+            raise UnreadableFile(f"{_STAMP_RULE}, got {cells[bad]!r} {where(bad)}") from None
+
+    def _numbers(self, cells: list[str], where: Callable[[int], str], words: _Words | None, before: int) -> Array:
+        """Read cells as doubles, missing ones as NaN; an infinite one is refused, words are counted and missing."""
+        decimal = self.layout.decimal
+        texts = [cell.replace(".", "?").replace(",", ".") for cell in cells] if decimal == "," else cells
+        try:
+            if any("_" in text for text in texts):  # Python takes 1_000 for a number
+                raise ValueError
+            values = np.fromiter(map(float, texts), np.float64, len(texts))
+        except ValueError:
+            values = np.fromiter((_number(cell, decimal) for cell in cells), np.float64, len(cells))
+        for index in np.flatnonzero(~np.isfinite(values)).tolist():
+            shown = cells[index].strip()
+            if shown.lower() not in MISSING:
+                if is_number(shown, decimal):
+                    raise UnreadableFile(f"a sample must be a finite number, got {shown[:40]!r} {where(index)}")
+                if words is None:
+                    values[index] = np.inf  # no number is, that may stand in a log
+                else:
+                    words.add(shown, where(index), before + index)
+        return values
+
+    def finish(self) -> tuple[list[NDArray[Any]], list[str]]:
+        """Return the columns taken, and lines for the history; what is taken from now on begins anew."""
+        labels, dates, notes = self.layout.labels, self.date, list[str]()
+        no_time = self.words[-1].at if self.columns[-1][1] == "time" else []
+        joined: list[NDArray[Any]] = []
+        for part in self.parts:  # each column's blocks are let go before the next is joined
+            joined.append(np.concatenate(part) if part else np.empty(0))
+            part.clear()
+            if no_time:  # the rows of a summary, where a word stands in place of the time
+                joined[-1] = np.delete(joined[-1], no_time)
+            joined[-1].setflags(write=False)  # made here: a recording takes it as it is
+        for words, (column, _) in zip(self.words, self.columns, strict=True):
+            what = f"column {labels[column].whole}: {counted(words.count, 'cell')} without a number read as missing"
+            notes += words.note(what, MOST_WORDS * self.total)
+        if self.dated and dates is not None:
+            time = next(column for column, kind in self.columns if kind == "time")
+            notes.append(f"date and time joined from columns {labels[dates].whole} and {labels[time].whole}")
+        self._begin()
+        return joined, notes
+
+    def remarks_and_headings(self, rows: int) -> list[str]:
+        """Return lines for the history on what stands among the `rows`; raise UnreadableFile for many remarks."""
+        most = max(MOST_WORDS * rows, _MOST_REMARKS)
+        lines = f"{counted(self.remarks.count, 'line')} of text among the samples left out"
+        repeated = f"{counted(self.repeated, 'line')} of the heading repeated among the samples left out"
+        return [*self.remarks.note(lines, most), *([repeated] if self.repeated else [])]
 
 
 def _blocks(file: BinaryIO, encoding: str, place: str) -> Iterator[tuple[int, bytes, bool]]:
@@ -134,7 +461,7 @@ def _blocks(file: BinaryIO, encoding: str, place: str) -> Iterator[tuple[int, by
         end = block.rfind(newline)
         while width == 2 and end >= 0 and end % 2:  # a newline's bytes across two characters
             end = block.rfind(newline, 0, end + 1)
-        if end < 0 and len(data) == _CHUNK:
+        if end < 0 and len(block) >= _LONGEST_LINE:
             if b"\r" not in block or width == 2:
                 raise UnreadableFile(f"a text log must have lines, got {len(block)} bytes without ({place})")
             end = block.rfind(b"\r")
@@ -154,312 +481,6 @@ def _lines(block: bytes, layout: Layout) -> list[str]:
     if "\r" in text:
         text = text.replace("\r\n", "\n").replace("\r", "\n")
     return text.removesuffix("\n").split("\n")
-
-
-@dataclass
-class _FormulaParser:
-    """Reads blocks in which each row has plain numbers in the chosen columns by pyarrow, where it is installed.
-
-    `first`: whether no block was read; `usable`: whether the log can have such blocks: its first block is one; `width`:
-    cells in a row of the last block.
-    """
-
-    layout: Layout
-    choice: ColumnMap
-    usable: bool
-    first: bool = True
-    width: int = 0
-
-    @classmethod
-    def of(cls, file: BinaryIO, layout: Layout, choice: ColumnMap) -> _FormulaParser:
-        """Return the parser of a log; small ones, whose time is that of the import, are not for it."""
-        plain = layout.encoding in ("utf-8", "utf-8-sig", "cp1252") and layout.delimiter != " "
-        large = os.fstat(file.fileno()).st_size >= _LARGE
-        return cls(layout, choice, plain and large and not layout.cell_units and find_spec("pyarrow") is not None)
-
-    def values(self, number: int, block: bytes) -> NDArray[np.float64] | None:
-        """Return the chosen columns (n, k) of a block from line `number` on, None where a row is another."""
-        if not self.usable:
-            return None
-        values = self._values(block.split(b"\n", max(0, self.layout.first_row + 1 - number))[-1])
-        self.usable, self.first = values is not None or not self.first, False
-        return values
-
-    def _values(self, block: bytes) -> NDArray[np.float64] | None:
-        from pyarrow import ArrowInvalid, csv, float64, py_buffer
-
-        layout, columns = self.layout, [column for column, _ in self.choice.columns]
-        self.width = width = block.partition(b"\n")[0].count(layout.delimiter.encode()) + 1
-        if any(mark in block for mark in _MARKS) or not max(columns) < width <= len(layout.labels):
-            return None
-        if b"\r" in block and block.count(b"\r") != block.count(b"\r\n"):
-            return None
-        names = [str(column) for column in range(width)]
-        try:
-            table = csv.read_csv(
-                py_buffer(block),
-                csv.ReadOptions(column_names=names, block_size=len(block)),
-                csv.ParseOptions(delimiter=layout.delimiter, quote_char=False),
-                csv.ConvertOptions(
-                    include_columns=[names[column] for column in columns],
-                    column_types={names[column]: float64() for column in columns},
-                    null_values=["", "NaN", *MISSING],
-                    decimal_point=layout.decimal,
-                ),
-            )
-        except ArrowInvalid:
-            return None
-        values = np.empty((table.num_rows, len(columns)), order="F")
-        for index, column in enumerate(table.columns):
-            values[:, index] = column.to_numpy()
-        return None if np.isinf(values).any() else values
-
-
-def _rows(lines: list[str], numbers: Sequence[int], layout: Layout, cut: bool, place: str) -> list[list[str]]:
-    """Split lines into cells; a quotation mark must be closed on its line, but on one that was `cut` short."""
-    if layout.delimiter == " ":
-        return [blank_cells(line) for line in lines]
-    if not any('"' in line for line in lines):
-        return [line.split(layout.delimiter) for line in lines]
-    reader = csv.reader([*lines, ""], delimiter=layout.delimiter, skipinitialspace=True)
-    rows: list[list[str]] = []
-    for line, row in enumerate(reader):
-        if reader.line_num > line + 1:  # the line goes on in the next
-            if cut and line == len(lines) - 1:
-                return [*rows, [*row[:-1], ""]]
-            raise UnreadableFile(
-                f"a quotation mark must be closed on its line, got an open one (line {numbers[line]}, {place})"
-            )
-        rows.append(row)
-    return rows[:-1]
-
-
-@dataclass
-class _Loose:
-    """What stands among the rows of a log and is none: remarks, repeated headings."""
-
-    remarks: _Words = field(default_factory=lambda: _Words(""))
-    repeated: int = 0
-
-    def notes(self, rows: int) -> list[str]:
-        """Return lines for the history; raise UnreadableFile where remarks are more than a few among `rows`."""
-        notes = self.remarks.notes(rows)
-        if self.repeated:
-            notes.append(f"{counted(self.repeated, 'line')} of the heading repeated among the samples left out")
-        return notes
-
-
-def _row_blocks(
-    file: BinaryIO, layout: Layout, choice: ColumnMap, place: str, loose: _Loose
-) -> Iterator[tuple[list[list[str]] | NDArray[np.float64], Sequence[int], bool]]:
-    """Yield blocks of rows with a cell in each chosen column, their lines' numbers, whether the last is cut short.
-
-    A block in which each row has plain numbers there is yielded as these, (n, k).
-    """
-    least, usual = max(column for column, _ in choice.columns) + 1, 0
-    parser = _FormulaParser.of(file, layout, choice)
-    for number, block, cut in _blocks(file, layout.encoding, place):
-        if not cut and (values := parser.values(number, block)) is not None:
-            usual = parser.width
-            yield values, range(number, number + len(values)), False
-            continue
-        lines = _lines(block, layout)
-        skip = max(0, layout.first_row + 1 - number)
-        blank = " " if layout.delimiter == "\t" else None  # tabs alone are a row of missing samples
-        kept = [
-            i for i in range(skip, len(lines)) if lines[i].strip(blank) and not lines[i].lstrip().startswith(COMMENTS)
-        ]
-        if layout.above:
-            count = len(kept)
-            kept = [i for i in kept if lines[i].strip() not in layout.above]
-            loose.repeated += count - len(kept)
-        if not kept:
-            continue
-        numbers: Sequence[int] = [number + i for i in kept]
-        rows = _rows([lines[i] for i in kept], numbers, layout, cut, place)
-        if cut and len(rows[-1]) < usual and _HALF_A_NUMBER.fullmatch(rows[-1][-1]):
-            # a last line without an end was not written whole: half a number and what follows it are missing
-            rows[-1] = [*rows[-1][:-1], *[""] * (least - len(rows[-1]) + 1)]
-        usual = len(rows[-1])
-        rows, numbers = _without_remarks(rows, numbers, least, layout, place, loose.remarks)
-        if rows:
-            _check_widths(rows, numbers, least, layout, place)
-            yield rows, numbers, cut
-
-
-class _Columns:
-    """The chosen columns of the rows taken so far; the time may hold stamps, with the date in another column."""
-
-    def __init__(self, layout: Layout, choice: ColumnMap, place: str) -> None:
-        self._layout, self.choice, self.place = layout, choice, place
-        self._parts: list[list[NDArray[Any]]] = [[] for _ in choice.columns]
-        self._words = [_Words(layout.labels[column].whole) for column, _ in choice.columns]
-        self._stamped: bool | None = None
-        self._dated = False
-        self.total = 0
-
-    def take(self, rows: list[list[str]] | NDArray[np.float64], numbers: Sequence[int], cut: bool) -> None:
-        """Read more rows; `cut`: whether the last one was not written whole."""
-        layout, choice, place = self._layout, self.choice, self.place
-        self.total += len(rows)
-        check_size(self.total, len(choice.columns), place)
-        if isinstance(rows, np.ndarray):
-            self._stamped = False
-            for part, odd, values in zip(self._parts, self._words, rows.T, strict=True):
-                part.append(odd.passed(values))
-            return
-        for part, odd, (column, time) in zip(self._parts, self._words, choice.columns, strict=True):
-            cells = [row[column] for row in rows]
-            if unit := layout.cell_units.get(column):
-                where = partial(_place_of, numbers=numbers, column=column, layout=layout, place=place)
-                cells = plain_cells(cells, unit, cut, where)
-            if time and self._stamped is None:
-                index = next((i for i, cell in enumerate(cells) if cell.strip().lower() not in MISSING), 0)
-                self._stamped = not is_number(cells[index], layout.decimal) and is_stamp(cells[index])
-                # a time of the day beside a date
-                day = rows[index][choice.date] if choice.date is not None and choice.date < len(rows[index]) else ""
-                self._dated = self._stamped and ":" in cells[index][:3] and is_stamp(day) and ":" not in day
-            if not (time and self._stamped):
-                part.append(_numbers(cells, numbers, column, layout, place, odd))
-                continue
-            if self._dated and choice.date is not None:
-                cells = [
-                    f"{row[choice.date].strip()} {cell.strip()}" if cell.strip() else ""
-                    for row, cell in zip(rows, cells, strict=True)
-                ]
-            part.append(_dates(cells, numbers, column, layout, place, odd))
-
-    def finish(self) -> tuple[list[NDArray[Any]], list[str]]:
-        """Return the columns, and lines for the history."""
-        choice, labels = self.choice, self._layout.labels
-        no_time = self._words[-1].at if choice.time is not None else []
-        joined: list[NDArray[Any]] = []
-        for part in self._parts:  # each column's blocks are let go before the next is joined
-            joined.append(np.concatenate(part) if part else np.empty(0))
-            part.clear()
-            if no_time:  # the rows of a summary, where a word stands in place of the time
-                joined[-1] = np.delete(joined[-1], no_time)
-        notes = [note for odd in self._words for note in odd.notes(self.total)]
-        if self._dated and choice.date is not None:
-            before, after = labels[choice.date], labels[choice.columns[-1][0]]
-            notes.append(f"date and time joined from columns {before.whole} and {after.whole}")
-        return joined, notes
-
-
-def _without_remarks(
-    rows: list[list[str]], numbers: Sequence[int], least: int, layout: Layout, place: str, remarks: _Words
-) -> tuple[list[list[str]], Sequence[int]]:
-    """Return rows and their numbers without the short ones that hold no number, which are counted in `remarks`."""
-    if min(map(len, rows)) >= least:
-        return rows, numbers
-    kept = [
-        i
-        for i, row in enumerate(rows)
-        if len(row) >= least
-        or sum(map(len, row)) > _LONGEST_REMARK
-        or any(is_number(cell, layout.decimal) or is_stamp(cell) for cell in row)
-    ]
-    for i in sorted(set(range(len(rows))) - set(kept)):
-        remarks.add(f"{layout.delimiter.join(rows[i])}", f"(line {numbers[i]}, {place})")
-    return [rows[i] for i in kept], [numbers[i] for i in kept]
-
-
-def _check_widths(rows: list[list[str]], numbers: Sequence[int], least: int, layout: Layout, place: str) -> None:
-    """Refuse rows that have too few cells, or more than the header and not empty."""
-    most = len(layout.labels)
-    widths = [len(row) for row in rows]
-    if min(widths) >= least and max(widths) <= most:
-        return
-    for row, number in zip(rows, numbers, strict=True):
-        if len(row) < least or any(cell.strip() for cell in row[most:]):
-            raise UnreadableFile(f"a row must have {counted(most, 'cell')}, got {len(row)} (line {number}, {place})")
-
-
-def _place_of(index: int, numbers: Sequence[int], column: int, layout: Layout, place: str) -> str:
-    return f"(line {numbers[index]}, column {layout.labels[column].whole}, {place})"
-
-
-def _dates(
-    cells: list[str], numbers: Sequence[int], column: int, layout: Layout, place: str, words: _Words
-) -> NDArray[np.datetime64]:
-    texts = ["" if cell.strip().lower() in MISSING else cell for cell in cells]
-    try:
-        return words.passed(stamps(texts))
-    except ValueError:
-        for index, text in enumerate(texts):
-            if text.strip() and not is_stamp(text) and not any(sign.isdigit() for sign in text):
-                words.rule = _STAMP_RULE
-                words.add(text.strip(), _place_of(index, numbers, column, layout, place), index)
-                texts[index] = ""
-    try:
-        return words.passed(stamps(texts))
-    except ValueError as error:
-        bad = int(error.args[0])
-        where = _place_of(bad, numbers, column, layout, place)
-        raise UnreadableFile(f"{_STAMP_RULE}, got {cells[bad]!r} {where}") from None
-
-
-@dataclass
-class _Words:
-    """Cells of a column that hold a word in place of a number (`OVERLOAD`), or lines of words where `name` is empty.
-
-    `rule`: what they break; `count`, `first`, `where`: how many, the first and its place; `at`: their rows; `rows`:
-    those read so far.
-    """
-
-    name: str
-    rule: str = "a sample must be a number"
-    count: int = 0
-    first: str = ""
-    where: str = ""
-    at: list[int] = field(default_factory=list)
-    rows: int = 0
-
-    def add(self, text: str, where: str, index: int = 0) -> None:
-        """Count a word, at `index` after the rows read so far."""
-        if not self.count:
-            self.first, self.where = text[:40], where
-        self.count += 1
-        self.at.append(self.rows + index)
-
-    def passed(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return the values of a block, whose rows are read now."""
-        self.rows += len(values)
-        return values
-
-    def notes(self, rows: int) -> list[str]:
-        """Return a line for the history; raise UnreadableFile where they are more than a few among `rows`."""
-        if self.count > max(MOST_WORDS * rows, 0 if self.name else _MOST_REMARKS):
-            raise UnreadableFile(f"{self.rule}, got {self.first!r} {self.where}")
-        if not self.count:
-            return []
-        if not self.name:
-            return [
-                f"{counted(self.count, 'line')} of text among the samples left out, first {self.first!r} {self.where}"
-            ]
-        cells = counted(self.count, "cell")
-        return [f"column {self.name}: {cells} without a number read as missing, first {self.first!r} {self.where}"]
-
-
-def _numbers(cells: list[str], numbers: Sequence[int], column: int, layout: Layout, place: str, words: _Words) -> Array:
-    """Read cells as doubles, missing ones as NaN; an infinite one is refused, words are counted and missing."""
-    comma = layout.decimal == ","
-    texts = [cell.replace(".", "?").replace(",", ".") for cell in cells] if comma else cells
-    plain = not any("_" in text for text in texts)  # Python takes 1_000 for a number
-    try:
-        if not plain:
-            raise ValueError
-        values = np.fromiter(map(float, texts), np.float64, len(texts))
-    except ValueError:
-        values = np.fromiter((_number(cell, layout.decimal) for cell in cells), np.float64, len(cells))
-    for index in np.flatnonzero(~np.isfinite(values)).tolist():
-        shown = cells[index].strip()
-        if shown.lower() not in MISSING:
-            where = _place_of(index, numbers, column, layout, place)
-            if is_number(shown, layout.decimal):
-                raise UnreadableFile(f"a sample must be a finite number, got {shown[:40]!r} {where}")
-            words.add(shown, where, index)
-    return words.passed(values)
 
 
 def _number(cell: str, decimal: str) -> float:
@@ -489,12 +510,6 @@ def write_text(
         file.write(OWN_MARK + json.dumps(description) + "\n")
         file.write(delimiter.join(f"{name} [{units[name]}]" for name in values) + "\n")
         for start in range(0, len(values["t"]), _ROWS_WRITTEN_AT_ONCE):
-            rows = []
-            for series in values.values():
-                part = series[start : start + _ROWS_WRITTEN_AT_ONCE]
-                cells = list(map(repr, part.tolist()))
-                for missing in np.flatnonzero(np.isnan(part)).tolist():
-                    cells[missing] = ""
-                rows.append(cells)
-            file.write("\n".join(map(delimiter.join, zip(*rows, strict=True))))
-            file.write("\n")
+            columns = [series[start : start + _ROWS_WRITTEN_AT_ONCE].tolist() for series in values.values()]
+            cells = [["" if isnan(value) else repr(value) for value in column] for column in columns]
+            file.write("".join(delimiter.join(row) + "\n" for row in zip(*cells, strict=True)))

@@ -7,27 +7,25 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate, chain, islice, repeat
 
-from sealscope.errors import InputError, UnreadableFile
+from sealscope.errors import UnreadableFile
 from sealscope.recordings.channels import CHANNEL_UNITS
 from sealscope.recordings.formats.columns import counted
-from sealscope.recordings.formats.headings.described import LABEL_ROWS, described
+from sealscope.recordings.formats.headings.described import described, scope_heading
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.preamble import of_lines, stated_rate
 from sealscope.recordings.formats.headings.proposal import knows, measures
-from sealscope.recordings.formats.headings.quantities import units_in, with_units, without_units
-from sealscope.recordings.formats.headings.scope import scope_heading
-from sealscope.recordings.timebase import is_stamp
-from sealscope.units import parse_unit
+from sealscope.recordings.formats.headings.quantities import is_unit, units_in, with_units, without_units
+from sealscope.recordings.formats.headings.words import WORDS
+from sealscope.recordings.formats.timebase import is_stamp
 
 SNIFF = 64 * 1024
 OWN_MARK = "# sealscope: "
 COMMENTS = ("#", "%", "//", '"#', "!")
 #: What loggers write where a sample is missing, in lower case.
-MISSING = frozenset(
-    {"", "nan", "-", "--", "---", "na", "n/a", "#n/a", "null", "none", "-nan", "+nan", "1.#qnan", "-1.#ind", "nan(ind)"}
-)
-_SAMPLE_ROWS = 200
+MISSING = frozenset({"", *WORDS["missing"]})
+_SAMPLE_ROWS = 100
 _LONGEST_NUMBER = 400
 _NUMBER = {
     ".": re.compile(r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eEdD][+-]?\d+)?|[+-]?inf(?:inity)?", re.IGNORECASE),
@@ -42,15 +40,8 @@ _LOOKS = (
     ("\t", "."), ("\t", ","), (";", "."), (";", ","), (",", "."), ("|", "."), ("|", ","), (",", ","), (" ", "."),
     (" ", ","),
 )  # fmt: skip
-#: First cells of the rows of a heading that say what the others of the row are.
-_NAME_KEYS = frozenset({
-    "name", "names", "channel", "channels", "channel name", "channel names", "trace name", "tracename", "signal",
-    "signals", "signal name", "kanal", "kanalname", "kanalbezeichnung", "messstelle", "bezeichnung", "voie", "canal",
-    "canale",
-})  # fmt: skip
-_UNIT_KEYS = frozenset({
-    "unit", "units", "einheit", "einheiten", "vunit", "unité", "unités", "unidad", "unità", "单位", "単位",
-})  # fmt: skip
+#: A number, and what may be its unit, in one cell.
+_QUANTITY = re.compile(r"\d[ \u00a0\u202f]{0,2}(?![eEdDT][+-]?\d)(?:[^\W\d_]|[%\u00b0])")
 _RULER = re.compile(r"[-=_:+]{1,80}")
 #: Most lines above the samples that are looked at for names and units.
 _DEEPEST_HEADING = 12
@@ -158,7 +149,11 @@ def _width(row: Sequence[str]) -> int:
 def _look(body: Sequence[str]) -> tuple[str, str, int]:
     """Return (delimiter, decimal sign, cells a row) with which most cells of the body are values."""
     best: tuple[tuple[float, float, bool, int], tuple[str, str, int]] | None = None
+    text = "\n".join(body)
+    blank = any(sign in text for sign in " \t\v\f")
     for delimiter, decimal in _LOOKS:
+        if delimiter not in text and not (delimiter == " " and blank):
+            continue
         rows = [cells_of(line, delimiter) for line in body]
         values = [sum(_is_value(cell, decimal) for cell in row) for row in rows]
         valued = [(row, many) for row, many in zip(rows, values, strict=True) if many and len(row) > 1]
@@ -189,55 +184,43 @@ def _header_labels(line: str, delimiter: str, width: int = 0) -> list[str]:
 
 def _unit_cells(cells: Sequence[str]) -> list[str | None] | None:
     """Return the units of a units row; None for another row: most of the cells of a units row are units."""
-    units: list[str | None] = []
-    known = present = 0
-    for cell in cells:
-        text = cell.strip().strip("[]()<>'").strip()
-        if not text or text == "-":
-            units.append(None)
-            continue
-        present += 1
-        try:
-            parse_unit(text)
-            known += 1
-        except InputError:
-            pass
-        units.append(text)
-    return units if present and known >= 0.6 * present else None
+    texts = [cell.strip().strip("[]()<>'").strip() for cell in cells]
+    units = [text if text and text != "-" else None for text in texts]
+    known = sum(unit is not None and is_unit(unit) for unit in units)
+    return units if known and known >= 0.6 * sum(unit is not None for unit in units) else None
 
 
 def _heading(lines: Sequence[str], first: int, delimiter: str, width: int, decimal: str) -> tuple[list[Label], int]:
     """Return (labels, number of rows they take) from the lines above the first data row."""
 
-    def names(index: int, commented: bool = False) -> list[str] | None:
-        line = lines[index].strip()
-        if line.startswith(COMMENTS):
-            if not commented:
-                return None
-            line = line.lstrip('#%/!" ').rstrip('"')
-        cells = _header_labels(line if commented else lines[index].strip("\r\n "), delimiter, width)
+    def names(line: str) -> list[str] | None:
+        cells = _header_labels(line, delimiter, width)
         if cells and not cells[-1]:
             cells = cells[: max(_width(cells), min(width, len(cells)))]
         enough = abs(len(cells) - width) <= 1 or (len(cells) >= width > 1)
         return cells if enough and any(cells) and not all(_is_value(c, decimal) for c in cells if c) else None
 
-    above = [i for i in range(first - 1, -1, -1) if lines[i].strip()]
+    above = [line.strip("\r\n ") for line in lines[first - 1 :: -1] if line.strip()] if first else []
     if not above:
         return [], 0
     if (scope := scope_heading(lines[:first], delimiter)) is not None:
         return scope
     rows: list[list[str]] = []
-    for index in above[:_DEEPEST_HEADING]:
-        row = names(index)
+    for line in above[:_DEEPEST_HEADING]:
+        row = None if line.startswith(COMMENTS) else names(line)
         if row is None:
             break
         rows.append(row)
     if rows:
         labels, taken = _keyed(rows) or _stacked(rows)
-        own = [index for index, row in zip(above, rows, strict=False) if row[0].strip().casefold() in LABEL_ROWS]
-        return described(labels, [cells_of(lines[index], delimiter) for index in sorted([*above[taken:], *own])]), taken
-    commented = names(above[0], commented=True) if not lines[above[0]].startswith(OWN_MARK) else None
-    return ([Label.parse(name) for name in commented], 1) if commented else ([], 0)
+        own = [
+            line for line, row in zip(above, rows, strict=False) if row[0].strip().casefold() in WORDS["row"]["label"]
+        ]
+        return described(labels, [cells_of(line, delimiter) for line in [*own, *above[taken:]][::-1]]), taken
+    if above[0].startswith(COMMENTS) and not above[0].startswith(OWN_MARK):
+        commented = names(above[0].lstrip('#%/!" ').rstrip('"'))
+        return ([Label.parse(name) for name in commented], 1) if commented else ([], 0)
+    return [], 0
 
 
 def _keyed(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int] | None:
@@ -246,18 +229,13 @@ def _keyed(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int] | None:
     `rows`: the lowest first.
     """
     keys = [row[0].strip().rstrip(":").casefold() for row in rows]
-    at = next((i for i, key in enumerate(keys) if key in _NAME_KEYS and _width(rows[i]) > 1), None)
-    unit = next((i for i, key in enumerate(keys) if key in _UNIT_KEYS), None)
+    at = next((i for i, key in enumerate(keys) if key in WORDS["row"]["name"] and _width(rows[i]) > 1), None)
+    unit = next((i for i, key in enumerate(keys) if key in WORDS["row"]["unit"]), None)
     if at is None or unit is None:
         return None
-    texts = list(rows[at])
-    units = _unit_cells(rows[unit][1:]) or []
-    if _width(rows[0]) == 1:  # a name of the first column alone
-        texts[0] = rows[0][0]
-    labels = [Label.parse(texts[0])]
-    units += [None] * (len(texts) - 1 - len(units))
-    labels += [Label.parse(name, given) for name, given in zip(texts[1:], units, strict=False)]
-    return labels, max(at, unit) + 1
+    texts = [rows[0][0] if _width(rows[0]) == 1 else rows[at][0], *rows[at][1:]]  # a name of the first column alone
+    units = chain([None], _unit_cells(rows[unit][1:]) or [], repeat(None))
+    return [Label.parse(name, given) for name, given in zip(texts, units, strict=False)], max(at, unit) + 1
 
 
 def _stacked(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int]:
@@ -265,9 +243,7 @@ def _stacked(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int]:
 
     Rows that say the same of every column (`REAL`, a ruler) are passed over. `rows`: the lowest first.
     """
-    skipped = 0
-    while skipped + 1 < len(rows) and _tells_nothing(rows[skipped]):
-        skipped += 1
+    skipped = next((i for i, row in enumerate(rows[:-1]) if not _tells_nothing(row)), len(rows) - 1)
     row, *over = rows[skipped:]
     texts, taken = list(row), skipped + 1
     units = (_numbered_units(row) or _unit_cells(row)) if over else None
@@ -279,13 +255,10 @@ def _stacked(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int]:
         units = []
     known = {name.casefold() for name in CHANNEL_UNITS}
     if over and not any(Label.parse(text).name.casefold() in known for text in texts) and any(map(measures, over[0])):
-        group, joined = "", []
-        for text, cell in zip(texts, [*over[0], *[""] * len(texts)], strict=False):
-            group = cell.strip() or group
-            joined.append(f"{group} {text}".strip())
-        texts, taken = joined, taken + 1
-    units += [None] * (len(texts) - len(units))
-    return [Label.parse(name, unit) for name, unit in zip(texts, units, strict=False)], taken
+        groups = accumulate(chain(over[0], repeat("")), lambda before, cell: cell.strip() or before, initial="")
+        texts = [f"{group} {text}".strip() for text, group in zip(texts, islice(groups, 1, None), strict=False)]
+        taken += 1
+    return [Label.parse(name, unit) for name, unit in zip(texts, chain(units, repeat(None)), strict=False)], taken
 
 
 def _numbered_units(row: Sequence[str]) -> list[str | None] | None:
@@ -293,14 +266,13 @@ def _numbered_units(row: Sequence[str]) -> list[str | None] | None:
     cells = [cell.strip() for cell in row]
     if [cell.casefold() for cell in cells[:3]] != ["no.", "time", "ms"]:
         return None
-    return [cell if column > 1 and _unit_cells([cell]) else None for column, cell in enumerate(cells)]
+    return [cell if column > 1 and is_unit(cell) else None for column, cell in enumerate(cells)]
 
 
 def _tells_nothing(row: Sequence[str]) -> bool:
     cells = [cell.strip() for cell in row if cell.strip()]
-    return all(_RULER.fullmatch(cell) for cell in cells) or (
-        len(set(cells)) == 1 < len(cells) and _unit_cells(cells) is None
-    )
+    same = len(set(cells)) == 1 < len(cells) and _unit_cells(cells) is None
+    return same or all(_RULER.fullmatch(cell) for cell in cells)
 
 
 def _own_layout(lines: Sequence[str], encoding: str) -> Layout | None:
@@ -313,17 +285,19 @@ def _own_layout(lines: Sequence[str], encoding: str) -> Layout | None:
 
 
 def layout_of(head: bytes, encoding: str, whole: bool, place: str) -> Layout:
-    """Find the layout of a log that begins with `head`; `whole`: that is all of it. Raises UnreadableFile."""
+    """Return the layout of a log that begins with `head`; raise UnreadableFile where it has no row of numbers.
+
+    `whole`: the head is all of the log.
+    """
     text = head.decode(encoding, errors="replace").lstrip("\ufeff")
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     if not whole:
         if len(lines) < 2:
             raise UnreadableFile(f"a text log must have lines, got none that ends within {SNIFF} bytes ({place})")
         lines.pop()
-    own = _own_layout(lines, encoding)
-    if own is not None:
+    if (own := _own_layout(lines, encoding)) is not None:
         return own
-    content = [line for line in lines if line.strip() and not line.lstrip().startswith(COMMENTS)]
+    content = [line for line in lines if _is_content(line)]
     if not content:
         raise UnreadableFile(f"a recording must have samples, got an empty file ({place})")
     body = content[max(1, min(len(content) // 2, len(content) - 20)) :][-_SAMPLE_ROWS:] or content
@@ -332,30 +306,8 @@ def layout_of(head: bytes, encoding: str, whole: bool, place: str) -> Layout:
         spelt = list(cell_units.values())
         lines, body = ([without_units(line, spelt) for line in part] for part in (lines, body))
     delimiter, decimal, width = _look(body)
-    rows = [row for row in (cells_of(line, delimiter) for line in body) if len(row) == width]
-    values = [sum(_is_value(cell, decimal) for cell in row) for row in rows]
-    rows = [row for row, count in zip(rows, values, strict=True) if 0 < max(values) <= 2 * count]  # no preamble
-    numeric = [
-        i
-        for i in range(width)
-        if 2 * sum(_is_value(r[i], decimal) for r in rows) > sum(r[i].strip().lower() not in MISSING for r in rows)
-    ]
-    worded = any(not _is_value(row[0], decimal) and row[0].strip().lower() not in MISSING for row in rows)
-    first = len(lines)
-    for index, line in enumerate(lines):
-        if not line.strip() or line.lstrip().startswith(COMMENTS):
-            continue
-        cells = cells_of(line, delimiter)
-        if len(cells) < min(width, (numeric or [0])[-1] + 1):
-            continue
-        if not worded and not (_is_value(cells[0], decimal) or cells[0].strip().lower() in MISSING):
-            continue  # a row that says what it holds, such as `SampleRate,500,500`
-        good = [i for i in numeric if i < len(cells) and _is_value(cells[i], decimal)]
-        empty = [i for i in numeric if i < len(cells) and cells[i].strip().lower() in MISSING]
-        if good and 2 * (len(good) + len(empty)) > len(numeric):
-            first = index
-            break
-    if first == len(lines):
+    first = _first_row(lines, body, delimiter, decimal, width)
+    if first is None:
         _refuse_markup(content[0], place)
         names = _header_labels(content[0], delimiter if width > 1 else _likely(content[0]))
         raise UnreadableFile(
@@ -370,20 +322,59 @@ def layout_of(head: bytes, encoding: str, whole: bool, place: str) -> Layout:
         labels = with_units(labels, cell_units, place)
     above = [line for line in written[:first] if line.strip()]
     remarks = above[: len(above) - taken]
-    about = of_lines(remarks, delimiter)
     plain = [line for line in remarks if not line.startswith(COMMENTS)]
     unused = len(plain) - len(of_lines(plain, delimiter))
     if unused > 0:
         notes.append(f"{counted(unused, 'line')} before the header not used")
-    lines_above = frozenset(line.strip() for line in above)
-    rate = stated_rate(of_lines(above, delimiter))
     return Layout(
-        encoding, delimiter, decimal, tuple(labels), first, None, tuple(notes), about, lines_above, rate, cell_units
+        encoding,
+        delimiter,
+        decimal,
+        tuple(labels),
+        first,
+        None,
+        tuple(notes),
+        of_lines(remarks, delimiter),
+        frozenset(line.strip() for line in above),
+        stated_rate(of_lines(above, delimiter)),
+        cell_units,
     )
+
+
+def _is_content(line: str) -> bool:
+    return bool(line.strip()) and not line.lstrip().startswith(COMMENTS)
+
+
+def _first_row(lines: Sequence[str], body: Sequence[str], delimiter: str, decimal: str, width: int) -> int | None:
+    """Return the index of the first line of samples, by the columns of the `body` that hold numbers."""
+
+    def missing(cell: str) -> bool:
+        return cell.strip().lower() in MISSING
+
+    rows = [row for row in (cells_of(line, delimiter) for line in body) if len(row) == width]
+    values = [[_is_value(cell, decimal) for cell in row] for row in rows]
+    most = max(map(sum, values), default=0)
+    full = [k for k, row in enumerate(values) if 0 < most <= 2 * sum(row)]  # no preamble
+    rows, values = [rows[k] for k in full], [values[k] for k in full]
+    numeric = [i for i in range(width) if 2 * sum(row[i] for row in values) > sum(not missing(row[i]) for row in rows)]
+    worded = any(not own[0] and not missing(row[0]) for row, own in zip(rows, values, strict=True))
+    for index, line in enumerate(lines):
+        cells = cells_of(line, delimiter) if _is_content(line) else []
+        if len(cells) < max(1, min(width, (numeric or [0])[-1] + 1)):
+            continue
+        if not worded and not (_is_value(cells[0], decimal) or missing(cells[0])):
+            continue  # a row that says what it holds, such as `SampleRate,500,500`
+        good = sum(i < len(cells) and _is_value(cells[i], decimal) for i in numeric)
+        empty = sum(i < len(cells) and missing(cells[i]) for i in numeric)
+        if good and 2 * (good + empty) > len(numeric):
+            return index
+    return None
 
 
 def _units_in_cells(body: Sequence[str]) -> dict[int, str]:
     """Return column -> unit of the columns whose cells hold it beside their number, by the delimiter with most such."""
+    if not any(map(_QUANTITY.search, body)):
+        return {}
     tried = [
         units_in(
             [cells_of(line, delimiter) for line in body], lambda cell: _is_value(cell, ".") or _is_value(cell, ",")

@@ -1,18 +1,18 @@
-"""Names of channels that an instrument's heading gives apart from its columns: a table of channels, a row of labels."""
+"""Headings with names or properties apart from the columns: a table of channels, a row of labels, TwinCAT Scope."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 
 from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.words import WORDS
 
-#: What a table of channels calls its first column, and the column of the names that a user has typed.
-_CHANNEL = frozenset({"ch", "ch.", "channel", "kanal"})
-_TYPED = ("signal name", "comment", "label", "name", "tag", "kommentar", "bezeichnung")
-#: First cells of a row of labels, one for each column, as Tektronix writes it above `TIME,CH1,CH2`.
-LABEL_ROWS = frozenset({"label", "labels"})
+_ROW = WORDS["row"]
 _LONGEST = 80
+#: Rows by which a TwinCAT Scope export is known; `V (Voltage)`, `(None)`: a unit and what it measures.
+_SCOPE, _MEASURED = ("SampleTime[ms]", "Starttime of export"), re.compile(r"([^()]{0,20})\([^()]{0,40}\)")
 
 
 def described(labels: Sequence[Label], rows: Sequence[Sequence[str]]) -> list[Label]:
@@ -28,9 +28,9 @@ def described(labels: Sequence[Label], rows: Sequence[Sequence[str]]) -> list[La
         keys = [cell.casefold() for cell in cells]
         if not cells:
             continue
-        if keys[0] in _CHANNEL:
-            typed = next((keys.index(name) for name in _TYPED if name in keys[1:]), None)
-        elif keys[0] in LABEL_ROWS:
+        if keys[0] in _ROW["channel"]:
+            typed = next((keys.index(name) for name in _ROW["typed"] if name in keys[1:]), None)
+        elif keys[0] in _ROW["label"]:
             for label, cell in zip(labels[1:], cells[1:], strict=False):
                 names.setdefault(_key(label), cell)
         elif typed is not None and typed < len(cells):
@@ -53,3 +53,23 @@ def _named(label: Label, name: str) -> Label:
     typed = Label.parse(name)
     own = label.name.rpartition(" ")[2]
     return replace(label, name=typed.name, unit=label.unit or typed.unit, called=own)
+
+
+def scope_heading(lines: Sequence[str], delimiter: str) -> tuple[list[Label], int] | None:
+    """Return (labels, number of lines from the heading's first on) of a TwinCAT Scope export; None for any other.
+
+    `lines`: those above the first sample. Every property's row repeats its name over the columns of times, which are
+    in milliseconds since the start of the export.
+    """
+    rows = [[cell.strip() for cell in line.split(delimiter)] for line in lines]
+    begin = max((index for index, row in enumerate(rows) if row[0] == "Name" and len(row) > 2), default=None)
+    if begin is None or not any(row[0] in _SCOPE for row in rows):
+        return None
+    properties = {row[0]: row for row in rows[begin:]}
+    names, units, labels = properties["Name"], properties.get("Unit", []), []
+    for column, name in enumerate(names):
+        given = units[column] if column < len(units) else ""
+        measured = _MEASURED.fullmatch(given)
+        unit = (measured[1] if measured else given).strip()
+        labels.append(Label("t [ms]", "t", "ms") if name == "Name" else Label.parse(name, unit or None))
+    return labels, sum(1 for line in lines[begin:] if line.strip())

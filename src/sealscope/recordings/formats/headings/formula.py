@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from math import isfinite
+from typing import Generic, TypeVar
+
+import numpy as np
 
 from sealscope.errors import InputError
+from sealscope.recordings.channels import Array
 
 _RULE = "a formula of a map must be a constant plus columns times factors, such as ch2*0.0625-0.625 bar"
 _LONGEST = 400
@@ -16,18 +20,19 @@ _LONGEST = 400
 _NAME, _COLUMN = re.compile(r"`([^`]+)`|(#\d+|(?<![\w.])[^\W\d][\w.]*)"), "column{}"
 #: Where a formula may end and its unit begin.
 _END = re.compile(r"\s+(?=\S)|(?=\[)|$")
+K = TypeVar("K", bound=Hashable)
 
 
 @dataclass(frozen=True)
-class Formula:
-    """`constant` plus the sum of columns times their `factors`; `unit`: as written behind, None where none is."""
+class Formula(Generic[K]):
+    """`constant` plus the sum of columns, by name or number, times their `factors`, in `unit`, None where none is."""
 
-    factors: Mapping[str, float]
+    factors: Mapping[K, float]
     constant: float = 0.0
     unit: str | None = None
 
-    @classmethod
-    def parse(cls, text: str) -> Formula:
+    @staticmethod
+    def parse(text: str) -> Formula[str]:
         """Parse sums, products with numbers, quotients by numbers and brackets; the rest of the text is the unit.
 
         Only the syntax is Python's: nothing is evaluated. The longest beginning of the text that is a formula is taken.
@@ -50,20 +55,38 @@ class Formula:
             unit = text[end:].strip()
             unit = unit[1:-1].strip() if unit.startswith("[") and unit.endswith("]") else unit
             if value.factors and all(map(isfinite, (value.constant, *value.factors.values()))):
-                return cls(value.factors, value.constant, unit or None)
+                return Formula(value.factors, value.constant, unit or None)
         raise InputError(f"{_RULE}, got {text[:80]!r}")
 
-    def plus(self, other: Formula, times: float = 1.0) -> Formula:
+    @property
+    def column(self) -> K:
+        """The first column."""
+        return next(iter(self.factors))
+
+    @property
+    def is_column(self) -> bool:
+        """Whether it is a column as it stands."""
+        return self.constant == 0.0 and [*self.factors.values()] == [1.0]
+
+    def plus(self, other: Formula[K], times: float = 1.0) -> Formula[K]:
         """Return the sum of this formula and `times` another."""
         factors = dict(self.factors)
         for name, factor in other.factors.items():
             factors[name] = factors.get(name, 0.0) + times * factor
         return Formula(factors, self.constant + times * other.constant)
 
+    def values(self, columns: Mapping[K, Array]) -> Array:
+        """Return the samples (n,) in `unit`: those of the only column itself, where it is one."""
+        if self.is_column:
+            return columns[self.column]
+        with np.errstate(over="ignore", invalid="ignore"):
+            terms = [factor * columns[column] for column, factor in self.factors.items()]
+            return np.asarray(self.constant + np.sum(terms, axis=0))
 
-def _linear(tree: ast.expr, names: list[str]) -> Formula:
+
+def _linear(tree: ast.expr, names: list[str]) -> Formula[str]:
     """Return the formula of a syntax tree; raise ValueError where it is not linear in the columns."""
-    zero = Formula({})
+    zero = Formula[str]({})
     match tree:
         case ast.Name(id=name):
             return Formula({names[int(name.removeprefix("column"))]: 1.0})

@@ -9,26 +9,22 @@ import numpy as np
 
 from sealscope.errors import InputError
 from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.words import WORDS
 from sealscope.units import parse_unit, to_si
 
 #: Most entries that are kept, and the longest name and text of each.
 _MOST, _LONGEST_NAME, _LONGEST_TEXT = 40, 60, 200
 _PAIR = re.compile(r"([^:=]{1,60}?)[ \t]{0,8}[:=](?!\\|//)[ \t]{0,8}(.{1,400})")
 #: What loggers call the sampling rate, and the time from one sample to the next.
-_RATE = re.compile(
-    r"(?:fs|f_s|(?:sampl(?:e|es|ing)|scan|data|log(?:ging)?)[ _-]?(?:rate|freq\w*)|abtast(?:rate|frequenz)|messrate|"
-    r"fr[\u00e9e]quence d.[\u00e9e]chantillonnage|frecuencia de muestreo|frequenza di campionamento|"
-    r"\u91c7\u6837(?:\u7387|\u9891\u7387)|\u30b5\u30f3\u30d7\u30ea\u30f3\u30b0(?:\u5468\u6ce2\u6570|\u30ec\u30fc\u30c8))",
-    re.IGNORECASE,
-)
-_INTERVAL = re.compile(
-    r"(?:dt|ts|delta[ _]?[tx]|\u0394t|sampl(?:e|ing)[ _-]?(?:interval|period|time)|abtast(?:zeit|intervall|periode)|"
-    r"horizontal interval|hresolution|increment|\u91c7\u6837(?:\u5468\u671f|\u95f4\u9694))",
-    re.IGNORECASE,
-)
+_STATED = [re.compile(WORDS["stated"][kind], re.IGNORECASE) for kind in ("rate", "interval")]
 #: TwinCAT's start of an export: 100 ns since 1601.
 _FILETIME = re.compile(r"(1[23]\d{16})\b")
 _FROM_1601_TO_1970 = 11_644_473_600 * 10**9  # [ns]
+_TEMPERATURE = re.compile(
+    r"(?P<value>[-+]?\d{1,3}(?:[.,]\d{1,3})?)\s*(?P<unit>°\s?[CF]|deg\s?[CF]|[CFK]\b|℃)", re.IGNORECASE
+)
+_UNIT_OF_NAME = re.compile(r"[\[(]\s*([^\])]{1,6}?)\s*[\])]")
+_OIL = re.compile(r"temp|oil|öl|oel|fluid|huile|olio|aceite", re.IGNORECASE)
 _QUANTITY = re.compile(r"(?P<number>[+-]?\d{1,12}(?:[.,]\d{1,12})?(?:[eE][+-]?\d{1,3})?)\s*(?P<unit>\S{0,10}).*")
 
 
@@ -36,7 +32,7 @@ def stated_rate(about: Mapping[str, str]) -> float | None:
     """Return the sampling rate [Hz] that a file's entries state, as a rate or as an interval; None without."""
     for name, text in about.items():
         label = Label.parse(name)
-        matches = [pattern.fullmatch(label.name) for pattern in (_RATE, _INTERVAL)]
+        matches = [pattern.fullmatch(label.name) for pattern in _STATED]
         cells = re.split(r"[;,\t]\s*", text.strip())  # one a channel, all the same
         quantity = _QUANTITY.fullmatch(cells[0] if len(set(cells)) == 1 else text.strip())
         if quantity is None or not any(matches):
@@ -99,3 +95,19 @@ def of_lines(lines: Sequence[str], delimiter: str) -> dict[str, str]:
 def _line(text: str, longest: int) -> str:
     printable = "".join(sign if sign.isprintable() else " " for sign in text[: 4 * longest])
     return " ".join(printable.split()).strip("\"'")[:longest]
+
+
+def stated_oil_temperature(provenance: Mapping[str, object]) -> float | None:
+    """Return the oil's temperature [deg C] by a recording's provenance, None where it does not state it."""
+    for name, text in remarks_of(provenance).items():
+        if not _OIL.search(name):
+            continue
+        unit_of_name = _UNIT_OF_NAME.search(name)
+        match = _TEMPERATURE.search(text if unit_of_name is None else f"{text} {unit_of_name[1]}")
+        if match is None:
+            continue
+        value, unit = float(match["value"].replace(",", ".")), match["unit"].upper().replace("℃", "C")[-1]
+        celsius = (value - 32.0) / 1.8 if unit == "F" else value - 273.15 if unit == "K" else value
+        if -60.0 < celsius < 200.0:
+            return celsius
+    return None

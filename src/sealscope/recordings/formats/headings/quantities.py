@@ -40,13 +40,14 @@ def units_in(rows: Sequence[Sequence[str]], is_value: Callable[[str], bool]) -> 
             if unit is None:
                 continue
             if unit not in known:
-                known[unit] = len(known) < _MOST_UNITS and _is_unit(unit)
+                known[unit] = len(known) < _MOST_UNITS and is_unit(unit)
             if known[unit]:
                 counts.setdefault(column, Counter())[unit] += 1
     return {column: units.most_common(1)[0][0] for column, units in counts.items() if 2 * units.total() > len(rows)}
 
 
-def _is_unit(text: str) -> bool:
+def is_unit(text: str) -> bool:
+    """Return whether a text is a known unit."""
     try:
         parse_unit(text)
     except InputError:

@@ -10,25 +10,9 @@ from numpy.typing import NDArray
 
 from sealscope.recordings.channels import Array
 from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.words import WORDS
 from sealscope.units import same_dimension
 
-
-def _words(text: str) -> frozenset[str]:
-    return frozenset(text.split(","))
-
-
-#: Part of a moment -> names of its column: English, German, French, Spanish, Italian.
-_NAMES: Mapping[str, frozenset[str]] = {
-    "year": _words("year,yyyy,jahr,année,annee,año,anno"),
-    "month": _words("month,mon,monat,mois,mes,mese"),
-    "day": _words("day,dd,tag,jour,dia,día,giorno"),
-    "hour": _words("hour,hours,hr,hrs,h,hh,std,stunde,stunden,heure,heures,hora,horas,ora,ore"),
-    "minute": _words("minute,minutes,min,mins,m,mm,minuten,minuto,minutos,minuti"),
-    "second": _words("second,seconds,sec,secs,s,ss,sek,sekunde,sekunden,seconde,secondes,segundo,segundos,secondi"),
-    "ms": _words("ms,msec,msecs,millis,millisec,millisecond,milliseconds,millitm,millisekunde,millisekunden"),
-    "us": _words("us,µs,μs,usec,usecs,micros,microsec,microsecond,microseconds,mikrosekunde,mikrosekunden"),
-    "ns": _words("ns,nsec,nanos,nanosecond,nanoseconds,nanosekunden"),
-}  # fmt: skip
 _DATE, _CLOCK, _BELOW = ("year", "month", "day"), ("hour", "minute", "second"), ("ms", "us", "ns")
 #: Nanoseconds of each part, and where it ends.
 _NANOSECONDS = {"hour": 3600e9, "minute": 60e9, "second": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
@@ -42,7 +26,7 @@ def parts_of_time(labels: Sequence[Label], used: Sequence[int]) -> dict[str, int
 
     Year, month and day are added where all three are there. Empty without hours, minutes and seconds, each once.
     """
-    columns = {part: _columns(labels, part, used) for part in _NAMES}
+    columns = {part: _columns(labels, part, used) for part in WORDS["part"]}
     if not all(len(columns[part]) == 1 for part in _CLOCK):
         return {}
     dated = _DATE if all(len(columns[part]) == 1 for part in _DATE) else ()
@@ -60,7 +44,7 @@ def _columns(labels: Sequence[Label], part: str, used: Sequence[int]) -> list[in
     return [
         column
         for column, label in enumerate(labels)
-        if label.name.strip().casefold() in _NAMES[part]
+        if label.name.strip().casefold() in WORDS["part"][part]
         and column not in used
         and (label.unit is None or same_dimension(label.unit, "s"))
     ]

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.series import Clock, Series, uniform
-from sealscope.recordings.formats.table import MAX_VALUES
+from sealscope.recordings.formats.table import MAX_VALUES, Clock, Series, uniform
 
 #: Deepest nesting that is walked, and most columns of a matrix that are taken for series.
 _DEEPEST = 8
@@ -78,7 +77,7 @@ def _group(group: str, name: str, fields: Mapping[str, Any], clock: Clock | None
     by_name = {key.rstrip("_").casefold(): value for key, value in fields.items()}
     time = _times(by_name)
     if time is not None:
-        clock = Clock((group, name, depth), partial(np.asarray, time))
+        clock = _clock((group, name, depth), time)
         if "signals" in by_name:  # a structure with time, as Simulink's scopes write
             for number, signal in enumerate(_members(by_name["signals"]), start=1):
                 label = _text(signal.get("label")) or f"{name}({number})"
@@ -98,7 +97,7 @@ def _group(group: str, name: str, fields: Mapping[str, Any], clock: Clock | None
         # a signal with its name and unit beside its samples
         own = by_name.get("time", by_name.get("t"))
         if isinstance(own, np.ndarray) and own.dtype.kind in "fiu" and own.size == held.size:
-            clock = Clock((group, name, depth), partial(np.asarray, own.reshape(-1).astype(np.float64)))
+            clock = _clock((group, name, depth), own.reshape(-1).astype(np.float64))
         yield from _columns(
             group, _first_text(by_name, _NAME_FIELDS) or name, held, _first_text(by_name, _UNIT_FIELDS) or None, clock
         )
@@ -208,17 +207,19 @@ def _columns(group: str, name: str, value: NDArray[Any], unit: str | None, clock
 def _frame(group: str, frame: Any) -> Iterator[Series]:
     """Yield the columns of a table; the row times of a timetable are their clock."""
     units = [str(unit) for unit in frame.attrs.get("VariableUnits", frame.attrs.get("varUnits", ()))]
-    clock = None
-    index = np.asarray(frame.index)
-    if index.dtype.kind == "m":
-        clock = Clock((group, "row times"), lambda: index.astype("timedelta64[ns]").astype(np.float64) / 1e9)
-    elif index.dtype.kind == "M":
-        start = index[0].astype("datetime64[ns]")
-        clock = Clock((group, "row times"), lambda: (index - index[0]) / np.timedelta64(1, "ns") / 1e9, start)
+    clock, index = None, np.asarray(frame.index)
+    if index.dtype.kind in "mM" and index.size:
+        start = index[0].astype("datetime64[ns]") if index.dtype.kind == "M" else None
+        elapsed = index if start is None else index - index[0]
+        clock = _clock((group, "row times"), elapsed / np.timedelta64(1, "ns") / 1e9, start)
     for number, name in enumerate(frame.columns):
         unit = units[number] if number < len(units) and units[number] else None
         values = np.asarray(frame[name])
         yield Series(group, Label.parse(str(name), unit), len(values), partial(np.asarray, values), clock)
+
+
+def _clock(key: tuple[Any, ...], t: NDArray[np.float64], start: np.datetime64 | None = None) -> Clock:
+    return Clock(key, lambda: (t, start))
 
 
 def _text(value: Any) -> str:

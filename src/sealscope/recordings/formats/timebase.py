@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sealscope.errors import InputError
 from sealscope.recordings.channels import Array
+from sealscope.recordings.formats.headings.words import WORDS
 from sealscope.units import to_si
 
 _CLOCK = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,:]\d{1,9})?|[.,]\d{1,9})?|\d{6}(?:[.,]\d{1,9})?"
@@ -27,17 +28,8 @@ _STAMP = re.compile(
 )
 #: Groups of which a stamp has at least one.
 _TELLING = ("date", "days", "basic", "year_cjk", "year", "name", "name_first", "first", "clock")
-#: Beginnings of the months' names in English, German, French, Italian and Spanish.
-_MONTHS = {
-    beginning: month
-    for month, beginnings in enumerate(
-        (
-            "jan ene gen", "feb fév fev", "mar mär mrz", "apr avr abr", "may mai mag", "jun juin giu", "jul juil lug",
-            "aug aoû aou ago", "sep set", "oct okt ott", "nov", "dec déc dez dic",
-        ), start=1
-    )
-    for beginning in beginnings.split()
-}  # fmt: skip
+#: Beginning of a month's name -> its number.
+_MONTHS = {beginning: int(number) for number, names in WORDS["month"].items() for beginning in names}
 _LONGEST_STAMP = 64
 _SINCE = re.compile(r"(?P<unit>[a-z]{1,20})\s{1,9}since\s{1,9}(?P<start>.{1,64})", re.IGNORECASE)
 _LONG_UNITS = {"milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns", "days": "day", "day": "day"}
@@ -178,12 +170,13 @@ def nominal_rate(t: Array) -> float:
         if off_line < 0.6 * mean:
             step = mean
             slack = max(slack, min(2 * off_line / span, 1e-3))
-    rate = 1.0 / step
-    for digits in range(1, 16):
-        rounded = float(f"{rate:.{digits}g}")
-        if abs(rounded / rate - 1.0) <= slack:
-            return rounded
-    return rate
+    return _shortest(1.0 / step, slack)
+
+
+def _shortest(value: float, slack: float) -> float:
+    """Return the shortest decimal that agrees with a value to a share of it."""
+    decimals = (float(f"{value:.{digits}g}") for digits in range(1, 16))
+    return next((decimal for decimal in decimals if abs(decimal / value - 1.0) <= slack), value)
 
 
 def falling(times: NDArray[Any]) -> bool:
@@ -335,12 +328,7 @@ def _finer(t: Array) -> tuple[float, Array] | None:
     usual = float(np.diff(changes).sum() / np.round(steps[changes][1:] / resolution).sum())
     if usual < 2.0 or np.abs(counts - usual).max() > 1.0:
         return None
-    rate = usual / resolution
-    for digits in range(1, 16):
-        rounded = float(f"{rate:.{digits}g}")
-        if abs(rounded / rate - 1.0) <= 1.0 / np.diff(changes).sum():
-            rate = rounded
-            break
+    rate = _shortest(usual / resolution, 1.0 / float(np.diff(changes).sum()))
     # a stamp says when its first sample was taken, to a sample
     begin = float(np.median(t[changes + 1] - (changes + 1) / rate))
     return resolution, begin + np.arange(t.size) / rate
