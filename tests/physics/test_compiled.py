@@ -42,11 +42,11 @@ SMALL = PROBE.format(
 WHOLE = """
 import numpy as np
 from sealscope.compiled import cache_directory
-from sealscope.physics.solvers.rk4 import advance_rk4
+from sealscope.physics.solvers.advance import advance
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.integrate import trajectory
 path = trajectory(Experiment.of(duration=0.2), ())
-print(float(path["p_A"][-1]), sum(advance_rk4.stats.cache_hits.values()), cache_directory())
+print(float(path["p_A"][-1]), sum(advance.stats.cache_hits.values()), cache_directory())
 """
 
 

@@ -33,7 +33,6 @@ from sealscope.physics.restrictors import (
 )
 from sealscope.physics.rig import NUMBERS, rig_numbers
 from sealscope.physics.solvers.imex import IMEX_NODES
-from sealscope.physics.vector.fixed import left_to_table
 from sealscope.physics.vector.runs import ACCOUNTS, CHANNELS, LEAK_ROWS, advance_lanes_imex
 from sealscope.simulation.batch.run import in_lanes
 from sealscope.simulation.experiment import Experiment
@@ -315,7 +314,7 @@ def test_lanes_run_all_parts_as_a_run_by_itself_does(drive):
     pressures, account = np.zeros((1, n, CHANNELS, WIDTH)), np.full((1, ACCOUNTS, WIDTH), np.inf)
     advance_lanes_imex(
         (0, 1), states, h, 0, nodes, shape, drive_rows, np.zeros((1, LEAK_ROWS, WIDTH)),
-        in_lanes(np.array(numbers)[:, None], WIDTH), np.array([0, n]), left_to_table(rig_numbers(rigs[0]), NUMBERS), 1,
+        in_lanes(np.array(numbers)[:, None], WIDTH), np.array([0, n]), rig_numbers(rigs[0]), 1,
         pressures, 0, account,
     )  # fmt: skip
     for lane, rig in enumerate(rigs):

@@ -13,7 +13,7 @@ from sealscope.errors import InputError, SimulationFailed
 from sealscope.parameters import load_rig
 from sealscope.physics.rest import initial_state
 from sealscope.physics.rig import rig_numbers
-from sealscope.physics.solvers.rk4 import advance_rk4
+from sealscope.physics.solvers.advance import EXPLICIT, advance
 from sealscope.simulation.batch.batch import simulate_batch
 from sealscope.simulation.closed_loop import outputs_per_sample
 from sealscope.simulation.courses import parse_force, parse_position
@@ -115,7 +115,7 @@ def step_by_step(experiment, path):
     u, none = np.empty((every, 3)), np.zeros((every, 3))
     for k, volts in enumerate(path.volts):
         u.fill(volts)
-        advance_rk4(y, path.step, u, none, none, np.zeros((0, 0)), p, False, every, rows[k : k + 1])
+        advance(EXPLICIT, y, path.step, u, none, none, np.zeros((0, 0)), p, False, every, rows[k : k + 1])
     return rows
 
 

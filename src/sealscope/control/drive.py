@@ -206,7 +206,7 @@ class ValveDrive:
 
 
 def _inverse(block: Array) -> Callable[[float, float], float]:
-    return lambda flow, dp: drive_voltage(block, flow, dp)
+    return lambda flow, dp: float(drive_voltage(block, flow, dp))
 
 
 def drive_of(rig: Rig) -> Drive | ValveDrive:

@@ -24,12 +24,12 @@ _LEAST_SLOPE = 0.1
 
 def leak_flow(leak: Leak, t: Array, dp: Array, dp_0: float) -> Array:
     """Return |Q_L| [m^3/s] of a leak with a known coefficient under the chambers' pressure difference `dp` [Pa]."""
-    from sealscope.physics.leakage import leakage_series
+    from sealscope.physics.leakage import laminar_leakage, leakage_series
 
     size = (leak.coefficient or 0.0) * leak.opening.share(t)
-    none = np.zeros_like(size)
-    G, C = (size, none) if leak.law == "laminar" else (none, size)
-    return np.asarray(np.abs(leakage_series(np.ascontiguousarray(dp), G, C, dp_0)))
+    if leak.law == "laminar":
+        return np.asarray(np.abs(laminar_leakage(dp, size)))  # type: ignore[arg-type]
+    return np.asarray(np.abs(leakage_series(np.ascontiguousarray(dp), np.zeros_like(size), size, dp_0)))
 
 
 def mean_while_open(leak: Leak, t: Array, flow: Array) -> float:

@@ -6,7 +6,6 @@ pressures, readings and details exist for a few seconds of each run only.
 
 from __future__ import annotations
 
-import importlib.util
 import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -30,8 +29,6 @@ if TYPE_CHECKING:
 
 #: Told how far the batch is, 0..1.
 Progress = Callable[[float], None]
-#: What a batch runs on.
-DEVICES = ("cpu", "gpu")
 #: Members of a set on which its step is chosen, and for how long [s] each of them runs for that.
 _SCOUTS, _SCOUTED = 4, 2.0 * FIRST_WINDOW
 
@@ -125,7 +122,6 @@ def simulate_batch(
     bounds: Sequence[float] | Array | None = None,
     error: float | str = PRESSURE_TOLERANCE,
     threads: int | None = None,
-    device: str = "cpu",
     progress: Progress | None = None,
 ) -> Batch:
     """Simulate experiments side by side and keep the RMS of the db8 details of p_A and p_B as recorded.
@@ -146,9 +142,6 @@ def simulate_batch(
         Error that a pressure may have [Pa rms] in the runs that state neither a step nor an error.
     threads : int, optional
         Threads of the processor, by default one a core.
-    device : {"cpu", "gpu"}, optional
-        What the batch runs on; "gpu" needs the extra `gpu` and an NVIDIA GPU. Results agree to rounding, and the
-        beginning of some runs is compared with the processor's.
     progress : callable, optional
         Called with how far the batch is (0 to 1).
 
@@ -172,7 +165,6 @@ def simulate_batch(
     <Batch: 3 runs, segments between 0, 2, 4 s>
     """
     error = parse_quantity(error, "Pa", name="error", finite=False)
-    runner = runner_of(device)
     experiments = list(experiments)
     for experiment in experiments:
         if not isinstance(experiment, Experiment):
@@ -195,7 +187,7 @@ def simulate_batch(
                     progress(min(1.0, begun + share * size / n))
 
             own = part.experiment.error
-            _run(part, batch, error if own is None else own, pool, workers, report, runner)
+            _run(part, batch, error if own is None else own, pool, workers, report)
             done += len(part.members) / n
     return batch
 
@@ -211,22 +203,6 @@ def _split_by_step(sets: Sequence[LaneSet]) -> list[LaneSet]:
     return split
 
 
-def runner_of(device: str) -> type[SetRun]:
-    """Return what runs a set on a device: cpu, or gpu (extra `gpu`); raises InputError for one that is not there."""
-    if device not in DEVICES:
-        raise InputError(f"device must be one of {', '.join(DEVICES)}, got {device!r}")
-    if device == "cpu":
-        return SetRun
-    from numba.core import config
-
-    if importlib.util.find_spec("numba_cuda") is None and not config.ENABLE_CUDASIM:
-        raise InputError("device gpu needs numba-cuda, which is not installed: pip install 'sealscope[gpu]'")
-    from sealscope.simulation.batch.gpu import DeviceRun, require_device
-
-    require_device()
-    return DeviceRun
-
-
 def _run(
     part: LaneSet,
     batch: Batch,
@@ -234,16 +210,15 @@ def _run(
     pool: ThreadPoolExecutor,
     workers: int,
     progress: Callable[[float], None],
-    runner: type[SetRun],
 ) -> None:
     places = [member.place for member in part.members]
     sizes = np.array([member.leak.coefficient or 0.0 for member in part.members])
     step = part.experiment.step or chosen_step(part, sizes, error)
     means = np.array([member.leak.mean or 0.0 for member in part.members])
     if np.any(means > 0):
-        sizes = _sized(part, step, sizes, means, pool, workers, runner)
+        sizes = _sized(part, step, sizes, means, pool, workers)
         step = part.experiment.step or min(step, chosen_step(part, sizes, error))
-    run = runner(part, step, sizes, sizes, batch.bounds)
+    run = SetRun(part, step, sizes, sizes, batch.bounds)
     run.all(pool, workers, progress)
     batch.rms[places] = run.rms()
     batch.mean_leak_lpm[places] = run.mean_flow() / LITRE_PER_MINUTE
@@ -298,7 +273,6 @@ def _sized(
     means: Array,
     pool: ThreadPoolExecutor,
     workers: int,
-    runner: type[SetRun],
 ) -> Array:
     """Coefficients that give the leaks' means, as `sizing.sized` finds them, for all members together."""
     from sealscope.simulation.sizing import MOST_RUNS, TOLERANCE, unsettled
@@ -307,7 +281,7 @@ def _sized(
     before = np.zeros((2, len(sizes)))
     for _ in range(MOST_RUNS):
         fine = part.experiment.step or min(step, allowed_step(part, sizes))
-        run = runner(part, fine, sizes, np.where(sizes > 0, sizes, 1.0), None)
+        run = SetRun(part, fine, sizes, np.where(sizes > 0, sizes, 1.0), None)
         run.all(pool, workers, None)
         got = run.mean_flow()
         if np.any(got[wanted] <= 0):

@@ -329,9 +329,8 @@ class SetRun:
         most: int | None = None,
     ) -> None:
         from sealscope.physics.rest import initial_state
-        from sealscope.physics.solvers.imex import IMEX_NODES
+        from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, nodes_of
         from sealscope.physics.solvers.limits import longest_step
-        from sealscope.physics.solvers.rk4 import RK4_NODES
         from sealscope.physics.vector.runs import ACCOUNTS, CHANNELS, LEAST
 
         members, common = part.members, part.experiment
@@ -344,11 +343,9 @@ class SetRun:
         self.h = 1.0 / (rate * self.every)
         self.samples = min(round(common.duration * common.rate), most or sys.maxsize)
         self.outputs = (self.samples + FILTER_REACH) * self.factor
-        nodes = np.array(IMEX_NODES if self.method == "imex" else RK4_NODES)
-        nodes[0], nodes[-1] = 1e-9, 1.0 - 1e-9  # the limits from inside the step
-        self.nodes = nodes * self.h
+        self.nodes = nodes_of(IMPLICIT if self.method == "imex" else EXPLICIT, self.h)
         self.cells = cells_of(members, self.outputs, rate)
-        self.numbers = self._constants(members[0].numbers)
+        self.numbers = members[0].numbers  # of which the choices count; the numbers stand in the table
         leaks = leak_rows(members, sizes, measured)
         checked = set()
         for member, (G, C) in zip(members, leaks[:, :2].tolist(), strict=True):
@@ -370,13 +367,6 @@ class SetRun:
         self.bounds = bounds
         if bounds is not None:
             self._prepare_statistics(bounds)
-
-    def _constants(self, numbers: RigNumbers) -> RigNumbers:
-        """Return what the compiled code takes as constants of the set: the choices; the numbers stand in the table."""
-        from sealscope.physics.rig import NUMBERS
-        from sealscope.physics.vector.fixed import left_to_table
-
-        return left_to_table(numbers, NUMBERS)
 
     def _prepare_filters(self, rate: float) -> None:
         """Lay out the anti-alias filter, for each lane where a channel is late.
