@@ -22,8 +22,8 @@ from sealscope.simulation.closed_loop import Feedback, outputs_per_sample
 from sealscope.simulation.commands import Sine, check_command
 from sealscope.simulation.courses import Force, numbers_under
 from sealscope.simulation.experiment import LONGEST_STEP, PRESSURE_TOLERANCE, Experiment, Method, choose_method
-from sealscope.simulation.faults import Leak
 from sealscope.simulation.instruments import FILTER_REACH
+from sealscope.simulation.leaks import Leak
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig

@@ -11,8 +11,8 @@ import numpy as np
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.recording import Array
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.faults import Leak
 from sealscope.simulation.integrate import Trajectory, trajectory
+from sealscope.simulation.leaks import Leak
 from sealscope.units import LITRE_PER_MINUTE
 
 #: Relative distance from the mean asked for at which the search ends, and within which the closest run is taken after

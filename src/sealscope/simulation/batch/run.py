@@ -30,7 +30,6 @@ from sealscope.simulation.changes import (
 from sealscope.simulation.commands import Command, Sine
 from sealscope.simulation.courses import numbers_under
 from sealscope.simulation.experiment import Experiment, choose_method, exact
-from sealscope.simulation.faults import From, Growing, Leak
 from sealscope.simulation.instruments import FILTER_REACH, anti_alias_taps
 from sealscope.simulation.integrate import (
     VACUUM,
@@ -40,6 +39,7 @@ from sealscope.simulation.integrate import (
     refuse_unresolved,
     steps_per_output,
 )
+from sealscope.simulation.leaks import From, Growing, Leak
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
