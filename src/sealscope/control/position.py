@@ -11,7 +11,7 @@ import numpy as np
 
 from sealscope.compiled import entry, law, pointer_at
 from sealscope.control.controller import P_A, P_B, TARGET, TARGET_SPEED, CompiledLaw, Measured, Started, X
-from sealscope.control.drive import DRIVE_BLOCK, Drive, ValveDrive, check_numbers, drive_of, drive_voltage
+from sealscope.control.drive import Drive, ValveDrive, check_numbers, drive_of, drive_voltage
 from sealscope.recordings.recording import Array
 
 if TYPE_CHECKING:
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 _PRESSURE_LAG = 0.02
 #: Places of the law's numbers in its block; the last are those of the drive's inverse.
 _AREA_A, _AREA_B, _K_V, _K_I_T, _DEAD_BAND, _U_MAX, _AVERAGED, _INTEGRAL, _DP, _DRIVE = range(1, 11)
-POSITION_BLOCK = _DRIVE + DRIVE_BLOCK
 
 
 @law

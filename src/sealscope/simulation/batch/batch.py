@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -175,51 +174,31 @@ def simulate_batch(
     inside = edges.ndim == 1 and edges.size >= 2 and np.all(np.isfinite(edges)) and np.all(np.diff(edges) > 0)
     if not (inside and edges[0] >= 0 and edges[-1] <= first.duration):
         raise InputError(f"bounds must rise within 0 .. {first.duration:g} s, got {edges.tolist()}")
-    workers = threads or os.cpu_count() or 1
     n, segments = len(experiments), edges.size - 1
     batch = Batch(np.empty((n, 2, segments, 5)), edges, np.empty(n), np.empty(n), np.empty(n))
     done = 0.0
-    with ThreadPoolExecutor(workers) as pool:
-        for part in _split_by_step(sets):
+    for part in sets:
 
-            def report(share: float, begun: float = done, size: int = len(part.members)) -> None:
-                if progress is not None:
-                    progress(min(1.0, begun + share * size / n))
+        def report(share: float, begun: float = done, size: int = len(part.members)) -> None:
+            if progress is not None:
+                progress(min(1.0, begun + share * size / n))
 
-            own = part.experiment.error
-            _run(part, batch, error if own is None else own, pool, workers, report)
-            done += len(part.members) / n
+        own = part.experiment.error
+        _run(part, batch, error if own is None else own, threads or os.cpu_count() or 1, report)
+        done += len(part.members) / n
     return batch
 
 
-def _split_by_step(sets: Sequence[LaneSet]) -> list[LaneSet]:
-    """Return the sets with a step or an error of their own apart from those without."""
-    split = []
-    for lane_set in sets:
-        kinds: dict[tuple[float | None, float | None], list] = {}  # type: ignore[type-arg]
-        for member in lane_set.members:
-            kinds.setdefault((member.experiment.step, member.experiment.error), []).append(member)
-        split += [LaneSet(tuple(members), lane_set.shape) for members in kinds.values()]
-    return split
-
-
-def _run(
-    part: LaneSet,
-    batch: Batch,
-    error: float,
-    pool: ThreadPoolExecutor,
-    workers: int,
-    progress: Callable[[float], None],
-) -> None:
+def _run(part: LaneSet, batch: Batch, error: float, threads: int, progress: Callable[[float], None]) -> None:
     places = [member.place for member in part.members]
     sizes = np.array([member.leak.coefficient or 0.0 for member in part.members])
     step = part.experiment.step or chosen_step(part, sizes, error)
     means = np.array([member.leak.mean or 0.0 for member in part.members])
     if np.any(means > 0):
-        sizes = _sized(part, step, sizes, means, pool, workers)
+        sizes = _sized(part, step, sizes, means, threads)
         step = part.experiment.step or min(step, chosen_step(part, sizes, error))
     run = SetRun(part, step, sizes, sizes, batch.bounds)
-    run.all(pool, workers, progress)
+    run.all(threads, progress)
     batch.rms[places] = run.rms()
     batch.mean_leak_lpm[places] = run.mean_flow() / LITRE_PER_MINUTE
     batch.coefficients[places] = sizes
@@ -266,14 +245,7 @@ def allowed_step(part: LaneSet, sizes: Array) -> float:
     return max(min(limits), LONGEST_STEP / FINEST)
 
 
-def _sized(
-    part: LaneSet,
-    step: float,
-    sizes: Array,
-    means: Array,
-    pool: ThreadPoolExecutor,
-    workers: int,
-) -> Array:
+def _sized(part: LaneSet, step: float, sizes: Array, means: Array, threads: int) -> Array:
     """Coefficients that give the leaks' means, as `sizing.sized` finds them, for all members together."""
     from sealscope.simulation.sizing import MOST_RUNS, TOLERANCE, unsettled
 
@@ -282,7 +254,7 @@ def _sized(
     for _ in range(MOST_RUNS):
         fine = part.experiment.step or min(step, allowed_step(part, sizes))
         run = SetRun(part, fine, sizes, np.where(sizes > 0, sizes, 1.0), None)
-        run.all(pool, workers, None)
+        run.all(threads, None)
         got = run.mean_flow()
         if np.any(got[wanted] <= 0):
             run_place = part.members[int(np.flatnonzero(wanted & (got <= 0))[0])].place
