@@ -33,19 +33,17 @@ class Opening(Protocol):
         """Return the opening in 0..1 at times t [s] (any shape)."""
         ...
 
-    def onset(self) -> float:
-        """Return the first time [s] at which it is open."""
-        ...
-
     def bends(self) -> tuple[float, ...]:
         """Return the times [s] at which it jumps or bends, as far as its form tells."""
         ...
 
-    def __str__(self) -> str: ...
+    def onset(self) -> float:
+        """Return the first time [s] at which it is open."""
+        return self.bends()[0]
 
 
 @dataclass(frozen=True)
-class From:
+class From(Opening):
     """Closed before `at` [s], fully open from then on."""
 
     at: float = 0.0
@@ -53,10 +51,6 @@ class From:
     def share(self, t: Array) -> Array:
         """Return the opening at times t [s]."""
         return np.where(t >= self.at, 1.0, 0.0)
-
-    def onset(self) -> float:
-        """Return `at` [s]."""
-        return self.at
 
     def bends(self) -> tuple[float, ...]:
         """Return the times [s] at which it jumps or bends."""
@@ -67,7 +61,7 @@ class From:
 
 
 @dataclass(frozen=True)
-class Growing:
+class Growing(Opening):
     """Opens evenly from `start` to `stop` [s] and stays open."""
 
     start: float
@@ -83,10 +77,6 @@ class Growing:
         """Return the opening at times t [s]."""
         return np.clip((t - self.start) / (self.stop - self.start), 0.0, 1.0)
 
-    def onset(self) -> float:
-        """Return `start` [s]."""
-        return self.start
-
     def bends(self) -> tuple[float, ...]:
         """Return the times [s] at which it jumps or bends."""
         return self.start, self.stop
@@ -96,7 +86,7 @@ class Growing:
 
 
 @dataclass(frozen=True, eq=False)
-class Tabulated:
+class Tabulated(Opening):
     """Opening linear between the points of a table; constant before the first and after the last."""
 
     t: Array
@@ -130,7 +120,7 @@ class Tabulated:
 
 
 @dataclass(frozen=True)
-class Between:
+class Between(Opening):
     """Opens evenly within `ramp` [s] from `start` on, and shuts as evenly from `stop` [s] on (infinity: never)."""
 
     start: float
@@ -152,10 +142,6 @@ class Between:
             return np.where((t >= self.start) & (t < self.stop), 1.0, 0.0)
         return np.clip(np.minimum(t - self.start, self.stop + self.ramp - t) / self.ramp, 0.0, 1.0)
 
-    def onset(self) -> float:
-        """Return `start` [s]."""
-        return self.start
-
     def bends(self) -> tuple[float, ...]:
         """Return the times [s] at which it jumps or bends."""
         return self.start, self.start + self.ramp, self.stop, self.stop + self.ramp
@@ -167,7 +153,7 @@ class Between:
 
 
 @dataclass(frozen=True, eq=False)
-class Thinned:
+class Thinned(Opening):
     """The `opening` of a laminar gap, as a share of what it passes at the rig's viscosity: over `viscosity` at t."""
 
     opening: Opening
