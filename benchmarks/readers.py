@@ -30,7 +30,8 @@ from sealscope.recordings import read, split_map_option
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.timebase import is_stamp
 from sealscope.simulation.commands import parse_command
-from sealscope.simulation.faults import parse_fault, parse_leak
+from sealscope.simulation.faults import parse_fault
+from sealscope.simulation.leaks import parse_leak
 from sealscope.units import parse_quantity, parse_unit
 
 HEAD = "t [s],p_A [Pa]\n"

@@ -38,11 +38,8 @@ def main() -> None:
     variants = ["bench_variants.py", "--json", str(results / "variants.json")]
     if chosen.quick:
         variants += ["--rounds", "1", "--runs", "8", "--duration", "20"]
-    gpu = ["bench_gpu.py", "--json", str(results / "gpu.json")]
-    if chosen.quick:
-        gpu += ["--runs", "2000", "--rounds", "2"]
     print(f"{platform.machine()}, {platform.python_implementation()} {platform.python_version()}", flush=True)
-    for words in (solvers, batch, variants, gpu):
+    for words in (solvers, batch, variants):
         subprocess.run([sys.executable, str(HERE / words[0]), *words[1:]], check=True)
 
 

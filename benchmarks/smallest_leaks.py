@@ -14,7 +14,7 @@ from dataclasses import replace
 from sealscope.campaigns.smallest import PlannedDuty, experiment_of, findable
 from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.parameters import load_rig
-from sealscope.simulation.faults import From, Leak
+from sealscope.simulation.leaks import From, Leak
 from sealscope.simulation.simulate import simulate_with_truth
 from sealscope.units import LITRE_PER_MINUTE
 

@@ -37,7 +37,7 @@ from sealscope.evaluation.binomial import clopper_pearson
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Array, Recording
 from sealscope.simulation.bench.machines import BenchMachine, draw
-from sealscope.simulation.faults import Leak
+from sealscope.simulation.leaks import Leak
 from sealscope.simulation.simulate import simulate_with_truth
 from sealscope.units import LITRE_PER_MINUTE
 

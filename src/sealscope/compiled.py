@@ -163,6 +163,7 @@ class _Cache(FunctionCache):  # type: ignore[misc]
 class _SettledLaws(FunctionPass):  # type: ignore[misc]
     """Replace len(p.law) by its number, `p` an argument that is a named tuple and `law` a field that is a tuple.
 
+    So is len(choice) of an argument that is a tuple itself.
     Branches on it are then settled before types are inferred, and a law that is absent is not even compiled.
     """
 
@@ -181,14 +182,19 @@ class _SettledLaws(FunctionPass):  # type: ignore[misc]
         def length(value: Any) -> int | None:
             if getattr(value, "op", None) != "call" or len(value.args) != 1:
                 return None
-            field = definition(value.args[0])
-            if getattr(definition(value.func), "value", None) is not len or getattr(field, "op", None) != "getattr":
+            given = definition(value.args[0])
+            if getattr(definition(value.func), "value", None) is not len:
                 return None
-            numbers = definition(field.value)
+            if isinstance(given, ir.Arg):
+                kind = state.args[given.index]
+                return kind.count if isinstance(kind, types.BaseTuple) else None
+            if getattr(given, "op", None) != "getattr":
+                return None
+            numbers = definition(given.value)
             kind = state.args[numbers.index] if isinstance(numbers, ir.Arg) else None
-            if not isinstance(kind, types.BaseNamedTuple) or field.attr not in kind.fields:
+            if not isinstance(kind, types.BaseNamedTuple) or given.attr not in kind.fields:
                 return None
-            law = kind.types[kind.fields.index(field.attr)]
+            law = kind.types[kind.fields.index(given.attr)]
             return law.count if isinstance(law, types.BaseTuple) else None
 
         for block in code.blocks.values():
@@ -242,8 +248,8 @@ def _cached(function: _F, own: dict[str, Any]) -> _F:
 class _Law(CPUDispatcher):  # type: ignore[misc]
     """A function that other compiled functions take in whole: made without the code by which Python calls it.
 
-    That code unpacks and checks each argument and takes more time to make than the law itself. A law called from Python
-    after all is compiled a second time, as a kernel is.
+    That code unpacks and checks each argument and takes more time to make than the law itself. Called from Python, a
+    small law is run by Python, a large one is compiled a second time, as a kernel is.
     """
 
     def add_overload(self, cres: Any) -> None:
@@ -252,7 +258,8 @@ class _Law(CPUDispatcher):  # type: ignore[misc]
 
     @cached_property
     def _for_python(self) -> Any:
-        return kernel(self.py_func, self.targetoptions["fastmath"])
+        inlined = self.targetoptions["forceinline"]
+        return self.py_func if inlined else kernel(self.py_func, self.targetoptions["fastmath"])
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         """Call from Python."""
@@ -269,7 +276,7 @@ def _law(function: _F, fastmath: Any, inline: bool = True) -> _F:
 
 
 def law(function: _F) -> _F:
-    """Compile a small law that only other compiled functions call: inlined there, cached with them, never alone."""
+    """Compile a small law that other compiled functions call: inlined and cached with them. Python runs it itself."""
     return _law(function, False)
 
 

@@ -49,9 +49,9 @@ def plan_with(text):
     return made
 
 
-def rows_of(plan, cases, device="cpu"):
+def rows_of(plan, cases):
     """The rows by case id, without their processor time."""
-    return {row.id: replace(row, seconds=0.0) for row in batches.in_batches(plan, cases, 2, device)}
+    return {row.id: replace(row, seconds=0.0) for row in batches.in_batches(plan, cases, 2)}
 
 
 def alone(plan, case):
@@ -107,7 +107,7 @@ def test_a_row_is_the_same_in_any_batch(plan_with, monkeypatch):
     cases = cases_of(plan)
     whole = rows_of(plan, cases)
     assert not any(row.error for row in whole.values())
-    monkeypatch.setitem(batches.RUNS, "cpu", 7)
+    monkeypatch.setattr(batches, "RUNS", 7)
     assert rows_of(plan, cases[::-1]) == whole
     assert rows_of(plan, cases[3:4]) == {cases[3].id: whole[cases[3].id]}
 
@@ -118,7 +118,7 @@ def test_interrupted_it_goes_on_to_the_same_bytes(plan_with, monkeypatch, tmp_pa
     expected = {
         path.name: path.read_bytes() for path in write_result(simulated_result(plan, tmp_path / "once"), tmp_path)
     }
-    monkeypatch.setitem(batches.RUNS, "cpu", 8)
+    monkeypatch.setattr(batches, "RUNS", 8)
     told = []
 
     def stop(done, total, failures):
@@ -148,7 +148,7 @@ def test_rows_of_both_ways_are_not_mixed(plan_with, tmp_path):
     with pytest.raises(InputError, match="continues only with the same mode of making rows"):
         campaign.run(plan, tmp_path / "runs", batch=True)
     ways = [simulated_result(plan, tmp_path / name).mode for name in ("batch", "runs")]
-    assert ways == ["in batches on the cpu", "run by run"]
+    assert ways == ["in batches", "run by run"]
 
 
 def test_a_case_that_fails_costs_no_other(plan_with):
@@ -222,6 +222,4 @@ def test_bad_calls_are_refused_before_the_work(plan_with, tmp_path):
     plan = plan_with()
     with pytest.raises(InputError, match="--cluster must stand without --batch"):
         campaign.run(plan, tmp_path / "none", batch=True, cluster="tcp://127.0.0.1:1")
-    with pytest.raises(InputError, match="--device must be cpu or gpu, got tpu"):
-        campaign.run(plan, tmp_path / "none", device="tpu")
     assert not (tmp_path / "none").exists()

@@ -21,7 +21,7 @@ from sealscope.campaigns.cases.bound import (
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.faults import Leak
+from sealscope.simulation.leaks import Leak
 from sealscope.simulation.sensitivity import clean_channels, leak_sensitivity, parameter_sensitivity
 
 PSI = 6894.757293168361

@@ -69,23 +69,15 @@ def test_in_batches_it_says_so_and_goes_on(call, tiny, tmp_path):
     status, out, err = call("campaign", "run", tiny, "-o", folder, "--batch", "-j", "2")
     assert status == 0, err
     assert "records: 26 of 26 done" in out
-    assert "Simulated in batches on the cpu: " in out
+    assert "Simulated in batches: " in out
     page = (folder / "report.html").read_text(encoding="utf-8")
-    assert "<dt>simulated</dt><dd>in batches on the cpu</dd>" in re.sub(r"\s*\n\s*", "", page)
+    assert "<dt>simulated</dt><dd>in batches</dd>" in re.sub(r"\s*\n\s*", "", page)
     rows = (folder / "rows.jsonl").read_bytes()
-    assert call("campaign", "run", tiny, "-o", folder, "--device", "cpu", "--batch")[0] == 0
+    assert call("campaign", "run", tiny, "-o", folder, "--batch")[0] == 0
     assert (folder / "rows.jsonl").read_bytes() == rows
     status, _, err = call("campaign", "run", tiny, "-o", folder)
     assert (status, len(err.splitlines())) == (2, 1)
     assert "the same mode of making rows" in err
-
-
-def test_without_a_device_it_is_one_line(call, tiny, tmp_path):
-    status, _, err = call("campaign", "run", tiny, "-o", tmp_path / "mine", "--device", "gpu")
-    if status == 0:
-        pytest.skip("there is a GPU")
-    assert (status, len(err.splitlines())) == (2, 1)
-    assert not (tmp_path / "mine").exists()
 
 
 def test_the_page_is_whole_and_asks_nothing_of_a_network(call, tiny, tmp_path):
@@ -119,7 +111,6 @@ def test_an_incomplete_campaign_says_so(call, tiny, tmp_path):
         (("campaign", "run", "no-such-plan"), "no packaged plan"),
         (("campaign", "report", "TINY", "-o", "nowhere"), "must have rows to report on"),
         (("campaign", "run", "TINY", "-o", "nowhere", "-j", "0"), "--jobs must be >= 1"),
-        (("campaign", "run", "TINY", "-o", "nowhere", "--device", "tpu"), "--device must be cpu or gpu, got tpu"),
         (("campaign", "run", "bench-volume", "--batch"), "got 'volume balance', which needs whole recordings"),
         (("campaign", "run", "appendix-c", "--batch"), "must simulate its records; run it without --batch"),
     ],

@@ -178,7 +178,7 @@ def test_a_family_draws_its_loads_and_controllers():
     [
         ('commands = ["3 sin(t)"]\ncontrollers = ["pi"]\nwhy = "x"\n', "a controller must have a target to follow"),
         ('commands = ["3 sin(t)"]\nloads = ["2"]\nwhy = "x"\n', "load must have its unit"),
-        ('commands = ["3 sin(t)"]\nloads = "2 kN"\nwhy = "x"\n', "loads of [duty] must be a list of texts"),
+        ('commands = ["3 sin(t)"]\nloads = "2 kN"\nwhy = "x"\n', "duty.loads must be a valid list, got '2 kN'"),
         ('commands = ["position 5 mm sin(t)"]\namplitude = [0.9, 1.1]\nwhy = "x"\n', "has no amplitude to be drawn"),
     ],
 )

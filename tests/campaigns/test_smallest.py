@@ -13,7 +13,7 @@ from sealscope.campaigns.smallest import Findable, PlannedDuty, RecordingPlan, e
 from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
-from sealscope.simulation.faults import From, Leak
+from sealscope.simulation.leaks import From, Leak
 from sealscope.simulation.simulate import simulate_with_truth
 from sealscope.units import LITRE_PER_MINUTE
 

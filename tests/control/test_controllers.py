@@ -106,10 +106,10 @@ class Written:
             dp += (1 - math.exp(-T / 0.02)) * (measured.p_A - measured.p_B - dp)
             error = measured.target - measured.x
             omega = (measured.target_speed + c.k_v * error + integral) * (c.area_A if dp > 0 else c.area_B)
-            omega /= c.displacement
-            quick = math.exp(-c.drive_corner * T) * (quick + omega - before)
+            omega /= c.drive.displacement
+            quick = math.exp(-c.drive.corner * T) * (quick + omega - before)
             before = omega
-            u = (omega + c.drive_shortfall * quick) / c.omega_per_volt
+            u = (omega + c.drive.shortfall * quick) / c.drive.omega_per_volt
             if abs(error) > c.dead_band and (abs(u) < c.u_max or u * error < 0):
                 integral += c.k_i * T * error
             return min(max(u, -c.u_max), c.u_max)

@@ -10,14 +10,13 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from sealscope.control import (
+    Drive,
     FaultTolerant,
     Flatness,
     PositionPI,
     ValveDrive,
-    ValvePI,
     controller_named,
     margins,
-    position_controller,
 )
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig
@@ -84,7 +83,7 @@ def test_after_a_step_the_piston_stands():
 def test_an_overlap_is_crossed():
     """1 V of dead band: known to the controller, the error is a small part of what it is otherwise."""
     rig = RIG.with_overrides(dict.fromkeys(("o_PA", "o_AT", "o_PB", "o_BT"), "50[um]"))
-    knows = ValvePI.of(rig)
+    knows = PositionPI.of(rig)
     assert knows.dead_volts == pytest.approx(1.0)
     errors = []
     for controller in (knows, replace(knows, dead_volts=0.0)):
@@ -97,7 +96,7 @@ def test_an_overlap_is_crossed():
 
 def test_the_loop_has_margins():
     """A stiff supply: more phase than at a pump, whose drive lags; 60 degrees and a factor of two at all speeds."""
-    controller = position_controller(RIG)
+    controller = PositionPI.of(RIG)
     for speed in (0.0, 0.05):
         margin = margins(RIG, controller, speed)
         assert margin.damped
@@ -106,16 +105,16 @@ def test_the_loop_has_margins():
 
 
 def test_a_valve_is_not_a_pump():
-    assert isinstance(position_controller(RIG), ValvePI)
-    assert isinstance(position_controller(load_rig("thesis")), PositionPI)
+    assert isinstance(PositionPI.of(RIG).drive, ValveDrive)
+    assert isinstance(PositionPI.of(load_rig("thesis")).drive, Drive)
     assert Flatness.of(RIG).G == 0.0
     with pytest.raises(InputError, match=r"fault-tolerant controller must have a pump .* got rig servo-valve"):
         FaultTolerant.of(RIG)
     with pytest.raises(InputError, match=r"fault-tolerant controller must have a pump"):
         controller_named("fault-tolerant-flatness", RIG)
-    with pytest.raises(InputError, match=r"must have a pump-controlled rig .* ValvePI"):
-        PositionPI.of(RIG)
+    with pytest.raises(InputError, match=r"must have a pump-controlled rig .* ValveDrive"):
+        Drive.of(RIG)
     with pytest.raises(InputError, match=r"must have a servo valve .* got rig thesis"):
-        ValvePI.of(load_rig("thesis"))
+        ValveDrive.of(load_rig("thesis"))
     with pytest.raises(InputError, match=r"p_s of the valve must be > 0, got 0.0"):
         replace(ValveDrive.of(RIG), p_s=0.0)

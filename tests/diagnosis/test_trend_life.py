@@ -16,7 +16,7 @@ from sealscope.diagnosis.trend.trend import Trend, trend_of
 from sealscope.diagnosis.trend.wear import MONTH
 from sealscope.recordings.recording import Recording
 from sealscope.reporting.trend.page import render_trend_page
-from sealscope.simulation.faults import Leak
+from sealscope.simulation.leaks import Leak
 
 REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "real" / "vtnsi_actuator"
 #: Wear from this day on, and the days on which the seal is changed, the duty, and the encoder of the position.

@@ -13,7 +13,7 @@ import pytest
 
 import sealscope as ss
 from sealscope.errors import InputError, SimulationFailed
-from sealscope.fmu.build import this_platform
+from sealscope.fmu.build import fmi_headers, this_platform
 
 fmpy = pytest.importorskip("fmpy", reason="FMPy runs the units: pip install 'sealscope[fmu]'")
 pytestmark = pytest.mark.slow
@@ -110,7 +110,7 @@ def plant(tmp_path_factory):
     (place / "config.h").write_text(CONFIG)
     for name in ("unit.c", "unit.h", "fmi2.c"):
         (place / name).write_text((layer / name).read_text())
-    include = [f"-I{place}", f"-I{layer / 'headers'}"]
+    include = [f"-I{place}", f"-I{fmi_headers()}"]
     sources = [place / name for name in ("plant.c", "unit.c", "fmi2.c")]
     library = place / "plant.so"
     subprocess.run(["gcc", "-O2", "-fPIC", "-shared", *include, *sources, "-lm", "-o", library], check=True, timeout=60)

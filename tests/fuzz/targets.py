@@ -34,7 +34,8 @@ from sealscope.reporting.campaign.page import PAGE, campaign_text, write_campaig
 from sealscope.simulation.bench.profile import load_profile
 from sealscope.simulation.commands import parse_command
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.faults import parse_fault, parse_leak
+from sealscope.simulation.faults import parse_fault
+from sealscope.simulation.leaks import parse_leak
 from sealscope.thesis.engine.kept import ResultsFolder
 from sealscope.thesis.engine.products import Claim, Figure, FigureCurve, Image, Number, Panel, ThesisTable
 from sealscope.units import parse_quantity, parse_unit

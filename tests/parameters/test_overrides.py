@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from sealscope.errors import InputError
 from sealscope.parameters import Motor, Rig, load_rig, parse_override, parse_overrides
 from sealscope.parameters.fields import choices_of, unit_of
-from sealscope.parameters.rig import _declared
+from sealscope.parameters.rig import declared
 
 RIG = load_rig("thesis")
-NUMBERS = [name for name, field in _declared().items() if field.annotation is float]
-CHOICES = [name for name, field in _declared().items() if choices_of(field)]
+NUMBERS = [name for name, field in declared().items() if field.annotation is float]
+CHOICES = [name for name, field in declared().items() if choices_of(field)]
 
 
 def message(settings: dict[str, Any], **more: Any) -> str:
@@ -150,7 +150,7 @@ def test_parts_made_by_hand_obey_the_same_rules() -> None:
 
 def _range(name: str) -> tuple[float, float]:
     low, high = -math.inf, math.inf
-    for rule in _declared()[name].metadata:
+    for rule in declared()[name].metadata:
         low = max(low, getattr(rule, "gt", low), getattr(rule, "ge", low))
         high = min(high, getattr(rule, "lt", high), getattr(rule, "le", high))
     return low, high
@@ -204,7 +204,7 @@ def test_text_and_number_agree(name: str, fraction: float) -> None:
     except InputError:
         return
     assert RIG.with_overrides({name: repr(value)}) == rig
-    assert RIG.with_overrides({name: f"{value!r}[{unit_of(_declared()[name])}]"}) == rig
+    assert RIG.with_overrides({name: f"{value!r}[{unit_of(declared()[name])}]"}) == rig
 
 
 #: Choices that go together only.
@@ -213,7 +213,7 @@ VALVE = {"valve.spool": "present", "supply.drive": "constant-speed"}
 
 @pytest.mark.parametrize("name", CHOICES)
 def test_every_word_of_a_choice_is_accepted(name: str) -> None:
-    words = choices_of(_declared()[name])
+    words = choices_of(declared()[name])
     assert len(words) > 1
     for word in words:
         others = VALVE if name in VALVE and word in VALVE.values() else {}

@@ -28,7 +28,6 @@ from sealscope.physics.rest import initial_state
 from sealscope.physics.restrictors import implicit_orifice_flow, orifice_flow
 from sealscope.physics.rig import CHOICES, NUMBERS, OUTPUTS, RigNumbers, rig_numbers
 from sealscope.physics.solvers.rk4 import RK4_NODES
-from sealscope.physics.vector.fixed import left_to_table
 from sealscope.physics.vector.runs import (
     ACCOUNTS,
     CHANNELS,
@@ -169,7 +168,7 @@ def test_every_lane_has_numbers_of_its_own(check_rig, drive):
     account[:, LEAST] = np.inf
     advance_lanes_rk4(
         (0, 1), state, h, 0, nodes, shape, drive_rows, np.zeros((1, LEAK_ROWS, WIDTH)), np.ascontiguousarray(table),
-        np.array([0, n]), left_to_table(rig_numbers(rigs[0]), NUMBERS), 1, pressures, 0, account,
+        np.array([0, n]), rig_numbers(rigs[0]), 1, pressures, 0, account,
     )  # fmt: skip
     for lane, rig in enumerate(rigs):
         alone = drive(rig, n * h, rate=2000.0, step=h)

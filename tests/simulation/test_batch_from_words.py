@@ -65,7 +65,7 @@ def test_a_batch_tells_its_numbers_by_name(monkeypatch):
     [
         ({"experiments": ["3 sin(4t)"]}, r"a batch must have experiments .*, got '3 sin\(4t\)'"),
         ({"error": "20[m]"}, "error must have a unit of pressure"),
-        ({"divice": "gpu"}, "simulate_batch has no argument 'divice'; did you mean 'device'"),
+        ({"thread": 1}, "simulate_batch has no argument 'thread'; did you mean 'threads'"),
     ],
 )
 def test_a_wrong_batch_is_refused_by_name(parts, rule):

@@ -13,7 +13,7 @@ from sealscope.errors import InputError, SimulationFailed
 from sealscope.parameters import load_rig
 from sealscope.physics.rest import initial_state
 from sealscope.physics.rig import rig_numbers
-from sealscope.physics.solvers.rk4 import advance_rk4
+from sealscope.physics.solvers.advance import EXPLICIT, advance
 from sealscope.simulation.batch.batch import simulate_batch
 from sealscope.simulation.closed_loop import outputs_per_sample
 from sealscope.simulation.courses import parse_force, parse_position
@@ -27,6 +27,8 @@ OFF = {
     "thesis-closed-loop": ({"F_pr": 30.0, "F_cfr": 1.2e-6, "F_v": 360.0, "K_oil": 551e6}, _STIFFER),
     "single-rod-eha": ({"F_pr": 120.0, "F_cfr": 6e-5, "F_v": 2400.0, "K_oil": 800e6},),
 }
+
+PI = PositionPI.of(load_rig("thesis"))
 
 
 def followed(rig: str, target: str, duration: float, **options):
@@ -63,7 +65,7 @@ def test_without_feed_forward_and_integral_it_lags():
     """The check above sees what the controller is for."""
     experiment = Experiment.of(
         rig="thesis-closed-loop", command="position 50 mm sin(1.57t)", duration=6.0,
-        controller=replace(PositionPI.of(load_rig("thesis")), k_i=0.0, drive_shortfall=0.0),
+        controller=replace(PI, k_i=0.0, drive=replace(PI.drive, shortfall=0.0)),
     )  # fmt: skip
     run = trajectory(experiment, ())
     error = experiment.target.at(run.t) - run["x"]
@@ -115,7 +117,7 @@ def step_by_step(experiment, path):
     u, none = np.empty((every, 3)), np.zeros((every, 3))
     for k, volts in enumerate(path.volts):
         u.fill(volts)
-        advance_rk4(y, path.step, u, none, none, np.zeros((0, 0)), p, False, every, rows[k : k + 1])
+        advance(EXPLICIT, y, path.step, u, none, none, np.zeros((0, 0)), p, False, every, rows[k : k + 1])
     return rows
 
 

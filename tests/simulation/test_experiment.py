@@ -11,8 +11,8 @@ import pytest
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.simulation.commands import Recorded, Sine
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.faults import Leak, Tabulated
 from sealscope.simulation.integrate import trajectory
+from sealscope.simulation.leaks import Leak, Tabulated
 from sealscope.simulation.simulate import prove, simulate, simulate_with_truth
 
 THROTTLED = {"orifices": "present", "closed_A": "50 %", "closed_B": "50 %"}

@@ -66,18 +66,18 @@ def test_warming_oil_warms(strangers):
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ('[[family]]\nname = "a"\n', "why of a must be a text"),
-        ('[[family]]\nname = "a"\nwhy = "b"\nwarm = true\n', "warm is not known in a family"),
+        ('[[family]]\nname = "a"\n', "family[1].why is missing"),
+        ('[[family]]\nname = "a"\nwhy = "b"\nwarm = true\n', "family[1].warm is not known"),
         ('[[family]]\nname = "a"\nwhy = "b"\n[[family]]\nname = "a"\nwhy = "b"\n', "names of their own"),
         (
             '[[family]]\nname = "a"\nwhy = "b"\n[[family.nuisance]]\nname = "c"\nwhy = "d"\n'
             'parameters = ["daq.bits"]\nvalues = ["x"]\nunit = "bit"\n',
-            "values of c must be numbers, got 'x'",
+            "c: values must be numbers with a unit, got 'x'",
         ),
         (
             '[[family]]\nname = "a"\nwhy = "b"\n[[family.nuisance]]\nname = "c"\nwhy = "d"\n'
             'parameters = ["cylinder.volumes"]\nvalues = ["moving"]\n',
-            "values of c must be among fixed, position, got 'moving'",
+            "c: values must be among fixed, position, got 'moving'",
         ),
     ],
 )

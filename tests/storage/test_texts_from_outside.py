@@ -15,7 +15,8 @@ from sealscope.errors import InputError, MissingExtra, SealscopeError, Simulatio
 from sealscope.parameters import load_rig, parse_overrides
 from sealscope.recordings import split_map_option
 from sealscope.simulation.commands import Chirp, check_command, parse_command
-from sealscope.simulation.faults import ParameterFault, parse_fault, parse_leak
+from sealscope.simulation.faults import Fault, parse_fault
+from sealscope.simulation.leaks import parse_leak
 from sealscope.storage.opening import names_a_file
 from sealscope.thesis.engine.kept import ResultsFolder
 from sealscope.units import parse_quantity
@@ -89,7 +90,7 @@ def test_any_blank_after_a_sign(blank: str) -> None:
     assert parse_fault(f"friction +{blank}20 % from{blank}9 s") == parse_fault("friction +20 % from 9 s")
     assert parse_leak(f"0.01{blank}L/min from 9{blank}s") == parse_leak("0.01 L/min from 9 s")
     assert str(parse_command(f"3 sin(4t +{blank}1)")) == "3 sin(4t + 1)"
-    assert parse_fault(f"friction +{blank}20 %") == ParameterFault("friction", 1.2)
+    assert parse_fault(f"friction +{blank}20 %") == Fault("friction", 1.2)
 
 
 LONG = 200_000

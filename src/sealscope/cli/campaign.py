@@ -67,9 +67,6 @@ def run(
     batch: Annotated[
         bool, typer.Option("--batch", help="Simulate side by side; for detectors of the details' RMS on both sides.")
     ] = False,
-    device: Annotated[
-        str, typer.Option("--device", metavar="cpu|gpu", help="What batches run on; gpu stands for --batch.")
-    ] = "cpu",
     trust: Annotated[
         bool,
         typer.Option("--trust", help="Run the controllers that the plan leads to (FILE.py:NAME): read them first."),
@@ -87,14 +84,13 @@ def run(
 
     loaded = load_plan(plan)
     place = _folder(loaded, folder)
-    if (batch or device != "cpu") and not isinstance(loaded, SimulatedPlan):
+    if batch and not isinstance(loaded, SimulatedPlan):
         raise InputError(f"a plan in batches must simulate its records; run it without --batch ({loaded.place})")
     if isinstance(loaded, SimulatedPlan):
         say_jobs(jobs)
         with progress_bar() as progress:
             state = carry_out(
-                loaded, place, jobs=jobs, cluster=cluster, retry=retry, progress=progress, batch=batch, device=device,
-                trust=trust,
+                loaded, place, jobs=jobs, cluster=cluster, retry=retry, progress=progress, batch=batch, trust=trust,
             )  # fmt: skip
         typer.echo(_progress_text(state))
     _report(loaded, place, sheet, data)

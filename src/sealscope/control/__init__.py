@@ -14,7 +14,5 @@ from sealscope.control.leak_observer import LeakObserver as LeakObserver
 from sealscope.control.margins import Margins as Margins
 from sealscope.control.margins import margins as margins
 from sealscope.control.position import PositionPI as PositionPI
-from sealscope.control.position import ValvePI as ValvePI
-from sealscope.control.position import position_controller as position_controller
 from sealscope.control.registry import CONTROLLERS as CONTROLLERS
 from sealscope.control.registry import controller_named as controller_named

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -62,22 +62,6 @@ def check_numbers(what: str, positive: dict[str, float], not_negative: dict[str,
             raise InputError(f"{name} of {what} must be >= 0, got {value}")
 
 
-class FlowSource(Protocol):
-    """What gives the cylinder its flow, as a controller assumes it."""
-
-    def block(self, rate: float) -> Array:
-        """Return the numbers of the inverse, called at `rate` [Hz], as `drive_voltage` takes them."""
-        ...
-
-    def steady(self, flow: float) -> float:
-        """Return the voltage [V] of a flow [m^3/s] that lasts, without a load."""
-        ...
-
-    def largest(self, u_max: float) -> float:
-        """Return the flow [m^3/s] at the voltage `u_max` [V], without a load."""
-        ...
-
-
 @dataclass(frozen=True)
 class Drive:
     """What a controller assumes of pump and drive.
@@ -104,8 +88,8 @@ class Drive:
         """Return the drive that a rig is said to have; InputError for a valve-controlled one."""
         if rig.valve.spool == "present":
             raise InputError(
-                f"a pump's drive must have a pump-controlled rig (valve.spool = absent), got {rig.name}; ValvePI and "
-                "ValveDrive are for a servo valve"
+                f"a pump's drive must have a pump-controlled rig (valve.spool = absent), got {rig.name}; ValveDrive is "
+                "for a servo valve"
             )
         motor, displacement = rig.motor, rig.pump.q_b / (2.0 * math.pi)
         shortfall, corner = (motor.C_e / motor.k_p, motor.K_i / motor.k_p) if motor.k_p > 0 else (0.0, 0.0)
@@ -140,8 +124,8 @@ class Drive:
         lagged(wanted, math.exp(decay), first, late)
         return np.asarray(self.displacement * (commanded + self.shortfall * (late - lift)) / (1.0 + self.shortfall))
 
-    def block(self, rate: float) -> Array:
-        """Return the numbers of the inverse, called at `rate` [Hz], as `drive_voltage` takes them."""
+    def block(self, rate: float, dead: float = 0.0) -> Array:
+        """Return the numbers of the inverse, called at `rate` [Hz], as `drive_voltage` takes them; no `dead` [V]."""
         fading = math.exp(-self.corner / rate)
         numbers = (self.displacement, self.omega_per_volt, self.shortfall, fading, self.droop)
         return np.array([_PUMP, *numbers, 0.0, 0.0])
@@ -206,7 +190,7 @@ class ValveDrive:
 
 
 def _inverse(block: Array) -> Callable[[float, float], float]:
-    return lambda flow, dp: drive_voltage(block, flow, dp)
+    return lambda flow, dp: float(drive_voltage(block, flow, dp))
 
 
 def drive_of(rig: Rig) -> Drive | ValveDrive:

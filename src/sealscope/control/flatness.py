@@ -12,7 +12,7 @@ import numpy as np
 from sealscope.compiled import entry, pointer_at
 from sealscope.control.controller import P_A, P_B, TARGET_SPEED, CompiledLaw, Measured, Started
 from sealscope.control.drive import DRIVE_BLOCK, Drive, ValveDrive, check_numbers, drive_of, drive_voltage
-from sealscope.control.position import PositionPI, ValvePI, followed, position_controller
+from sealscope.control.position import PositionPI, followed
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -59,7 +59,7 @@ class Flatness:
     Source: J. Levine, Analysis and Control of Nonlinear Systems: A Flatness-based Approach, Springer 2009, chapter 6.
     """
 
-    feedback: PositionPI | ValvePI
+    feedback: PositionPI
     drive: Drive | ValveDrive
     M: float
     F_C: float
@@ -81,7 +81,7 @@ class Flatness:
         by_valve = rig.valve.spool == "present"
         charge = 0.5 * (drive.p_s + 2.0 * rig.supply.p_return) if isinstance(drive, ValveDrive) else rig.fluid.p_charge
         return cls(
-            position_controller(rig),
+            PositionPI.of(rig),
             drive,
             cylinder.M_eq,
             friction.F_pr + 2.0 * friction.F_cfr * charge,

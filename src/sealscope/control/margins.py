@@ -81,24 +81,20 @@ def margins(rig: Rig, controller: Controller, speed: float = 0.0, load: float = 
 def _linearised(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array, Array, Array]:
     from sealscope.physics.rest import initial_state
     from sealscope.physics.rig import rig_numbers
-    from sealscope.physics.solvers.imex import IMEX_NODES, advance_imex
+    from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, advance, nodes_of
     from sealscope.physics.solvers.limits import longest_step
-    from sealscope.physics.solvers.rk4 import RK4_NODES, advance_rk4
     from sealscope.physics.state import OUTPUTS, POSITION, VELOCITY
 
     p = rig_numbers(rig) if load == 0.0 else rig_numbers(rig)._replace(pushed=(True,))
-    nodes = len(IMEX_NODES if p.throttled else RK4_NODES)
     steps = max(2, math.ceil(1.2 / (rate * min(1e-3, longest_step(p)))))
-    h = 1.0 / (rate * steps)
+    h, implicit, euler = 1.0 / (rate * steps), IMPLICIT if p.throttled else EXPLICIT, rig.motor.integrator == "euler"
+    nodes = nodes_of(implicit, h).size
 
     def advanced(y: Array, u: float, samples: int = 1) -> Array:
         n = samples * steps
         after, rows = np.array(y), np.empty((samples, len(OUTPUTS)))
         volts, none, force = np.full((n, nodes), u), np.zeros((n, nodes)), np.full((n, nodes), load)
-        if p.throttled:
-            advance_imex(after, h, volts, none, none, force, p, steps, rows)
-        else:
-            advance_rk4(after, h, volts, none, none, force, p, rig.motor.integrator == "euler", steps, rows)
+        advance(implicit, after, h, volts, none, none, force, p, euler, steps, rows)
         return after
 
     y, u = initial_state(rig, 0.0, load), 0.0

@@ -20,7 +20,7 @@ from sealscope.calls import closest
 from sealscope.control.controller import Controller
 from sealscope.control.fault_tolerant import FaultTolerant
 from sealscope.control.flatness import Flatness
-from sealscope.control.position import position_controller
+from sealscope.control.position import PositionPI
 from sealscope.errors import InputError
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 #: What makes each built-in controller for what a rig is said to be.
 CONTROLLERS: Mapping[str, Callable[[Rig], Controller]] = {
-    "pi": position_controller,
+    "pi": PositionPI.of,
     "flatness": Flatness.of,
     "fault-tolerant": FaultTolerant.of,
     "fault-tolerant-flatness": lambda rig: FaultTolerant.of(rig, Flatness.of(rig)),

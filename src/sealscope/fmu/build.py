@@ -105,6 +105,16 @@ def compiler() -> tuple[list[str], bool]:
     raise InputError("an FMU needs a C compiler, and there is none here; pip install 'sealscope[fmu]' brings it")
 
 
+def fmi_headers() -> Path:
+    """Return the folder of the standard's headers, which FMPy carries; raise InputError where it is not installed."""
+    from importlib.util import find_spec
+
+    package = find_spec("fmpy")
+    if package is None or package.origin is None:
+        raise InputError("an FMU needs the headers of FMI, which FMPy carries: pip install 'sealscope[fmu]'")
+    return Path(package.origin).parent / "c-code"
+
+
 def identifier_of(path: Path) -> str:
     """Return the file's name as an identifier of C."""
     name = re.sub(r"\W", "_", path.stem, flags=re.ASCII)
@@ -377,9 +387,7 @@ def _sources(place: Path, modules: Mapping[str, str], header: str, version: Vers
     """Write the sources of a unit below `place`, and return their paths."""
     layer = files("sealscope.fmu") / "c"
     written = {name: (layer / name).read_text("utf-8") for name in (*_SOURCES, f"fmi{version}.c")}
-    for entry in (layer / "headers").iterdir():
-        if entry.name.startswith(f"fmi{version}"):
-            written[f"headers/{entry.name}"] = entry.read_text("utf-8")
+    written |= {f"headers/{path.name}": path.read_text("utf-8") for path in fmi_headers().glob(f"fmi{version}*.h")}
     written["config.h"] = header
     written |= {f"{function}.ll": module for function, module in modules.items()}
     written["README.txt"] = (

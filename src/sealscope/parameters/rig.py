@@ -285,7 +285,7 @@ class Rig(Part):
                 entries[name].text(),
                 entries[name].source,
             )
-            for name, field in _declared().items()
+            for name, field in declared().items()
         ]
 
     def present(self) -> dict[str, Value]:
@@ -293,7 +293,7 @@ class Rig(Part):
 
         Two rigs have the same ones where they are the same machine, whichever parameters Sealscope has learnt since.
         """
-        return {name: self[name] for name, field in _declared().items() if self[name] != absent_of(field)}
+        return {name: self[name] for name, field in declared().items() if self[name] != absent_of(field)}
 
     def as_dict(self) -> dict[str, Any]:
         """Return the rig as plain nested values, fit for JSON: `{"motor": {"R_c": {"value": 0.73, ...}}, ...}`."""
@@ -327,10 +327,10 @@ class Rig(Part):
         entries = {**_absent_entries(place), **entries}
         known = declared_names()
         for full in entries:
-            if full not in _declared():
+            if full not in declared():
                 raise InputError(f"{full} is not a parameter{closest(full, known)} ({entries[full].place})")
         tree: dict[str, Any] = {}
-        for full, field in _declared().items():
+        for full, field in declared().items():
             if full not in entries:
                 raise InputError(f"{full} is missing ({place})")
             *groups, symbol = full.split(".")
@@ -351,7 +351,8 @@ class Rig(Part):
 
 
 @cache
-def _declared() -> dict[str, FieldInfo]:
+def declared() -> dict[str, FieldInfo]:
+    """Return the declaration of each parameter by dotted name, in the order of declaration."""
     return dict(leaves(Rig))
 
 
@@ -359,7 +360,7 @@ def _absent_entries(place: str) -> dict[str, ParameterEntry]:
     """Return an entry for each parameter that need not be stated."""
     return {
         full: ParameterEntry(value, unit_of(field), "absent from the model: not stated", place)
-        for full, field in _declared().items()
+        for full, field in declared().items()
         if (value := absent_of(field)) is not None
     }
 
@@ -367,7 +368,7 @@ def _absent_entries(place: str) -> dict[str, ParameterEntry]:
 @cache
 def declared_names() -> tuple[str, ...]:
     """Dotted names of all parameters, in the order of declaration."""
-    return tuple(_declared())
+    return tuple(declared())
 
 
 def _part(
@@ -432,7 +433,7 @@ def _si_value(full: str, field: FieldInfo, entry: ParameterEntry) -> Value:
 
 def _as_given(full: str, value: Any, place: str) -> tuple[Value, str]:
     """Value and unit that a caller's number (SI) or text (with its unit) stands for."""
-    field = _declared()[full]
+    field = declared()[full]
     if choices_of(field):
         return (value.strip() if isinstance(value, str) else value), ""
     si_unit = unit_of(field)
@@ -446,7 +447,7 @@ def flatten(tree: Iterable[tuple[str, Any]], place: str, prefix: str = "") -> di
     entries: dict[str, ParameterEntry] = {}
     for key, item in tree:
         full = prefix + key
-        if full in _declared() or (isinstance(item, dict) and "value" in item):
+        if full in declared() or (isinstance(item, dict) and "value" in item):
             entries[full] = _entry(full, item, place)
         elif isinstance(item, dict):
             entries |= flatten(item.items(), place, full + ".")
@@ -456,7 +457,7 @@ def flatten(tree: Iterable[tuple[str, Any]], place: str, prefix: str = "") -> di
 
 
 def _entry(full: str, item: Any, place: str) -> ParameterEntry:
-    if full not in _declared():
+    if full not in declared():
         raise InputError(f"{full} is not a parameter{closest(full, declared_names())} ({place})")
     shown = _shown(full)
     if not isinstance(item, dict):

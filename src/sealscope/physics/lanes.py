@@ -1,33 +1,30 @@
 """Lanes: vectors of numbers that the laws take in place of one number.
 
-One source serves one run, eight on a processor's vector registers (sixteen in single precision), and one a thread on a
-GPU. A law written without branches on its numbers (`select` instead of `if`) is compiled for plain floats, for `LANES`
-and for `SINGLES` alike; the type of an array says which of them `load` takes from it. Each operation on lanes is one
+One source serves one run and eight on a processor's vector registers (sixteen in single precision). A law written
+without branches on its numbers (`select` instead of `if`) is compiled for plain floats, for `LANES` and for `SINGLES`
+alike; the type of an array says which of them `load` takes from it. Each operation on lanes is one
 instruction over a whole vector register where the processor has it (two or four where its registers are shorter), by
 construction and not by a compiler's guess. Products and sums of lanes may be contracted to fused multiply-adds, so a
 lane and a plain run agree to rounding, not to the bit. Lanes live inside compiled functions only: `load` and `store`
-move them from and to rows of arrays. On a GPU, and in plain Python as its simulator runs it, there are no lanes: each
-thread has one run, and `load` and `store` move one plain number, that of the thread's own place in the row.
+move them from and to rows of arrays.
 """
 
 from __future__ import annotations
 
 import math
 import operator
-import threading
 from typing import Any
 
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
 from numba.core import cgutils
-from numba.core.typing import Context
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import lower_builtin, lower_cast, models, register_model
 
 from sealscope.compiled import contracted
 
-#: Runs side by side: a register of 512 bits; threads of a GPU that run in step, and so the places of a row there.
-WIDTH, WARP = 8, 32
+#: Runs side by side: a register of 512 bits.
+WIDTH = 8
 #: ... and runs side by side in single precision.
 SINGLE_WIDTH = 2 * WIDTH
 _FLAGS = ("contract",)
@@ -181,8 +178,8 @@ for _function, _name in ((operator.and_, "and_"), (operator.or_, "or_")):
 def lowered(function: Any, arity: int, result: Any, build: Any) -> None:
     """Give a plain function a compiled form too.
 
-    `result(kinds, device)` is the kind of what it returns (None where it does not take these kinds), and
-    `build(context, builder, kinds, values)` makes the instructions. `device` is true where code for a GPU is made.
+    `result(kinds)` is the kind of what it returns (None where it does not take these kinds), and
+    `build(context, builder, kinds, values)` makes the instructions.
     """
 
     @infer_global(function)
@@ -190,7 +187,7 @@ def lowered(function: Any, arity: int, result: Any, build: Any) -> None:
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
             if len(args) != arity or kws:
                 return None
-            kind = result(args, not isinstance(self.context, Context))
+            kind = result(args)
             return None if kind is None else signature(kind, *args)
 
     lower_builtin(function, *[types.Any] * arity)(
@@ -203,14 +200,14 @@ def select(condition: Any, yes: Any, no: Any) -> Any:
     return yes if condition else no
 
 
-def _chosen(kinds: Any, _: bool) -> Any:
+def _chosen(kinds: Any) -> Any:
     if isinstance(kinds[0], Mask):
         return kinds[0].lanes
     return next((kind for kind in kinds if isinstance(kind, Lanes)), types.float64)
 
 
 def _select(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
-    kind = _chosen(kinds, False)
+    kind = _chosen(kinds)
     if isinstance(kind, Lanes):
         a, b = (_as_lanes(context, builder, v, k, kind) for v, k in zip(values[1:], kinds[1:], strict=True))
     else:
@@ -233,7 +230,7 @@ def _anywhere(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
     return builder.icmp_unsigned("!=", builder.bitcast(values[0], bits), ir.Constant(bits, 0))
 
 
-lowered(anywhere, 1, lambda *_: types.boolean, _anywhere)
+lowered(anywhere, 1, lambda _: types.boolean, _anywhere)
 
 
 def _constant(kind: Any, value: float) -> Any:
@@ -252,7 +249,7 @@ def _nearest_whole(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
     return builder.fsub(builder.fadd(values[0], large, flags=_FLAGS), large, flags=_FLAGS)
 
 
-lowered(nearest_whole, 1, lambda kinds, _: kinds[0], _nearest_whole)
+lowered(nearest_whole, 1, lambda kinds: kinds[0], _nearest_whole)
 
 
 def power_of_two(n: Any) -> Any:
@@ -277,7 +274,7 @@ def _power_of_two(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
     return builder.bitcast(builder.shl(biased, shift), n.type)
 
 
-lowered(power_of_two, 1, lambda kinds, _: kinds[0], _power_of_two)
+lowered(power_of_two, 1, lambda kinds: kinds[0], _power_of_two)
 
 _LOADED = {types.float64: LANES, types.float32: SINGLES}
 
@@ -286,65 +283,35 @@ def _is_block(array: Any) -> bool:
     return isinstance(array, types.Array) and array.dtype in _LOADED and array.layout == "C"
 
 
-def on_device(context: Any) -> bool:
-    """Whether a target context makes code for a GPU."""
-    return not isinstance(context.typing_context, Context)
-
-
 def _place(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
-    """Where the lanes of a row are; on a GPU, where the number of this thread is."""
+    """Where the lanes of a row are."""
     data = context.make_array(kinds[0])(context, builder, values[0]).data
     row = context.cast(builder, values[1], kinds[1], types.intp)
-    if on_device(context):
-        kind = ir.FunctionType(ir.IntType(32), [])
-        thread = cgutils.get_or_insert_function(builder.module, kind, "llvm.nvvm.read.ptx.sreg.tid.x")
-        own = builder.and_(builder.call(thread, []), ir.Constant(ir.IntType(32), WARP - 1))
-        at = builder.mul(row, ir.Constant(row.type, WARP))
-        return cgutils.gep_inbounds(builder, data, builder.add(at, builder.zext(own, row.type)))
     lanes = _LOADED[kinds[0].dtype]
     at = builder.mul(row, ir.Constant(row.type, lanes.width))
     return builder.bitcast(cgutils.gep_inbounds(builder, data, at), _vector(lanes).as_pointer())
 
 
-def _own(array: Any, row: int) -> tuple[Any, int]:
-    """Return all numbers of an array, and the place of this thread's number of a row among them, in plain Python.
-
-    The simulator wraps arrays twice, and each attribute of its wrappers is slow.
-    """
-    for wrapper in ("_item", "_ary"):
-        array = getattr(array, wrapper, array)
-    width = array.shape[-1]
-    return array.reshape(-1), row * width + getattr(threading.current_thread(), "thread_id", 0) % width
-
-
 def load(array: Any, row: int) -> Any:
     """Return the lanes of row `row` of a C-ordered array, rows counted through all leading axes.
 
-    It is (..., WIDTH) of doubles, or (..., SINGLE_WIDTH) in single precision. On a GPU the thread's number of row `row`
-    of an array (..., WARP).
+    It is (..., WIDTH) of doubles, or (..., SINGLE_WIDTH) in single precision.
     """
-    numbers, at = _own(array, row)
-    return numbers[at]
 
 
-def load_number(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
-    """Return the instructions of `load`."""
+def _load(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
     return builder.load(_place(context, builder, kinds, values), align=kinds[0].dtype.bitwidth // 8)
 
 
-def _loaded(kinds: Any, device: bool) -> Any:
-    if not (_is_block(kinds[0]) and isinstance(kinds[1], types.Integer)):
-        return None
-    return kinds[0].dtype if device else _LOADED[kinds[0].dtype]
+def _loaded(kinds: Any) -> Any:
+    return _LOADED[kinds[0].dtype] if _is_block(kinds[0]) and isinstance(kinds[1], types.Integer) else None
 
 
-lowered(load, 2, _loaded, load_number)
+lowered(load, 2, _loaded, _load)
 
 
 def store(array: Any, row: int, value: Any) -> None:
-    """Write lanes into row `row` of an array as `load` reads it; on a GPU the thread's number."""
-    numbers, at = _own(array, row)
-    numbers[at] = value
+    """Write lanes into row `row` of an array as `load` reads it."""
 
 
 def _store(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
@@ -352,8 +319,8 @@ def _store(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
     return context.get_dummy_value()
 
 
-def _stored(kinds: Any, device: bool) -> Any:
-    return types.none if _loaded(kinds, device) == kinds[2] else None
+def _stored(kinds: Any) -> Any:
+    return types.none if _loaded(kinds) == kinds[2] else None
 
 
 lowered(store, 3, _stored, _store)
@@ -361,16 +328,13 @@ lowered(store, 3, _stored, _store)
 
 def spread(value: Any) -> Any:
     """Return the same number in every lane of doubles."""
-    return float(value)
 
 
 def _spread_out(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
-    if on_device(context):
-        return context.cast(builder, values[0], kinds[0], types.float64)
     return _as_lanes(context, builder, values[0], kinds[0], LANES)
 
 
-lowered(spread, 1, lambda kinds, device: types.float64 if device else LANES, _spread_out)
+lowered(spread, 1, lambda _: LANES, _spread_out)
 
 
 _LOG2_E = 1.4426950408889634

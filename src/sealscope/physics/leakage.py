@@ -37,11 +37,3 @@ def leakage_series(dp: np.ndarray, G: np.ndarray, C: np.ndarray, dp_0: float) ->
     for k in range(dp.size):
         flow[k] = piston_leakage(dp[k], G[k], C[k], dp_0)
     return flow
-
-
-def orifice_over_laminar(size: np.ndarray) -> float:
-    """Return the mean flow of an orifice over that of a worn seal which shows the same conductance.
-
-    Shown is the conductance of least squares, sum(Q dp)/sum(dp^2), at pressure differences of `size` (n,) [Pa].
-    """
-    return float(np.mean(size**0.5) * np.mean(size**2) / (np.mean(size**1.5) * np.mean(size)))

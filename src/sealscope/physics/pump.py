@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from sealscope.compiled import contracted, kernel
+from sealscope.compiled import contracted, law
 from sealscope.physics.restrictors import orifice_flow
 
 
@@ -31,7 +31,7 @@ def pump_torque(dp: float, q_b: float) -> float:
     return q_b / (2.0 * math.pi) * dp
 
 
-@kernel
+@law
 def loss_coefficients(q_b: float, C_st: float, C_h: float, rho: float) -> tuple[float, float]:
     """Return c_slip [m^3/(s Pa^0.5)] of the turbulent slip and k_h [N m s^2] of the hydrodynamic torque.
 

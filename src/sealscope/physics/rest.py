@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sealscope.compiled import kernel
+from sealscope.compiled import kernel, law
 from sealscope.errors import InputError
 from sealscope.physics.cylinder import hard_stop_force, load_force, opposing_force
 from sealscope.physics.fluid import P_ATM
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from sealscope.parameters import Cylinder, Rig
 
 
-@kernel
+@law
 def carried_at_rest(
     x: float, F_l: float, k_load: float, A_opp: float, p_opp: float, L: float, k_stop: float, d_stop: float
 ) -> float:
@@ -33,13 +33,13 @@ def holding_current(dp: float, q_b: float, C_m: float) -> float:
     return pump_torque(dp, q_b) / C_m
 
 
-@kernel
+@law
 def holding_integral(i: float, R_c: float, K_i: float) -> float:
     """Speed controller's integral [rad] that gives the winding its current i [A] at rest: R_c i/K_i, eq. (4.3)."""
     return R_c * i / K_i if K_i > 0.0 else 0.0
 
 
-@kernel
+@law
 def pressures_at_rest(
     force: float, A_A: float, A_B: float, V_A: float, V_B: float, p_charge: float, made_up: bool
 ) -> tuple[float, float]:
@@ -57,7 +57,7 @@ def pressures_at_rest(
     return p_charge + moved / V_A, p_charge - moved / V_B
 
 
-@kernel
+@law
 def pressures_behind_valve(force: float, A_A: float, A_B: float, p_1: float, p_2: float) -> tuple[float, float]:
     """Return p_A, p_B [Pa] that carry `force` [N] against +x behind a servo valve with equal edges at null.
 

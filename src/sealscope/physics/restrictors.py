@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from sealscope.compiled import contracted, kernel, law
+from sealscope.compiled import contracted, law
 from sealscope.physics.lanes import anywhere, select
 
 
-@kernel
+@law
 def orifice_coefficient(C_d: float, area: float, rho: float) -> float:
     """Flow coefficient c = C_d A sqrt(2/rho) [m^3/(s Pa^0.5)] of an orifice (factor of eqs. 4.9-4.12)."""
     return C_d * area * math.sqrt(2.0 / rho)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sealscope.compiled import contracted, kernel
+from sealscope.compiled import contracted, law
 from sealscope.parameters import Rig
 from sealscope.parameters.fields import leaves, unit_of
 from sealscope.physics.cylinder import (
@@ -179,7 +179,7 @@ else:  # numba takes a named tuple apart; its fields are those of the models
     RigNumbers = namedtuple("RigNumbers", (*NUMBERS, *CHOICES))
 
 
-@kernel
+@law
 def coefficients_of_throttles(
     C_d: float,
     d_line: float,
@@ -207,7 +207,7 @@ def coefficients_of_throttles(
     return A_in, A_out, B_free, B_throttled
 
 
-@kernel
+@law
 def derived_numbers(
     C_d: float,
     d_line: float,

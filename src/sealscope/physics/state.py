@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from sealscope.compiled import contracted, kernel
+from sealscope.compiled import contracted, law
 
 STATES = ("I", "i", "omega", "theta", "x", "v", "p_A", "p_B", "p_1", "p_2", "V_up", "z", "x_s", "v_s")
 INTEGRAL, CURRENT, OMEGA, THETA, POSITION, VELOCITY, P_A, P_B, P_1, P_2, MADE_UP, BRISTLE, SPOOL, SPOOL_SPEED = range(
@@ -58,7 +58,7 @@ def pressures_moved(y: State, h: float, s: Pressures) -> State:
     return y[0], y[1], y[2], y[3], y[4], y[5], p_A, p_B, p_1, p_2, y[10], y[11], y[12], y[13]
 
 
-@kernel
+@law
 def survey(rows: np.ndarray) -> tuple[bool, float, float]:
     """Of rows of outputs (n, 21): whether all are finite, the largest |x| [m], and the lowest pressure [Pa]."""
     reach, least, total = 0.0, math.inf, 0.0

@@ -3,17 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
-
-import numpy as np
-from numpy.typing import NDArray
 
 from sealscope.compiled import contracted
 from sealscope.physics.lanes import select
 from sealscope.physics.restrictors import orifice_flow
-
-if TYPE_CHECKING:
-    from sealscope.parameters.valve import ServoValve
 
 
 @contracted
@@ -60,19 +53,3 @@ def edge_flow(dp: float, way: float, overlap: float, Q_N: float, dp_N: float, x_
     """
     c = Q_N / math.sqrt(dp_N) * max(way - overlap, 0.0) / x_max
     return orifice_flow(dp, c, dp_lam)
-
-
-def spool_series(u: NDArray[np.float64], valve: ServoValve, rate: float, parts: int) -> NDArray[np.float64]:
-    """Return the spool's place [m] in the middles of `parts` parts of each sample, (parts (n - 1),), from rest.
-
-    The command u (n,) [V] is held from sample to sample at `rate` [Hz], and the spool is the lag of the second order of
-    `spool_acceleration`, exact between the parts; its limit of speed is left out.
-    """
-    from scipy.signal import cont2discrete, lfilter
-
-    target = valve.x_max * np.clip(u / valve.u_N, -1.0, 1.0)
-    lag = (np.array([valve.omega_s**2]), np.array([1.0, 2.0 * valve.zeta_s * valve.omega_s, valve.omega_s**2]))
-    numerator, denominator, _ = cont2discrete(lag, 1.0 / (rate * parts))
-    place = lfilter(numerator.ravel(), denominator, np.repeat(target, parts))
-    middles = 0.5 * (place[1:] + place[:-1])[: (u.size - 1) * parts]
-    return np.asarray(np.clip(middles, -valve.x_max, valve.x_max))

@@ -18,7 +18,8 @@ from sealscope.recordings.recording import Array
 from sealscope.simulation.changes import Effect, ParameterDrift, Readings
 from sealscope.simulation.commands import Command, Sine, check_command
 from sealscope.simulation.courses import Force, Position, command_or_target, parse_force
-from sealscope.simulation.faults import Fault, Leak, Thinned, parse_fault, parse_leak
+from sealscope.simulation.faults import Fault, parse_fault
+from sealscope.simulation.leaks import Leak, Thinned, parse_leak
 from sealscope.units import parse_quantity
 
 if TYPE_CHECKING:
@@ -289,9 +290,9 @@ class Experiment:
         """The controller that follows the target, its own or the one that knows the rig; None for a command."""
         if not isinstance(self.command, Position):
             return None
-        from sealscope.control import position_controller
+        from sealscope.control import PositionPI
 
-        return self.controller or position_controller(self.rig)
+        return self.controller or PositionPI.of(self.rig)
 
     def effects(self) -> tuple[Effect, ...]:
         """Return what changes in the machine within the run."""

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
 
-from sealscope.compiled import kernel
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
@@ -23,8 +22,8 @@ from sealscope.simulation.closed_loop import Feedback, outputs_per_sample
 from sealscope.simulation.commands import Sine, check_command
 from sealscope.simulation.courses import Force, numbers_under
 from sealscope.simulation.experiment import LONGEST_STEP, PRESSURE_TOLERANCE, Experiment, Method, choose_method
-from sealscope.simulation.faults import Leak
 from sealscope.simulation.instruments import FILTER_REACH
+from sealscope.simulation.leaks import Leak
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -85,19 +84,6 @@ class Inputs(Protocol):
         ...
 
 
-@kernel
-def sines_of_sums(
-    sine: np.ndarray, cosine: np.ndarray, sine_off: np.ndarray, cosine_off: np.ndarray, amplitude: float, offset: float
-) -> np.ndarray:
-    """Return offset + amplitude sin(a + b), (n, m), for all a (n,) and b (m,), from the sines and cosines of both."""
-    out = np.empty((sine.size, sine_off.size))
-    for k in range(sine.size):
-        s, c = amplitude * sine[k], amplitude * cosine[k]
-        for m in range(sine_off.size):
-            out[k, m] = offset + (s * cosine_off[m] + c * sine_off[m])
-    return out
-
-
 class NodeSines:
     """A sine at the nodes of steps, block after block.
 
@@ -121,7 +107,8 @@ class NodeSines:
         s, c = np.sin(angle), np.cos(angle)
         sine = s * self._cosine[:n] + c * self._sine[:n]
         cosine = c * self._cosine[:n] - s * self._sine[:n]
-        return np.asarray(sines_of_sums(sine, cosine, np.sin(turn), np.cos(turn), amplitude, offset))
+        turned = np.outer(amplitude * sine, np.cos(turn)) + np.outer(amplitude * cosine, np.sin(turn))
+        return np.asarray(offset + turned)
 
 
 class RunInputs:
@@ -334,65 +321,38 @@ class _Run:
 
     def advance(self, y: Array, start: int, stop: int, every: int, rows: Array, origin: int = 0) -> None:
         """Advance the state `y` in place from output `start` to `stop`, `every` steps each; write rows k - origin."""
-        from sealscope.physics.solvers.imex import IMEX_NODES, advance_imex
+        from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, advance, advance_closed, nodes_of
         from sealscope.physics.solvers.limits import longest_step
-        from sealscope.physics.solvers.rk4 import RK4_NODES, advance_rk4
-        from sealscope.physics.state import survey
 
         unloaded = np.zeros((0, 0))
         h = 1.0 / (self.rate * every)
-        nodes = np.array(IMEX_NODES if self.method == "imex" else RK4_NODES)
-        nodes[0], nodes[-1] = 1e-9, 1.0 - 1e-9  # the limits from inside the step
+        implicit = IMPLICIT if self.method == "imex" else EXPLICIT
+        nodes = nodes_of(implicit, h)
         block = max(1, _BLOCK_STEPS // every)
         last = start
         while last < stop:
             first, last = last, min(last + block, stop)
             steps = np.arange(first * every, last * every, dtype=np.float64)
             # writable, so that a run with a leak takes the kernel that one without (zeros shared by all) has compiled
-            u, G, C = (np.require(a, requirements=("C", "W")) for a in self.inputs.at_nodes(steps * h, nodes * h))
-            F = unloaded if self.load is None else np.ascontiguousarray(self.load.at(steps[:, None] * h + nodes * h))
+            u, G, C = (np.require(a, requirements=("C", "W")) for a in self.inputs.at_nodes(steps * h, nodes))
+            F = unloaded if self.load is None else np.ascontiguousarray(self.load.at(steps[:, None] * h + nodes))
             worst = float(G.max()), float(C.max())
             for k, end, p in self.schedule.within(first, last):
                 if not self.allow_unresolved and max(worst) > 0.0:
                     refuse_long(h, longest_step(p, *worst), "the leak")
                 part = slice((k - first) * every, (end - first) * every)
                 out = rows[k - origin : end - origin]
-                if self.feedback is not None:
-                    self._follow(self.feedback, y, h, (G[part], C[part], F[part]), p, every, out, k)
-                elif self.method == "imex":
-                    advance_imex(y, h, u[part], G[part], C[part], F[part], p, every, out)
+                inputs, how = (G[part], C[part], F[part]), (p, self.euler, every)
+                if self.feedback is None:
+                    outputs, *surveyed = end - k, *advance(implicit, y, h, u[part], *inputs, *how, out)
                 else:
-                    advance_rk4(y, h, u[part], G[part], C[part], F[part], p, self.euler, every, out)
-            if self.feedback is None:
-                done = rows[first - origin : last - origin]
-                self._refuse(survey(done), p, h, done, first)
+                    outputs, *surveyed = advance_closed(implicit, y, h, *inputs, *how, k, out, self.feedback.loop)
+                self._refuse(surveyed, p, h, out[:outputs], k)
+                if self.feedback is not None and outputs < end - k:
+                    self.feedback.refuse()
             if self.progress is not None and last / self.rate > self.reached:
                 self.reached = last / self.rate
                 self.progress(self.reached)
-
-    def _follow(
-        self,
-        feedback: Feedback,
-        y: Array,
-        h: float,
-        inputs: tuple[Array, Array, Array],
-        p: RigNumbers,
-        every: int,
-        out: Array,
-        start: int,
-    ) -> None:
-        """Advance the state over the outputs `out` from `start` on, under a controller; `inputs`: G, C and load."""
-        from sealscope.physics.solvers.imex import closed_imex
-        from sealscope.physics.solvers.rk4 import closed_rk4
-
-        outputs, *surveyed = (
-            closed_imex(y, h, *inputs, p, every, start, out, feedback.loop)
-            if self.method == "imex"
-            else closed_rk4(y, h, *inputs, p, self.euler, every, start, out, feedback.loop)
-        )
-        self._refuse(surveyed, p, h, out[:outputs], start)
-        if outputs < len(out):
-            feedback.refuse()
 
     def _refuse(self, surveyed: Sequence[float], p: RigNumbers, h: float, rows: Array, first: int) -> None:
         """Raise SimulationFailed where rows from the output `first` on, as surveyed, are beyond what the rig allows."""

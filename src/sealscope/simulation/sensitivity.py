@@ -17,9 +17,9 @@ from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.chambers import CHAMBERS, PRESSURES
 from sealscope.recordings.recording import Array
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.faults import Leak
 from sealscope.simulation.instruments import decimate, lagging
 from sealscope.simulation.integrate import oversampling, trajectory
+from sealscope.simulation.leaks import Leak
 from sealscope.units import LITRE_PER_MINUTE
 
 #: The first step of a leak's derivative: this mean flow [m^3/s] ...

@@ -17,9 +17,10 @@ from sealscope.recordings.chambers import CHAMBERS, PRESSURES
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
 from sealscope.simulation.changes import ParameterDrift
 from sealscope.simulation.experiment import PRESSURE_TOLERANCE, Experiment
-from sealscope.simulation.faults import Fault, Leak
+from sealscope.simulation.faults import Fault
 from sealscope.simulation.instruments import decimate, record
 from sealscope.simulation.integrate import DETAIL_TOLERANCE, Trajectory, oversampling, trajectory
+from sealscope.simulation.leaks import Leak
 from sealscope.simulation.sizing import leak_flow, mean_while_open, sized_run
 from sealscope.storage.atomic import atomic_write
 from sealscope.units import LITRE_PER_MINUTE

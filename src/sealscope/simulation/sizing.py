@@ -11,8 +11,8 @@ import numpy as np
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.recording import Array
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.faults import Leak
 from sealscope.simulation.integrate import Trajectory, trajectory
+from sealscope.simulation.leaks import Leak
 from sealscope.units import LITRE_PER_MINUTE
 
 #: Relative distance from the mean asked for at which the search ends, and within which the closest run is taken after
@@ -24,12 +24,12 @@ _LEAST_SLOPE = 0.1
 
 def leak_flow(leak: Leak, t: Array, dp: Array, dp_0: float) -> Array:
     """Return |Q_L| [m^3/s] of a leak with a known coefficient under the chambers' pressure difference `dp` [Pa]."""
-    from sealscope.physics.leakage import leakage_series
+    from sealscope.physics.leakage import laminar_leakage, leakage_series
 
     size = (leak.coefficient or 0.0) * leak.opening.share(t)
-    none = np.zeros_like(size)
-    G, C = (size, none) if leak.law == "laminar" else (none, size)
-    return np.asarray(np.abs(leakage_series(np.ascontiguousarray(dp), G, C, dp_0)))
+    if leak.law == "laminar":
+        return np.asarray(np.abs(laminar_leakage(dp, size)))  # type: ignore[arg-type]
+    return np.asarray(np.abs(leakage_series(np.ascontiguousarray(dp), np.zeros_like(size), size, dp_0)))
 
 
 def mean_while_open(leak: Leak, t: Array, flow: Array) -> float:

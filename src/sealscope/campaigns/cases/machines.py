@@ -13,7 +13,7 @@ from sealscope.campaigns.plans.model import SimulatedPlan
 if TYPE_CHECKING:
     from sealscope.simulation.bench.profile import Profile
     from sealscope.simulation.experiment import Experiment
-    from sealscope.simulation.faults import Leak
+    from sealscope.simulation.leaks import Leak
 
 #: Length [s] of the run that sizes a leak on its machine; two periods of the slowest of the thesis's commands.
 SIZING_SECONDS = 13.0
@@ -21,7 +21,7 @@ SIZING_SECONDS = 13.0
 
 def leak_of(plan: SimulatedPlan, case: CampaignCase) -> tuple[Leak, ...]:
     """Return the case's leak, open from the plan's onset on; its size still a mean flow."""
-    from sealscope.simulation.faults import From, Leak
+    from sealscope.simulation.leaks import From, Leak
     from sealscope.units import LITRE_PER_MINUTE
 
     if not case.leak_lpm:
@@ -81,7 +81,7 @@ def _by_full_name(values: Mapping[str, str | float]) -> dict[str, str | float]:
 
 def sizing_run(experiment: Experiment) -> Experiment:
     """Return the short run on which an experiment's leaks are sized, open from its start."""
-    from sealscope.simulation.faults import From
+    from sealscope.simulation.leaks import From
 
     return replace(
         experiment,

@@ -33,15 +33,12 @@ if TYPE_CHECKING:
     from sealscope.simulation.experiment import Experiment
 
 #: Runs of a batch, after each of which the rows are on disk.
-RUNS = {"cpu": 256, "gpu": 4096}
+RUNS = 256
+#: Mode of rows of batches: they are not mixed with those of another mode, whose noise differs.
+IN_BATCHES = "in batches"
 #: Machines of a cell on which its step is chosen, and how long [s] each of them runs for that: the first window that
 #: `integrate` checks, and two more.
 SCOUTS, SCOUTED = 4, 4.0
-
-
-def mode_of(device: str) -> str:
-    """Return the mode of rows of batches: they are not mixed with those of another mode, whose noise differs."""
-    return f"in batches on the {device}"
 
 
 def bounds_of(plan: SimulatedPlan) -> IntArray:
@@ -85,34 +82,23 @@ def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
             raise no(f"runs that can stand side by side, got: {error}") from None
 
 
-def check_device(plan: SimulatedPlan, device: str) -> None:
-    """Raise InputError for a device that is not there: before the work, not as the error of every row."""
-    from sealscope.simulation.batch.batch import runner_of
-
-    if device not in RUNS:
-        raise InputError(f"--device must be {' or '.join(RUNS)}, got {device}")
-    runner_of(device)
-
-
-def in_batches(
-    plan: SimulatedPlan, cases: Sequence[CampaignCase], threads: int, device: str = "cpu"
-) -> Generator[CaseRow, None, None]:
+def in_batches(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads: int) -> Generator[CaseRow, None, None]:
     """Yield the rows of the cases, batch by batch; a case that cannot be carried out costs no other.
 
     A row derives from its case alone, whatever stands beside it.
     """
-    batches = _Batches(plan, threads, device)
-    for start in range(0, len(cases), RUNS[device]):
-        yield from batches.rows(cases[start : start + RUNS[device]])
+    batches = _Batches(plan, threads)
+    for start in range(0, len(cases), RUNS):
+        yield from batches.rows(cases[start : start + RUNS])
 
 
 class _Batches:
     """Carries out the cases of one plan."""
 
-    def __init__(self, plan: SimulatedPlan, threads: int, device: str) -> None:
+    def __init__(self, plan: SimulatedPlan, threads: int) -> None:
         from sealscope.simulation.bench.profile import load_profile
 
-        self._plan, self._threads, self._device = plan, threads, device
+        self._plan, self._threads = plan, threads
         self._profile = load_profile(plan.profile) if plan.profile else None
         self._steps = StepChooser(plan, self._profile)
         self._bounds = bounds_of(plan)
@@ -147,7 +133,7 @@ class _Batches:
         cases = [case for case, _ in drawn]
         experiments = self._sized([experiment for _, experiment in drawn])
         edges = self._bounds.ravel() / self._plan.rig.daq.sample_rate
-        batch = simulate_batch(experiments, bounds=edges, threads=self._threads, device=self._device)
+        batch = simulate_batch(experiments, bounds=edges, threads=self._threads)
         squares = batch.rms[:, :, [0, 2]] ** 2
         rows = []
         for k, case in enumerate(cases):
@@ -174,7 +160,7 @@ class _Batches:
             return sized
         short = [sizing_run(experiments[k]) for k in leaky]
         try:
-            sizes = simulate_batch(short, threads=self._threads, device=self._device).coefficients.tolist()
+            sizes = simulate_batch(short, threads=self._threads).coefficients.tolist()
         except SealscopeError:
             if len(experiments) > 1:  # halving finds the one that is to blame
                 raise

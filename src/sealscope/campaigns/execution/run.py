@@ -36,31 +36,27 @@ def run(
     progress: ProgressCallback | None = None,
     task: Task = work,
     batch: bool = False,
-    device: str = "cpu",
     trust: bool = False,
 ) -> store.CampaignProgress:
     """Carry out what is missing of the plan in `folder`, and return how far it is then.
 
     `jobs`: processes of this machine, one a core by default and two a core at most, 1 for this process alone;
     `cluster`: address of a Dask scheduler instead; `retry`: carry failed cases out again; `batch`: simulate cases side
-    by side (`batches`) on the `device`, cpu (with `jobs` threads) or gpu, which implies `batch`; `trust`: whether
-    controllers that the plan leads to (`FILE.py:NAME`) are run, which may be a stranger's. The rows are the same
-    whoever makes them and in whatever order, those of batches in any batch; kinds of records take turns
-    (`interleaved`). Raises InputError where a controller is not trusted, the folder holds another campaign, another run
-    is at work in it, or a batch cannot do what the plan asks for.
+    by side (`batches`) with `jobs` threads; `trust`: whether controllers that the plan leads to (`FILE.py:NAME`) are
+    run, which may be a stranger's. The rows are the same whoever makes them and in whatever order, those of batches in
+    any batch; kinds of records take turns (`interleaved`). Raises InputError where a controller is not trusted, the
+    folder holds another campaign, another run is at work in it, or a batch cannot do what the plan asks for.
     """
     if jobs is not None and jobs < 1:
         raise InputError(f"--jobs must be >= 1, got {jobs}")
     check_controllers(plan, trust)
-    batch = batch or device != "cpu"
     cases = cases_of(plan)
     mode = store.RUN_BY_RUN
     if batch:
         if cluster is not None:
             raise InputError("--cluster must stand without --batch: a batch is made by one machine")
-        batches.check_device(plan, device)
         batches.check_plan(plan, cases)
-        mode = batches.mode_of(device)
+        mode = batches.IN_BATCHES
     place = Path(folder)
     store.begin(place, store.made_from(plan, mode))
     with store.locked(place):
@@ -77,7 +73,7 @@ def run(
             keep = inner_folder(place, RECORDINGS)
         jobs = process_count(jobs)
         if batch:
-            new_rows = batches.in_batches(plan, waiting, jobs, device)
+            new_rows = batches.in_batches(plan, waiting, jobs)
         else:
             new_rows = _rows(partial(_carry_out, task, plan, keep), waiting, jobs, cluster)
         with store.appending(place) as append, closing(new_rows):

@@ -26,7 +26,7 @@ _SAME = {
     "name": "campaign",
     "world": "rig, bench, length, onset or seed",
     "code": "program code",
-    "mode": "mode of making rows (run by run, or in batches on which device)",
+    "mode": "mode of making rows (run by run, or in batches)",
     "false_alarm_within": "false-alarm probability, at which its detectors search within a record",
     "assumed": "rig that its detectors assume",
     "plug_ins": "detectors of other distributions",
@@ -62,7 +62,7 @@ class CampaignProgress:
 
 
 def made_from(plan: SimulatedPlan, mode: str = RUN_BY_RUN) -> dict[str, Any]:
-    """Return what a campaign's rows depend on, as plain values; `mode`: `RUN_BY_RUN` or `batches.mode_of`."""
+    """Return what a campaign's rows depend on, as plain values; `mode`: `RUN_BY_RUN` or `batches.IN_BATCHES`."""
     detectors = [plan_detector(name) for name in plan.detectors]
     searching = any(detector.scorer is None for detector in detectors)  # its verdict follows from the probability
     assumed = plan.assumed or plan.rig

@@ -9,7 +9,6 @@ static fmi2Status status_of(int code) { return code ? fmi2Error : fmi2OK; }
 
 static void report(void *instance, const char *name, int code, const char *message) {
     Instance *unit = instance;
-    (void)code;
     if (unit->logger) ((fmi2CallbackLogger)unit->logger)(unit->environment, name, fmi2Error, "logStatusError", "%s", message);
 }
 
@@ -17,13 +16,11 @@ const char *fmi2GetTypesPlatform(void) { return fmi2TypesPlatform; }
 const char *fmi2GetVersion(void) { return fmi2Version; }
 
 fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean on, size_t n, const fmi2String categories[]) {
-    (void)c, (void)on, (void)n, (void)categories;
     return fmi2OK;
 }
 
 fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String token, fmi2String resources,
                               const fmi2CallbackFunctions *functions, fmi2Boolean visible, fmi2Boolean logging) {
-    (void)resources, (void)visible, (void)logging;
     if (type != fmi2CoSimulation) return NULL;
     return unit_new(name, token, functions ? functions->componentEnvironment : NULL,
                     functions ? (void *)functions->logger : NULL, report);
@@ -33,7 +30,6 @@ void fmi2FreeInstance(fmi2Component c) { unit_free(c); }
 
 fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean tolerance_defined, fmi2Real tolerance, fmi2Real start,
                                fmi2Boolean stop_defined, fmi2Real stop) {
-    (void)tolerance_defined, (void)tolerance, (void)stop_defined, (void)stop;
     ((Instance *)c)->block.time = start;
     return fmi2OK;
 }
@@ -69,11 +65,9 @@ fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference references[], s
 
 #define NONE_OF(Type)                                                                                                  \
     fmi2Status fmi2Get##Type(fmi2Component c, const fmi2ValueReference r[], size_t n, fmi2##Type v[]) {                \
-        (void)c, (void)r, (void)v;                                                                                     \
         return n ? fmi2Error : fmi2OK;                                                                                 \
     }                                                                                                                  \
     fmi2Status fmi2Set##Type(fmi2Component c, const fmi2ValueReference r[], size_t n, const fmi2##Type v[]) {          \
-        (void)c, (void)r, (void)v;                                                                                     \
         return n ? fmi2Error : fmi2OK;                                                                                 \
     }
 NONE_OF(Integer)
@@ -81,49 +75,33 @@ NONE_OF(Boolean)
 NONE_OF(String)
 
 fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *state) {
-    if (!*state) *state = malloc(sizeof(Block));
-    if (!*state) return fmi2Error;
-    memcpy(*state, &((Instance *)c)->block, sizeof(Block));
-    return fmi2OK;
+    return status_of(unit_keep(c, state, &((Instance *)c)->block, sizeof(Block)));
 }
-
 fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate state) {
     memcpy(&((Instance *)c)->block, state, sizeof(Block));
     return fmi2OK;
 }
-
 fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *state) {
-    (void)c;
     free(*state);
     *state = NULL;
     return fmi2OK;
 }
-
 fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, fmi2FMUstate state, size_t *size) {
-    (void)c, (void)state;
     *size = sizeof(Block);
     return fmi2OK;
 }
-
 fmi2Status fmi2SerializeFMUstate(fmi2Component c, fmi2FMUstate state, fmi2Byte bytes[], size_t size) {
-    (void)c;
     if (size < sizeof(Block)) return fmi2Error;
     memcpy(bytes, state, sizeof(Block));
     return fmi2OK;
 }
-
 fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte bytes[], size_t size, fmi2FMUstate *state) {
-    if (size != sizeof(Block)) return status_of(unit_refuse(c, WRONG_CALL, "a state must have %zu bytes, got %zu", sizeof(Block), size));
-    if (!*state) *state = malloc(sizeof(Block));
-    if (!*state) return fmi2Error;
-    memcpy(*state, bytes, sizeof(Block));
-    return fmi2OK;
+    return status_of(unit_keep(c, state, bytes, size));
 }
 
 fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReference unknowns[], size_t n,
                                         const fmi2ValueReference knowns[], size_t m, const fmi2Real seed[],
                                         fmi2Real derivative[]) {
-    (void)unknowns, (void)n, (void)knowns, (void)m, (void)seed, (void)derivative;
     return status_of(unit_refuse(c, WRONG_CALL, "the unit has no directional derivatives"));
 }
 
@@ -139,19 +117,16 @@ fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference
 
 fmi2Status fmi2GetRealOutputDerivatives(fmi2Component c, const fmi2ValueReference references[], size_t n,
                                         const fmi2Integer order[], fmi2Real values[]) {
-    (void)references, (void)n, (void)order, (void)values;
     return status_of(unit_refuse(c, WRONG_CALL, "the unit has no derivatives of outputs"));
 }
 
 fmi2Status fmi2DoStep(fmi2Component c, fmi2Real time, fmi2Real span, fmi2Boolean no_set_prior) {
-    (void)no_set_prior;
     return status_of(unit_advance(c, time, span));
 }
 
 fmi2Status fmi2CancelStep(fmi2Component c) { return status_of(unit_refuse(c, WRONG_CALL, "no step is under way")); }
 
 fmi2Status fmi2GetStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Status *value) {
-    (void)c, (void)kind, (void)value;
     return fmi2Discard;
 }
 
@@ -162,7 +137,6 @@ fmi2Status fmi2GetRealStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Rea
 }
 
 fmi2Status fmi2GetIntegerStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Integer *value) {
-    (void)c, (void)kind, (void)value;
     return fmi2Discard;
 }
 
@@ -173,6 +147,5 @@ fmi2Status fmi2GetBooleanStatus(fmi2Component c, const fmi2StatusKind kind, fmi2
 }
 
 fmi2Status fmi2GetStringStatus(fmi2Component c, const fmi2StatusKind kind, fmi2String *value) {
-    (void)c, (void)kind, (void)value;
     return fmi2Discard;
 }

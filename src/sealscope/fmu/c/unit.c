@@ -153,3 +153,11 @@ int unit_advance(Instance *unit, double time, double span) {
     b->fresh = 0;
     return code ? failure(unit, code) : OK;
 }
+
+int unit_keep(Instance *unit, void **state, const void *block, size_t size) {
+    if (size != sizeof(Block)) return unit_refuse(unit, WRONG_CALL, "a state must have %zu bytes, got %zu", sizeof(Block), size);
+    if (!*state) *state = malloc(sizeof(Block));
+    if (!*state) return WRONG_CALL;
+    memcpy(*state, block, sizeof(Block));
+    return OK;
+}

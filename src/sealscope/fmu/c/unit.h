@@ -34,6 +34,7 @@ int unit_get(Instance *unit, uint32_t reference, double *value);
 int unit_set(Instance *unit, uint32_t reference, double value);
 int unit_set_slope(Instance *unit, uint32_t reference, double slope);
 int unit_advance(Instance *unit, double time, double span);
+int unit_keep(Instance *unit, void **state, const void *block, size_t size);
 int unit_refuse(Instance *unit, int code, const char *format, ...);
 
 #endif

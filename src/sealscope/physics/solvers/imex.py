@@ -11,11 +11,9 @@ work-precision table that chose it.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
-from sealscope.compiled import contracted, kernel
+from sealscope.compiled import contracted, law
 from sealscope.physics.cylinder import pressure_rate
 from sealscope.physics.fluid import P_ATM
 from sealscope.physics.lanes import anywhere, select
@@ -23,7 +21,6 @@ from sealscope.physics.rig import (
     RigNumbers,
     bulk_modulus,
     implicit_flows,
-    observe,
     pressures_of,
     rates_without_throttles,
     throttle_flows,
@@ -31,7 +28,6 @@ from sealscope.physics.rig import (
     volumes_at,
     within_limits,
 )
-from sealscope.physics.solvers.loop import APART, Loop, sampled
 from sealscope.physics.state import (
     P_1,
     P_2,
@@ -42,8 +38,6 @@ from sealscope.physics.state import (
     State,
     moved,
     pressures_moved,
-    state_of,
-    survey,
 )
 
 #: Nodes of the step at which the inputs are needed.
@@ -155,67 +149,15 @@ def imex_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, F: Nodes, p: Rig
     return within_limits(z, p)
 
 
-@kernel
-def advance_imex(
-    y: np.ndarray,
-    h: float,
-    u: np.ndarray,
-    G: np.ndarray,
-    C: np.ndarray,
-    F: np.ndarray,
-    p: RigNumbers,
-    every: int,
-    rows: np.ndarray,
-) -> None:
-    """Advance `y` (14,) in place by n steps of h [s]; every `every` steps, before the step, write a row of outputs.
-
-    `u`, `G`, `C`: (n, 6) command [V] and leakage coefficients at the nodes of each step; `rows`: (n // every, 21).
-    `F`: (n, 6) load [N] beside the rig's own, (0, 0) without one.
-    """
-    z = state_of(y)
-    for step in range(u.shape[0]):
-        if step % every == 0:
-            observe(z, u[step, 0], G[step, 0], C[step, 0], p, rows[step // every])
-        volts = (u[step, 0], u[step, 1], u[step, 2], u[step, 3], u[step, 4], u[step, 5])
-        laminar = (G[step, 0], G[step, 1], G[step, 2], G[step, 3], G[step, 4], G[step, 5])
-        orifice = (C[step, 0], C[step, 1], C[step, 2], C[step, 3], C[step, 4], C[step, 5])
-        load = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        if len(p.pushed) > 0:
-            load = (F[step, 0], F[step, 1], F[step, 2], F[step, 3], F[step, 4], F[step, 5])
-        z = imex_step(z, h, volts, laminar, orifice, load, p)
-    for m in range(len(z)):
-        y[m] = z[m]
-
-
-@kernel
-def closed_imex(
-    y: np.ndarray,
-    h: float,
-    G: np.ndarray,
-    C: np.ndarray,
-    F: np.ndarray,
-    p: RigNumbers,
-    every: int,
-    start: int,
-    rows: np.ndarray,
-    loop: Loop,
-) -> tuple[int, bool, float, float]:
-    """Advance as `advance_imex` over the outputs `rows` from `start` on, under a controller.
-
-    Return how many outputs there are and their `survey`: fewer than rows where a state or a voltage is not finite.
-    """
-    apart, n = loop.whole[APART], rows.shape[0]
-    u = np.empty((apart * every, G.shape[1]))
-    first, finite, reach, least = 0, True, 0.0, math.inf
-    while first < n and finite:
-        k = (start + first) // apart
-        if (start + first) % apart == 0 and not sampled(loop, k, y):
-            break
-        u[:] = loop.volts[k]
-        last = min((k + 1) * apart - start, n)
-        begin, end = first * every, last * every
-        load = F[begin:end] if F.shape[0] > 0 else F
-        advance_imex(y, h, u[: end - begin], G[begin:end], C[begin:end], load, p, every, rows[first:last])
-        finite, far, low = survey(rows[first:last])
-        first, reach, least = last, max(reach, far), min(least, low)
-    return first, finite, reach, least
+@law
+def implicit_step(
+    z: State, h: float, u: np.ndarray, G: np.ndarray, C: np.ndarray, F: np.ndarray, step: int, p: RigNumbers
+) -> State:
+    """`imex_step` with the inputs of row `step`; `F` is not looked at where no load is beside the rig's own."""
+    volts = (u[step, 0], u[step, 1], u[step, 2], u[step, 3], u[step, 4], u[step, 5])
+    laminar = (G[step, 0], G[step, 1], G[step, 2], G[step, 3], G[step, 4], G[step, 5])
+    orifice = (C[step, 0], C[step, 1], C[step, 2], C[step, 3], C[step, 4], C[step, 5])
+    load = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    if len(p.pushed) > 0:
+        load = (F[step, 0], F[step, 1], F[step, 2], F[step, 3], F[step, 4], F[step, 5])
+    return imex_step(z, h, volts, laminar, orifice, load, p)

@@ -5,14 +5,11 @@ Exact enough without throttles, unstable with them.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
-from sealscope.compiled import contracted, kernel
-from sealscope.physics.rig import RigNumbers, observe, rates, within_limits
-from sealscope.physics.solvers.loop import APART, Loop, sampled
-from sealscope.physics.state import State, moved, state_of, survey
+from sealscope.compiled import contracted, law
+from sealscope.physics.rig import RigNumbers, rates, within_limits
+from sealscope.physics.state import State, moved
 
 #: Nodes of the step at which the inputs are needed.
 RK4_NODES = (0.0, 0.5, 1.0)
@@ -40,70 +37,20 @@ def rk4_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, F: Nodes, p: RigN
     return integral, z[1], z[2], z[3], z[4], z[5], z[6], z[7], z[8], z[9], z[10], z[11], z[12], z[13]
 
 
-@kernel
-def advance_rk4(
-    y: np.ndarray,
+@law
+def explicit_step(
+    z: State,
     h: float,
     u: np.ndarray,
     G: np.ndarray,
     C: np.ndarray,
     F: np.ndarray,
+    step: int,
     p: RigNumbers,
     euler_integral: bool,
-    every: int,
-    rows: np.ndarray,
-) -> None:
-    """Advance `y` (14,) in place by n steps of h [s]; every `every` steps, before the step, write a row of outputs.
-
-    `u`, `G`, `C`: (n, 3) command [V] and leakage coefficients at t, t + h/2 and t + h of each step; `F`: (n, 3) load
-    [N] beside the rig's own, (0, 0) without one; `rows`: (n // every, 21). `euler_integral` takes eq. (4.2) literally:
-    I is held within the step and grows by h (omega_d - omega) once after it.
-    """
-    n = u.shape[0]
-    z = state_of(y)
-    for step in range(n):
-        if step % every == 0:
-            observe(z, u[step, 0], G[step, 0], C[step, 0], p, rows[step // every])
-        volts = (u[step, 0], u[step, 1], u[step, 2])
-        laminar, orifice = (G[step, 0], G[step, 1], G[step, 2]), (C[step, 0], C[step, 1], C[step, 2])
-        load = (F[step, 0], F[step, 1], F[step, 2]) if len(p.pushed) > 0 else (0.0, 0.0, 0.0)
-        z = rk4_step(z, h, volts, laminar, orifice, load, p, euler_integral)
-    for m in range(len(z)):
-        y[m] = z[m]
-
-
-@kernel
-def closed_rk4(
-    y: np.ndarray,
-    h: float,
-    G: np.ndarray,
-    C: np.ndarray,
-    F: np.ndarray,
-    p: RigNumbers,
-    euler_integral: bool,
-    every: int,
-    start: int,
-    rows: np.ndarray,
-    loop: Loop,
-) -> tuple[int, bool, float, float]:
-    """Advance as `advance_rk4` over the outputs `rows` from `start` on, under a controller.
-
-    Return how many outputs there are and their `survey`: fewer than rows where a state or a voltage is not finite.
-    """
-    apart, n = loop.whole[APART], rows.shape[0]
-    u = np.empty((apart * every, G.shape[1]))
-    first, finite, reach, least = 0, True, 0.0, math.inf
-    while first < n and finite:
-        k = (start + first) // apart
-        if (start + first) % apart == 0 and not sampled(loop, k, y):
-            break
-        u[:] = loop.volts[k]
-        last = min((k + 1) * apart - start, n)
-        begin, end = first * every, last * every
-        load = F[begin:end] if F.shape[0] > 0 else F
-        advance_rk4(
-            y, h, u[: end - begin], G[begin:end], C[begin:end], load, p, euler_integral, every, rows[first:last]
-        )
-        finite, far, low = survey(rows[first:last])
-        first, reach, least = last, max(reach, far), min(least, low)
-    return first, finite, reach, least
+) -> State:
+    """`rk4_step` with the inputs of row `step`; `F` is not looked at where no load is beside the rig's own."""
+    volts = (u[step, 0], u[step, 1], u[step, 2])
+    laminar, orifice = (G[step, 0], G[step, 1], G[step, 2]), (C[step, 0], C[step, 1], C[step, 2])
+    load = (F[step, 0], F[step, 1], F[step, 2]) if len(p.pushed) > 0 else (0.0, 0.0, 0.0)
+    return rk4_step(z, h, volts, laminar, orifice, load, p, euler_integral)

@@ -13,11 +13,11 @@ import numpy as np
 from sealscope.compiled import contracted, kernel
 from sealscope.physics.lanes import load, store
 from sealscope.physics.leakage import piston_leakage
-from sealscope.physics.rig import CHOICES, LAWS, NUMBERS, RigNumbers, pressures_of, vapour_floor
+from sealscope.physics.rig import CHOICES, NUMBERS, RigNumbers, pressures_of, vapour_floor
+from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, Implicit
 from sealscope.physics.solvers.imex import imex_step
 from sealscope.physics.solvers.rk4 import rk4_step
 from sealscope.physics.state import P_A, P_B, POSITION, State
-from sealscope.physics.vector.fixed import settled, taken
 
 #: Rows that describe a leak of each lane: G [m^3/(s Pa)], C [m^3/(s Pa^0.5)], start [s], slope of the opening [1/s],
 #: and the G and C whose flow goes to the account (those of the leak, or of one that is being sized).
@@ -34,15 +34,13 @@ FLOW, OPEN, REACH, LEAST, DIVERGED = range(ACCOUNTS)
 
 
 def _lane_numbers() -> Any:
-    """Return the compiled function (table, at, p): `p`, and where it is () the group's own numbers.
+    """Return the compiled function (table, at, p): the choices of `p`, and the group's numbers from rows at, at + 1, ..
 
-    These stand in rows at, at + 1, .. of a table of all `NUMBERS`. Numba needs every field written out, so the text is
-    made from the lists of fields.
+    Numba needs every field written out, so the text is made from the lists of fields.
     """
-    fields = [f"{name}=taken(p.{name}, table, at + {row})" for row, name in enumerate(NUMBERS)]
-    fields += [f"{name}=settled(p.{name})" for name in CHOICES if name not in LAWS]
-    fields += [f"{name}=p.{name}" for name in LAWS]
-    scope = {"RigNumbers": RigNumbers, "taken": taken, "settled": settled}
+    fields = [f"{name}=load(table, at + {row})" for row, name in enumerate(NUMBERS)]
+    fields += [f"{name}=p.{name}" for name in CHOICES]
+    scope = {"RigNumbers": RigNumbers, "load": load}
     exec(f"def lane_numbers(table, at, p):\n    return RigNumbers({', '.join(fields)})", scope)
     return contracted(scope["lane_numbers"])  # type: ignore[type-var]
 
@@ -133,7 +131,7 @@ def _noted(z: State, leak: Leak, t: float, account: Account, q: RigNumbers) -> A
 
 @contracted
 def advance(
-    implicit: bool,
+    implicit: Implicit,
     groups: tuple[int, int],
     y: np.ndarray,
     h: float,
@@ -152,7 +150,7 @@ def advance(
 ) -> None:
     """Advance groups first <= g < last of runs in place by n steps of h [s], the first of them step `start` of the run.
 
-    By the implicit-explicit method where `implicit`, else by RK4; for lanes, or on a GPU for a thread's one number.
+    By the implicit-explicit method where `implicit`, else by RK4.
 
     `y`: (groups, 14, WIDTH); `shape`: (n, nodes) the command's shape at `nodes` [s] of each step, or (n, 2 nodes) with
     the load [N] of all runs behind; `drive`: (groups, 2, WIDTH) gain and offset [V]; `leaks`: (groups, LEAK_ROWS,
@@ -194,7 +192,7 @@ def advance(
                     out += CHANNELS
                     noted = _noted(z, leak, t + nodes[0], noted, q)
                 due -= 1
-                if implicit:
+                if len(implicit) > 0:
                     z = _imex(z, h, t, nodes, shape, step, gain, leak, q)
                 else:
                     z = _rk4(z, h, t, nodes, shape, step, gain, leak, q)
@@ -207,10 +205,10 @@ def advance(
 @kernel
 def advance_lanes_rk4(*run: Any) -> None:
     """`advance` by RK4, compiled for lanes."""
-    advance(False, *run)
+    advance(EXPLICIT, *run)
 
 
 @kernel
 def advance_lanes_imex(*run: Any) -> None:
     """`advance` for throttled rigs, by the implicit-explicit method, compiled for lanes."""
-    advance(True, *run)
+    advance(IMPLICIT, *run)

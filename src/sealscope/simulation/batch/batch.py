@@ -6,10 +6,8 @@ pressures, readings and details exist for a few seconds of each run only.
 
 from __future__ import annotations
 
-import importlib.util
 import os
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -30,8 +28,6 @@ if TYPE_CHECKING:
 
 #: Told how far the batch is, 0..1.
 Progress = Callable[[float], None]
-#: What a batch runs on.
-DEVICES = ("cpu", "gpu")
 #: Members of a set on which its step is chosen, and for how long [s] each of them runs for that.
 _SCOUTS, _SCOUTED = 4, 2.0 * FIRST_WINDOW
 
@@ -125,7 +121,6 @@ def simulate_batch(
     bounds: Sequence[float] | Array | None = None,
     error: float | str = PRESSURE_TOLERANCE,
     threads: int | None = None,
-    device: str = "cpu",
     progress: Progress | None = None,
 ) -> Batch:
     """Simulate experiments side by side and keep the RMS of the db8 details of p_A and p_B as recorded.
@@ -146,9 +141,6 @@ def simulate_batch(
         Error that a pressure may have [Pa rms] in the runs that state neither a step nor an error.
     threads : int, optional
         Threads of the processor, by default one a core.
-    device : {"cpu", "gpu"}, optional
-        What the batch runs on; "gpu" needs the extra `gpu` and an NVIDIA GPU. Results agree to rounding, and the
-        beginning of some runs is compared with the processor's.
     progress : callable, optional
         Called with how far the batch is (0 to 1).
 
@@ -172,7 +164,6 @@ def simulate_batch(
     <Batch: 3 runs, segments between 0, 2, 4 s>
     """
     error = parse_quantity(error, "Pa", name="error", finite=False)
-    runner = runner_of(device)
     experiments = list(experiments)
     for experiment in experiments:
         if not isinstance(experiment, Experiment):
@@ -183,68 +174,31 @@ def simulate_batch(
     inside = edges.ndim == 1 and edges.size >= 2 and np.all(np.isfinite(edges)) and np.all(np.diff(edges) > 0)
     if not (inside and edges[0] >= 0 and edges[-1] <= first.duration):
         raise InputError(f"bounds must rise within 0 .. {first.duration:g} s, got {edges.tolist()}")
-    workers = threads or os.cpu_count() or 1
     n, segments = len(experiments), edges.size - 1
     batch = Batch(np.empty((n, 2, segments, 5)), edges, np.empty(n), np.empty(n), np.empty(n))
     done = 0.0
-    with ThreadPoolExecutor(workers) as pool:
-        for part in _split_by_step(sets):
+    for part in sets:
 
-            def report(share: float, begun: float = done, size: int = len(part.members)) -> None:
-                if progress is not None:
-                    progress(min(1.0, begun + share * size / n))
+        def report(share: float, begun: float = done, size: int = len(part.members)) -> None:
+            if progress is not None:
+                progress(min(1.0, begun + share * size / n))
 
-            own = part.experiment.error
-            _run(part, batch, error if own is None else own, pool, workers, report, runner)
-            done += len(part.members) / n
+        own = part.experiment.error
+        _run(part, batch, error if own is None else own, threads or os.cpu_count() or 1, report)
+        done += len(part.members) / n
     return batch
 
 
-def _split_by_step(sets: Sequence[LaneSet]) -> list[LaneSet]:
-    """Return the sets with a step or an error of their own apart from those without."""
-    split = []
-    for lane_set in sets:
-        kinds: dict[tuple[float | None, float | None], list] = {}  # type: ignore[type-arg]
-        for member in lane_set.members:
-            kinds.setdefault((member.experiment.step, member.experiment.error), []).append(member)
-        split += [LaneSet(tuple(members), lane_set.shape) for members in kinds.values()]
-    return split
-
-
-def runner_of(device: str) -> type[SetRun]:
-    """Return what runs a set on a device: cpu, or gpu (extra `gpu`); raises InputError for one that is not there."""
-    if device not in DEVICES:
-        raise InputError(f"device must be one of {', '.join(DEVICES)}, got {device!r}")
-    if device == "cpu":
-        return SetRun
-    from numba.core import config
-
-    if importlib.util.find_spec("numba_cuda") is None and not config.ENABLE_CUDASIM:
-        raise InputError("device gpu needs numba-cuda, which is not installed: pip install 'sealscope[gpu]'")
-    from sealscope.simulation.batch.gpu import DeviceRun, require_device
-
-    require_device()
-    return DeviceRun
-
-
-def _run(
-    part: LaneSet,
-    batch: Batch,
-    error: float,
-    pool: ThreadPoolExecutor,
-    workers: int,
-    progress: Callable[[float], None],
-    runner: type[SetRun],
-) -> None:
+def _run(part: LaneSet, batch: Batch, error: float, threads: int, progress: Callable[[float], None]) -> None:
     places = [member.place for member in part.members]
     sizes = np.array([member.leak.coefficient or 0.0 for member in part.members])
     step = part.experiment.step or chosen_step(part, sizes, error)
     means = np.array([member.leak.mean or 0.0 for member in part.members])
     if np.any(means > 0):
-        sizes = _sized(part, step, sizes, means, pool, workers, runner)
+        sizes = _sized(part, step, sizes, means, threads)
         step = part.experiment.step or min(step, chosen_step(part, sizes, error))
-    run = runner(part, step, sizes, sizes, batch.bounds)
-    run.all(pool, workers, progress)
+    run = SetRun(part, step, sizes, sizes, batch.bounds)
+    run.all(threads, progress)
     batch.rms[places] = run.rms()
     batch.mean_leak_lpm[places] = run.mean_flow() / LITRE_PER_MINUTE
     batch.coefficients[places] = sizes
@@ -291,15 +245,7 @@ def allowed_step(part: LaneSet, sizes: Array) -> float:
     return max(min(limits), LONGEST_STEP / FINEST)
 
 
-def _sized(
-    part: LaneSet,
-    step: float,
-    sizes: Array,
-    means: Array,
-    pool: ThreadPoolExecutor,
-    workers: int,
-    runner: type[SetRun],
-) -> Array:
+def _sized(part: LaneSet, step: float, sizes: Array, means: Array, threads: int) -> Array:
     """Coefficients that give the leaks' means, as `sizing.sized` finds them, for all members together."""
     from sealscope.simulation.sizing import MOST_RUNS, TOLERANCE, unsettled
 
@@ -307,8 +253,8 @@ def _sized(
     before = np.zeros((2, len(sizes)))
     for _ in range(MOST_RUNS):
         fine = part.experiment.step or min(step, allowed_step(part, sizes))
-        run = runner(part, fine, sizes, np.where(sizes > 0, sizes, 1.0), None)
-        run.all(pool, workers, None)
+        run = SetRun(part, fine, sizes, np.where(sizes > 0, sizes, 1.0), None)
+        run.all(threads, None)
         got = run.mean_flow()
         if np.any(got[wanted] <= 0):
             run_place = part.members[int(np.flatnonzero(wanted & (got <= 0))[0])].place

@@ -15,24 +15,16 @@ from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
 
 from sealscope.compiled import contracted
-from sealscope.physics.lanes import WIDTH, Lanes, lowered, select
+from sealscope.physics.lanes import LANES, WIDTH, lowered, select
 from sealscope.recordings.recording import Array
 
-_WORD = ir.IntType(64)
+_WORDS, _DOUBLES = ir.VectorType(ir.IntType(64), WIDTH), ir.VectorType(ir.DoubleType(), WIDTH)
 _ONE_BITS, _MANTISSA = 0x3FF0000000000000, 0x000FFFFFFFFFFFFF
-_GOLDEN, _MIX, _MASK = 0x9E3779B97F4A7C15, ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)), (1 << 64) - 1
+_GOLDEN, _MIX = 0x9E3779B97F4A7C15, ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB))
 
 
-def _kinds(kind: Any) -> tuple[Any, Any, Any]:
-    """Words and doubles of a lane's or of a number's kind, and how a whole number is written as such words."""
-    if isinstance(kind, Lanes):
-        word = ir.VectorType(_WORD, WIDTH)
-        return word, ir.VectorType(ir.DoubleType(), WIDTH), lambda value: ir.Constant(word, [value] * WIDTH)
-    return _WORD, ir.DoubleType(), lambda value: ir.Constant(_WORD, value)
-
-
-def _bits(x: float) -> int:
-    return int(np.float64(x).view(np.uint64))
+def _constant(value: int) -> Any:
+    return ir.Constant(_WORDS, [value] * WIDTH)
 
 
 def keys(seeds: list[int]) -> Array:
@@ -43,58 +35,42 @@ def keys(seeds: list[int]) -> Array:
 
 def uniform(key: Any, place: int) -> Any:
     """Numbers evenly spread over (0, 1], one a lane: those at `place` >= 0 of the keys' sequences."""
-    z = (_bits(key) + (place + 1) * _GOLDEN) & _MASK
-    for shift, factor in _MIX:
-        z = ((z ^ (z >> shift)) * factor) & _MASK
-    z ^= z >> 31
-    return 2.0 - float(np.uint64((z >> 12) | _ONE_BITS).view(np.float64))
 
 
 def _uniform(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
-    word, double, constant = _kinds(kinds[0])
+    word = ir.IntType(64)
     step = context.cast(builder, values[1], kinds[1], types.int64)
-    step = builder.mul(builder.add(step, ir.Constant(_WORD, 1)), ir.Constant(_WORD, _GOLDEN))
-    if isinstance(kinds[0], Lanes):
-        lane = builder.insert_element(ir.Constant(word, ir.Undefined), step, ir.Constant(ir.IntType(32), 0))
-        step = builder.shuffle_vector(lane, lane, ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH))
-    z = builder.add(builder.bitcast(values[0], word), step)
+    step = builder.mul(builder.add(step, ir.Constant(word, 1)), ir.Constant(word, _GOLDEN))
+    lane = builder.insert_element(ir.Constant(_WORDS, ir.Undefined), step, ir.Constant(ir.IntType(32), 0))
+    step = builder.shuffle_vector(lane, lane, ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH))
+    z = builder.add(builder.bitcast(values[0], _WORDS), step)
     for shift, factor in _MIX:
-        z = builder.mul(builder.xor(z, builder.lshr(z, constant(shift))), constant(factor))
-    z = builder.xor(z, builder.lshr(z, constant(31)))
-    bits = builder.or_(builder.lshr(z, constant(12)), constant(_ONE_BITS))
-    two = ir.Constant(double, [2.0] * WIDTH if isinstance(kinds[0], Lanes) else 2.0)
-    return builder.fsub(two, builder.bitcast(bits, double))
+        z = builder.mul(builder.xor(z, builder.lshr(z, _constant(shift))), _constant(factor))
+    z = builder.xor(z, builder.lshr(z, _constant(31)))
+    bits = builder.or_(builder.lshr(z, _constant(12)), _constant(_ONE_BITS))
+    return builder.fsub(ir.Constant(_DOUBLES, [2.0] * WIDTH), builder.bitcast(bits, _DOUBLES))
 
 
 def _exponent(x: Any) -> Any:
     """Return the exponent of positive normal doubles, as doubles."""
-    return float((_bits(x) >> 52) - 1023)
 
 
 def _raised(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
-    word, double, constant = _kinds(kinds[0])
-    raised = builder.lshr(builder.bitcast(values[0], word), constant(52))
-    return builder.sitofp(builder.sub(raised, constant(1023)), double)
+    raised = builder.lshr(builder.bitcast(values[0], _WORDS), _constant(52))
+    return builder.sitofp(builder.sub(raised, _constant(1023)), _DOUBLES)
 
 
 def _fraction(x: Any) -> Any:
     """Return the fraction of positive normal doubles, 1 <= m < 2."""
-    return float(np.uint64(_bits(x) & _MANTISSA | _ONE_BITS).view(np.float64))
 
 
 def _mantissa(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
-    word, double, constant = _kinds(kinds[0])
-    bits = builder.and_(builder.bitcast(values[0], word), constant(_MANTISSA))
-    return builder.bitcast(builder.or_(bits, constant(_ONE_BITS)), double)
+    bits = builder.and_(builder.bitcast(values[0], _WORDS), _constant(_MANTISSA))
+    return builder.bitcast(builder.or_(bits, _constant(_ONE_BITS)), _DOUBLES)
 
 
-def _number_or_lanes(kinds: Any, _: bool) -> Any:
-    return kinds[0] if isinstance(kinds[0], Lanes) or kinds[0] == types.float64 else None
-
-
-lowered(uniform, 2, _number_or_lanes, _uniform)
-lowered(_exponent, 1, _number_or_lanes, _raised)
-lowered(_fraction, 1, _number_or_lanes, _mantissa)
+for _function, _arity, _build in ((uniform, 2, _uniform), (_exponent, 1, _raised), (_fraction, 1, _mantissa)):
+    lowered(_function, _arity, lambda kinds: kinds[0] if kinds[0] == LANES else None, _build)
 
 
 @contracted

@@ -30,7 +30,6 @@ from sealscope.simulation.changes import (
 from sealscope.simulation.commands import Command, Sine
 from sealscope.simulation.courses import numbers_under
 from sealscope.simulation.experiment import Experiment, choose_method, exact
-from sealscope.simulation.faults import From, Growing, Leak
 from sealscope.simulation.instruments import FILTER_REACH, anti_alias_taps
 from sealscope.simulation.integrate import (
     VACUUM,
@@ -40,6 +39,7 @@ from sealscope.simulation.integrate import (
     refuse_unresolved,
     steps_per_output,
 )
+from sealscope.simulation.leaks import From, Growing, Leak
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -77,7 +77,7 @@ class Member:
 
 @dataclass(frozen=True)
 class LaneSet:
-    """Experiments of one kind under one shape of a command and one load."""
+    """Experiments of one kind under one shape of a command and one load, with one step or error asked for."""
 
     members: tuple[Member, ...]
     shape: Command
@@ -115,12 +115,11 @@ def refuse(experiment: Experiment, place: int) -> None:
                 raise no(f"sensors.{name}.{field} = 0, got {getattr(sensor, field)}")
 
 
-def _shape(command: Command) -> tuple[Any, Command, float, float]:
-    """Return what commands of one shape have in common, that shape, and gain and offset that make the command of it."""
+def _shape(command: Command) -> tuple[str, Command, float, float]:
+    """Return a name of the shape of a command, the shape, and gain and offset that make the command of it."""
     if isinstance(command, Sine):
         shape = Sine(1.0, command.omega, command.phase)
-        return ("sine", command.omega, command.phase), shape, command.amplitude, command.offset
-
+        return str(exact(shape)), shape, command.amplitude, command.offset
     return str(exact(command)), command, 1.0, 0.0
 
 
@@ -138,10 +137,8 @@ def sets_of(experiments: Sequence[Experiment]) -> list[LaneSet]:
     shapes: dict[Any, Command] = {}
     known: dict[Any, RigNumbers] = {}  # by rig and load: most batches have few of them
     for place, experiment in enumerate(experiments):
-        for name, own, common in (
-            ("duration", experiment.duration, first.duration),
-            ("rate", experiment.rate, first.rate),
-        ):
+        for name in ("duration", "rate"):
+            own, common = getattr(experiment, name), getattr(first, name)
             if own != common:
                 raise InputError(f"runs of a batch must have one {name}, got {common:g} and {own:g} (run {place})")
         refuse(experiment, place)
@@ -156,7 +153,8 @@ def sets_of(experiments: Sequence[Experiment]) -> list[LaneSet]:
             numbers = numbers._replace(aerated=(True,))
         key, shape, gain, offset = _shape(experiment.commanded)
         choices = tuple(getattr(numbers, name) for name in CHOICES if name != "pushed")
-        kind = (key, load, choices, choose_method(experiment.rig, experiment.method))
+        method = choose_method(experiment.rig, experiment.method)
+        kind = (key, load, choices, method, experiment.step, experiment.error)
         shapes[kind] = shape
         by_kind.setdefault(kind, []).append(Member(place, experiment, numbers, effects, gain, offset))
     return [LaneSet(tuple(members), shapes[kind]) for kind, members in by_kind.items()]
@@ -250,54 +248,46 @@ def with_sizes(experiment: Experiment, size: float) -> Experiment:
 
 def instrument_rows(members: Sequence[Member], first: int, last: int) -> Array:
     """Return (runs, 2, INSTRUMENT_ROWS) of p_A and p_B for samples first .. last, even between these."""
-    from sealscope.simulation.batch.signals import HUM, HUM_PHASE, INSTRUMENT_ROWS
+    from sealscope.simulation.batch.signals import HUM, HUM_PHASE
 
-    rows = np.zeros((len(members), len(CHAMBERS), INSTRUMENT_ROWS))
     ends = np.array([first, last]) / members[0].experiment.rate
     steady: dict[int, Array] = {}  # by rig, of runs whose instruments do not drift
-    for run, member in enumerate(members):
-        experiment = member.experiment
-        if experiment.drifts:
-            rows[run] = _channels(experiment.rig, experiment.readings(), ends, last - first)
-        else:
-            if id(experiment.rig) not in steady:
-                steady[id(experiment.rig)] = _channels(experiment.rig, Readings(), ends, last - first)
-            rows[run] = steady[id(experiment.rig)]
-        if rows[run, :, HUM].any():
-            rows[run, :, HUM_PHASE] = np.random.default_rng([experiment.seed, 1]).random(len(CHAMBERS))
-    return rows
+    rows = []
+    for experiment in (member.experiment for member in members):
+        own = None if experiment.drifts else steady.get(id(experiment.rig))
+        if own is None:
+            own = _channels(experiment.rig, experiment.readings(), ends, last - first)
+            if not experiment.drifts:
+                steady[id(experiment.rig)] = own
+        if own[:, HUM].any():
+            own = own.copy()
+            own[:, HUM_PHASE] = np.random.default_rng([experiment.seed, 1]).random(len(CHAMBERS))
+        rows.append(own)
+    return np.array(rows)
 
 
 def _channels(rig: Rig, readings: Readings, ends: Array, samples: int) -> Array:
-    return np.array([_row(rig, name, readings, ends, samples) for name in CHAMBERS])
+    """Return (2, INSTRUMENT_ROWS) of p_A and p_B, even between the two times `ends` [s], `samples` apart."""
+    from sealscope.simulation.batch import signals as at
 
-
-def _row(rig: Rig, name: str, readings: Readings, ends: Array, samples: int) -> Array:
-    """Return (INSTRUMENT_ROWS,) of one pressure channel, even between the two times `ends` [s], `samples` apart.
-
-    The hum's phase is the run's own and left 0.
-    """
-    from sealscope.simulation.batch import signals as rows
-
-    sensor, daq = getattr(rig.sensors, name), rig.daq
-    row = np.zeros(rows.INSTRUMENT_ROWS)
-
-    def set_even(own: str, value: float, at: int, rise: int, plus: float = 0.0) -> None:
-        at_ends = np.broadcast_to(readings.value(own, value, ends), (2,))
-        row[at] = at_ends[0] + plus
-        row[rise] = (at_ends[1] - at_ends[0]) / samples
-
-    set_even(f"sensors.{name}.gain_error", sensor.gain_error, rows.GAIN, rows.GAIN_RISE, 1.0)
-    set_even(f"sensors.{name}.offset", sensor.offset, rows.OFFSET, rows.OFFSET_RISE)
-    set_even(f"sensors.{name}.noise", sensor.noise, rows.NOISE, rows.NOISE_RISE)
-    set_even("sensors.common_noise", rig.sensors.common_noise, rows.COMMON, rows.COMMON_RISE)
-    row[rows.WALK] = sensor.drift / np.sqrt(daq.sample_rate)
-    row[rows.HUM], row[rows.HUM_TURNS] = sensor.hum, sensor.hum_frequency / daq.sample_rate
-    row[rows.LEAST], row[rows.LARGEST] = sensor.range_lo, sensor.range_hi
-    row[rows.VOLTS] = daq.sensor_volts_lo
-    row[rows.PER_PASCAL] = (daq.sensor_volts_hi - daq.sensor_volts_lo) / (sensor.range_hi - sensor.range_lo)
-    row[rows.COUNT], row[rows.TOP] = daq.step, 2.0 ** (daq.bits - 1)
-    return row
+    rows, daq = np.zeros((len(CHAMBERS), at.INSTRUMENT_ROWS)), rig.daq
+    for row, name in zip(rows, CHAMBERS, strict=True):
+        sensor = getattr(rig.sensors, name)
+        for place, rise, parameter, value, plus in (
+            (at.GAIN, at.GAIN_RISE, f"sensors.{name}.gain_error", sensor.gain_error, 1.0),
+            (at.OFFSET, at.OFFSET_RISE, f"sensors.{name}.offset", sensor.offset, 0.0),
+            (at.NOISE, at.NOISE_RISE, f"sensors.{name}.noise", sensor.noise, 0.0),
+            (at.COMMON, at.COMMON_RISE, "sensors.common_noise", rig.sensors.common_noise, 0.0),
+        ):
+            begun, ended = np.broadcast_to(readings.value(parameter, value, ends), (2,))
+            row[place], row[rise] = begun + plus, (ended - begun) / samples
+        row[at.WALK] = sensor.drift / np.sqrt(daq.sample_rate)
+        row[at.HUM], row[at.HUM_TURNS] = sensor.hum, sensor.hum_frequency / daq.sample_rate
+        row[at.LEAST], row[at.LARGEST] = sensor.range_lo, sensor.range_hi
+        row[at.VOLTS] = daq.sensor_volts_lo
+        row[at.PER_PASCAL] = (daq.sensor_volts_hi - daq.sensor_volts_lo) / (sensor.range_hi - sensor.range_lo)
+        row[at.COUNT], row[at.TOP] = daq.step, 2.0 ** (daq.bits - 1)
+    return rows
 
 
 def _at_rest(experiment: Experiment) -> float:
@@ -329,9 +319,8 @@ class SetRun:
         most: int | None = None,
     ) -> None:
         from sealscope.physics.rest import initial_state
-        from sealscope.physics.solvers.imex import IMEX_NODES
+        from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, nodes_of
         from sealscope.physics.solvers.limits import longest_step
-        from sealscope.physics.solvers.rk4 import RK4_NODES
         from sealscope.physics.vector.runs import ACCOUNTS, CHANNELS, LEAST
 
         members, common = part.members, part.experiment
@@ -344,11 +333,9 @@ class SetRun:
         self.h = 1.0 / (rate * self.every)
         self.samples = min(round(common.duration * common.rate), most or sys.maxsize)
         self.outputs = (self.samples + FILTER_REACH) * self.factor
-        nodes = np.array(IMEX_NODES if self.method == "imex" else RK4_NODES)
-        nodes[0], nodes[-1] = 1e-9, 1.0 - 1e-9  # the limits from inside the step
-        self.nodes = nodes * self.h
+        self.nodes = nodes_of(IMPLICIT if self.method == "imex" else EXPLICIT, self.h)
         self.cells = cells_of(members, self.outputs, rate)
-        self.numbers = self._constants(members[0].numbers)
+        self.numbers = members[0].numbers  # of which the choices count; the numbers stand in the table
         leaks = leak_rows(members, sizes, measured)
         checked = set()
         for member, (G, C) in zip(members, leaks[:, :2].tolist(), strict=True):
@@ -370,13 +357,6 @@ class SetRun:
         self.bounds = bounds
         if bounds is not None:
             self._prepare_statistics(bounds)
-
-    def _constants(self, numbers: RigNumbers) -> RigNumbers:
-        """Return what the compiled code takes as constants of the set: the choices; the numbers stand in the table."""
-        from sealscope.physics.rig import NUMBERS
-        from sealscope.physics.vector.fixed import left_to_table
-
-        return left_to_table(numbers, NUMBERS)
 
     def _prepare_filters(self, rate: float) -> None:
         """Lay out the anti-alias filter, for each lane where a channel is late.
@@ -418,20 +398,20 @@ class SetRun:
         self.sums = np.zeros((*shape, self.segments.size - 1, QUANTITIES, self.width))
         self.keys = in_lanes(keys([m.experiment.seed for m in self.part.members]), self.width)
 
-    def all(self, pool: ThreadPoolExecutor, workers: int, progress: Callable[[float], None] | None) -> None:
-        """Run all groups, shared out over the pool's threads (the compiled parts run beside each other)."""
-        cuts = np.unique(np.linspace(0, self.groups, min(workers, self.groups) + 1).round().astype(int))
-        lock, reached = threading.Lock(), [0.0]
+    def all(self, threads: int, progress: Callable[[float], None] | None) -> None:
+        """Run all groups, shared out over `threads` (the compiled parts run beside each other)."""
+        cuts = np.unique(np.linspace(0, self.groups, min(threads, self.groups) + 1).round().astype(int)).tolist()
+        lock, reached = threading.Lock(), 0.0
 
         def tell(share: float) -> None:
+            nonlocal reached
             if progress is not None:
                 with lock:
-                    reached[0] += share
-                    progress(reached[0])
+                    reached += share
+                    progress(reached)
 
-        parts = [(int(a), int(b)) for a, b in itertools.pairwise(cuts)]
-        for future in [pool.submit(self._some, part, tell) for part in parts]:
-            future.result()
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(lambda part: self._some(part, tell), itertools.pairwise(cuts)))
 
     def _chunks(self) -> list[tuple[int, int, int, int]]:
         """Cells first .. last and outputs start .. stop of each chunk."""
@@ -447,11 +427,6 @@ class SetRun:
             chunks += [(first, last, a, min(a + most, stop)) for a in range(start, stop, most)]
             first = last
         return chunks
-
-    @property
-    def _kept(self) -> int:
-        """Outputs that later samples still need."""
-        return self.before + self.after + self.factor
 
     def _due(self, stop: int) -> int:
         """Return the sample before which all can be read once outputs up to `stop` are there."""
@@ -469,7 +444,8 @@ class SetRun:
         own = (0, b - a)
         state, drive, leaks, account = self.state[a:b], self.drive[a:b], self.leaks[a:b], self.account[a:b]
         table, cells = np.empty((0, 0, 0, 0)), (-1, -1)
-        chunks, shapes, kept = self._chunks(), self._shapes(), self._kept
+        chunks, shapes = self._chunks(), self._shapes()
+        kept = self.before + self.after + self.factor  # outputs that later samples still need
         longest = max(stop - start for _, _, start, stop in chunks)
         pressures = np.zeros((b - a, kept + longest, self.channels, self.width))
         walks = np.zeros((b - a, self.channels, self.width))
@@ -478,9 +454,10 @@ class SetRun:
         for first, last, start, stop in chunks:
             if cells != (first, last):
                 table, cells = self.cells.table(first, last, self.width)[a:b], (first, last)
+            bounds = (np.clip(self.cells.bounds[first : last + 1], start, stop) - start) * self.every  # in steps
             advance(
                 own, state, self.h, start * self.every, self.nodes, shapes(start, stop), drive, leaks, table,
-                self._cell_bounds(first, last, start, stop), self.numbers, self.every, pressures, kept, account,
+                bounds, self.numbers, self.every, pressures, kept, account,
             )  # fmt: skip
             self._check(groups, stop)
             if self.bounds is not None:
@@ -488,7 +465,7 @@ class SetRun:
                     pressures[:, :kept] = pressures[:, kept : kept + 1]  # at rest before the beginning
                 until = self._due(stop)
                 if until > sampled:
-                    sensors = self.sensors(groups, sampled, until)
+                    sensors = self._sensors(groups, sampled, until)
                     begin = sampled * self.factor - self.before - (start - kept)
                     sense_lanes(
                         own, pressures, begin, self.factor, self.taps, self.own_taps[a:b], sampled, until, sensors,
@@ -498,55 +475,37 @@ class SetRun:
                 pressures[:, :kept] = pressures[:, stop - start : stop - start + kept].copy()
             tell((stop - start) / self.outputs * (b - a) / self.groups)
 
-    def _cell_bounds(self, first: int, last: int, start: int, stop: int) -> np.ndarray:
-        """Return the steps of the chunk of outputs start .. stop at which its cells begin."""
-        return np.asarray((np.clip(self.cells.bounds[first : last + 1], start, stop) - start) * self.every)
-
     def _shapes(self) -> Callable[[int, int], Array]:
         """Return the command's shape at the nodes of the steps between two outputs, for one thread's use.
 
         Where there is a load, its forces [N] at the nodes stand behind.
         """
-
-        def times(start: int, stop: int) -> Array:
-            return np.arange(start * self.every, stop * self.every, dtype=np.float64) * self.h
-
         shape, load = self.part.shape, self.part.experiment.load
-        if isinstance(shape, Sine):
-            sines = NodeSines(shape.omega, shape.phase)
+        sines = NodeSines(shape.omega, shape.phase) if isinstance(shape, Sine) else None
 
-            def volts(t: Array) -> Array:
-                return sines.at(t, self.nodes, 1.0, 0.0)
+        def shapes(start: int, stop: int) -> Array:
+            t = np.arange(start * self.every, stop * self.every, dtype=np.float64) * self.h
+            at = t[:, None] + self.nodes
+            volts = shape.volts(at) if sines is None else sines.at(t, self.nodes, 1.0, 0.0)
+            return np.ascontiguousarray(
+                volts if load is None else np.hstack([volts, np.broadcast_to(load.at(at), at.shape)])
+            )
 
-        else:
+        return shapes
 
-            def volts(t: Array) -> Array:
-                return np.ascontiguousarray(shape.volts(t[:, None] + self.nodes))
-
-        if load is None:
-            return lambda start, stop: volts(times(start, stop))
-
-        def pushed(start: int, stop: int) -> Array:
-            t = times(start, stop)
-            return np.hstack([volts(t), np.broadcast_to(load.at(t[:, None] + self.nodes), (t.size, self.nodes.size))])
-
-        return pushed
-
-    def sensors(self, groups: tuple[int, int], first: int, last: int) -> Array:
-        """Instruments of the groups for samples first .. last, (groups, 2, INSTRUMENT_ROWS, width)."""
-        if not self.drifting:
-            return np.asarray(in_lanes(self._steady, self.width)[groups[0] : groups[1]])
+    def _sensors(self, groups: tuple[int, int], first: int, last: int) -> Array:
+        """Return the instruments of the groups for samples first .. last, (groups, 2, INSTRUMENT_ROWS, width)."""
+        if self._steady is not None:
+            return self._steady[groups[0] : groups[1]]
         own = self.part.members[groups[0] * self.width : groups[1] * self.width]
-        return np.asarray(in_lanes(instrument_rows(own, first, last), self.width))
+        return in_lanes(instrument_rows(own, first, last), self.width)
 
     @cached_property
-    def drifting(self) -> bool:
-        """Whether instruments change within a run."""
-        return any(member.experiment.readings().adjustments for member in self.part.members)
-
-    @cached_property
-    def _steady(self) -> Array:
-        return instrument_rows(self.part.members, 0, self.samples)
+    def _steady(self) -> Array | None:
+        """The instruments of all groups, None where some change within a run."""
+        if any(member.experiment.readings().adjustments for member in self.part.members):
+            return None
+        return in_lanes(instrument_rows(self.part.members, 0, self.samples), self.width)
 
     def _check(self, groups: tuple[int, int], stop: int) -> None:
         """Raise SimulationFailed for a run that diverged, fell below vacuum or hit a stop too hard for the step."""

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-import math
 import os
+from collections.abc import Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from sealscope.errors import InputError
+from sealscope.parameters import declared_names
+from sealscope.parameters.fields import choices_of, unit_of
+from sealscope.parameters.names import resolve
+from sealscope.parameters.rig import declared
 from sealscope.simulation.changes import Linear, ParameterDrift, drifts_absolutely
 from sealscope.simulation.courses import Position, command_or_target, parse_force
 from sealscope.storage.toml_file import read_toml
+from sealscope.units import to_si
 
 _PACKAGED = Path(__file__).parent / "profiles"
-_SHAPES = ("linear", "wander")
 
 
 @dataclass(frozen=True)
@@ -150,218 +156,191 @@ def load_profile(name_or_path: str | os.PathLike[str] = "bench") -> Profile:
     return _profile(Path(text), text)
 
 
+class _Entry(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+
+_Text = Annotated[str, Field(pattern=r"\S")]
+_Names = Annotated[list[str], Field(min_length=1)]
+_Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
+
+
+class _DriftEntry(_Entry):
+    size: _Pair
+    unit: _Text
+    shapes: Annotated[list[Literal["linear", "wander"]], Field(min_length=1)] | None = None
+    oil: Annotated[float, Field(ge=-1.0, le=1.0)] | None = None
+
+
+class _NuisanceEntry(_Entry):
+    name: _Text
+    parameters: _Names
+    range: _Pair | None = None
+    scale: _Pair | None = None
+    values: Annotated[list[float | str], Field(min_length=1)] | None = None
+    unit: _Text | None = None
+    each: bool = False
+    drift: _DriftEntry | None = None
+    why: _Text
+
+
+class _DutyEntry(_Entry):
+    commands: _Names
+    closed: list[Annotated[float, Field(ge=0.0, le=99.0)]] = Field([0.0], min_length=1)
+    amplitude: _Pair = Field([1.0, 1.0])
+    loads: _Names = Field([])
+    controllers: _Names = Field([])
+    why: _Text
+
+
+class _FamilyEntry(_Entry):
+    name: _Text
+    why: _Text
+    warms: bool = False
+    duty: _DutyEntry | None = None
+    nuisance: list[_NuisanceEntry] = Field([])
+
+
+class _HeadEntry(_Entry):
+    name: _Text
+    title: _Text
+    extends: Literal[profile_names()] | None = None  # type: ignore[valid-type]
+
+
+class _ProfileEntry(_Entry):
+    profile: _HeadEntry
+    duty: _DutyEntry | None = None
+    nuisance: list[_NuisanceEntry] = Field([])
+    family: list[_FamilyEntry] = Field([])
+
+
 def _profile(path: Path, place: str) -> Profile:
     tree = read_toml(path, "a profile", place)
-    _known(tree, ("profile", "duty", "nuisance", "family"), "a profile", place)
-    head = tree.get("profile", {})
-    _known(head, ("name", "title", "extends"), "[profile]", place)
-    base = None
-    if "extends" in head:
-        if head["extends"] not in profile_names():
-            known = ", ".join(profile_names())
-            raise InputError(f"extends must be a packaged profile ({known}), got {head['extends']!r} ({place})")
-        base = load_profile(head["extends"])
-    name, title = (_text(head, key, "[profile]", place) for key in ("name", "title"))
-    duty = base.duty if base is not None and "duty" not in tree else _duty(tree.get("duty"), place)
-    nuisances = _in_place(() if base is None else base.nuisances, _nuisances(tree, place))
-    entries = tree.get("family", [])
-    if not isinstance(entries, list):
-        raise InputError(f"families must be [[family]] tables, got {entries!r} ({place})")
-    families = tuple(_family(entry, place) for entry in entries)
-    if len({family.name for family in families}) < len(families):
-        raise InputError(f"families must have names of their own ({place})")
-    return Profile(name, title, duty, nuisances, place, families)
+    try:
+        entry = _ProfileEntry(**tree)
+    except ValidationError as error:
+        raise InputError(f"{_rule_broken(error)} ({place})") from None
+    try:
+        base = None if entry.profile.extends is None else load_profile(entry.profile.extends)
+        if entry.duty is None and base is None:
+            raise InputError("a profile must have [duty], got none")
+        duty = base.duty if base is not None and entry.duty is None else _duty(entry.duty)
+        nuisances = _in_place(() if base is None else base.nuisances, _nuisances(entry.nuisance))
+        families = tuple(
+            Family(
+                one.name, _nuisances(one.nuisance), None if one.duty is None else _duty(one.duty), one.warms, one.why
+            )
+            for one in entry.family
+        )
+        _names_of_their_own("families", families)
+    except InputError as error:
+        raise InputError(f"{error} ({place})") from None
+    return Profile(entry.profile.name, entry.profile.title, duty, nuisances, place, families)
 
 
-def _family(entry: Any, place: str) -> Family:
-    _known(entry, ("name", "why", "warms", "duty", "nuisance"), "a family", place)
-    name = _text(entry, "name", "a family", place)
-    why = _text(entry, "why", name, place)
-    warms = entry.get("warms", False)
-    if not isinstance(warms, bool):
-        raise InputError(f"warms of {name} must be true or false, got {warms!r} ({place})")
-    duty = _duty(entry["duty"], place) if "duty" in entry else None
-    return Family(name, _nuisances(entry, place), duty, warms, why)
+def _rule_broken(error: ValidationError) -> str:
+    first = error.errors(include_url=False)[0]
+    entry = "".join(f"[{part + 1}]" if isinstance(part, int) else f".{part}" for part in first["loc"])[1:]
+    if plain := {"missing": "is missing", "extra_forbidden": "is not known"}.get(first["type"]):
+        return f"{entry} {plain}"
+    return f"{entry} must be {first['msg'].removeprefix('Input should be ')}, got {first['input']!r}"
 
 
-def _nuisances(tree: dict[str, Any], place: str) -> tuple[AnyNuisance, ...]:
-    entries = tree.get("nuisance", [])
-    if not isinstance(entries, list):
-        raise InputError(f"nuisances must be [[nuisance]] tables, got {entries!r} ({place})")
-    nuisances = tuple(_nuisance(entry, place) for entry in entries)
+def _names_of_their_own(what: str, entries: Sequence[AnyNuisance | Family]) -> None:
+    if len({entry.name for entry in entries}) < len(entries):
+        raise InputError(f"{what} must have names of their own")
+
+
+def _nuisances(entries: Sequence[_NuisanceEntry]) -> tuple[AnyNuisance, ...]:
+    nuisances = []
+    for entry in entries:
+        try:
+            nuisances.append(_nuisance(entry))
+        except InputError as error:
+            raise InputError(f"{entry.name}: {error}") from None
     owner: dict[str, str] = {}
     for nuisance in nuisances:
         for parameter in nuisance.parameters:
             if owner.setdefault(parameter, nuisance.name) != nuisance.name:
-                raise InputError(
-                    f"{parameter} must be in one nuisance, got {owner[parameter]} and {nuisance.name} ({place})"
-                )
-    if len({nuisance.name for nuisance in nuisances}) < len(nuisances):
-        raise InputError(f"nuisances must have names of their own ({place})")
-    return nuisances
+                raise InputError(f"{parameter} must be in one nuisance, got {owner[parameter]} and {nuisance.name}")
+    _names_of_their_own("nuisances", nuisances)
+    return tuple(nuisances)
 
 
-def _known(table: Any, keys: tuple[str, ...], what: str, place: str) -> None:
-    if not isinstance(table, dict):
-        raise InputError(f"{what} must be a table, got {table!r} ({place})")
-    for key in table:
-        if key not in keys:
-            raise InputError(f"{key} is not known in {what}, which has {', '.join(keys)} ({place})")
+def _pair(given: Sequence[float], what: str) -> tuple[float, float]:
+    if given[0] > given[1]:
+        raise InputError(f"{what} must be [low, high] with low <= high, got {list(given)}")
+    return float(given[0]), float(given[1])
 
 
-def _text(table: dict[str, Any], key: str, what: str, place: str) -> str:
-    value = table.get(key)
-    if not isinstance(value, str) or not value.strip():
-        raise InputError(f"{key} of {what} must be a text, got {value!r} ({place})")
-    return value
+def _nuisance(entry: _NuisanceEntry) -> AnyNuisance:
+    parameters = tuple(resolve(name, declared_names()) for name in entry.parameters)
+    fields = [declared()[parameter] for parameter in parameters]
+    kinds = {(choices_of(field), unit_of(field)) for field in fields}
+    choices, si_unit = next(iter(kinds))
+    if entry.values is not None:
+        if len(kinds) > 1 or entry.range or entry.scale or entry.drift or entry.each:
+            raise InputError(
+                "a list of values must be of parameters of one kind and unit, with neither range nor drift"
+            )
+        return NuisanceChoice(entry.name, parameters, _values(entry, choices, si_unit), entry.why)
+    if any(chosen for chosen, _ in kinds):
+        raise InputError(f"{', '.join(parameters)}: a choice cannot be drawn from a range")
+    if entry.scale is not None and entry.range is None and entry.unit is None:
+        low, high = _pair(entry.scale, "scale")
+        if low <= 0:
+            raise InputError(f"scale must be > 0, got {low:g}")
+    elif entry.range is not None and entry.scale is None and entry.unit is not None:
+        low, high = _pair(entry.range, "range")
+        if len(kinds) > 1:
+            raise InputError(
+                f"parameters of one range must have one unit, got {', '.join(sorted(u for _, u in kinds))}"
+            )
+        low, high = (to_si(value, entry.unit, si_unit, name="range") for value in (low, high))
+    else:
+        raise InputError("there must be a range with its unit or a scale without one")
+    drift = None if entry.drift is None else _drift(entry.drift, parameters, si_unit)
+    return Nuisance(entry.name, parameters, low, high, entry.scale is not None, entry.each, drift, entry.why)
 
 
-def _pair(value: Any, what: str, place: str) -> tuple[float, float]:
-    numbers = isinstance(value, list) and all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
-    if not (numbers and len(value) == 2 and all(map(math.isfinite, value)) and value[0] <= value[1]):
-        raise InputError(f"{what} must be [low, high] with low <= high, got {value!r} ({place})")
-    return float(value[0]), float(value[1])
-
-
-def _nuisance(entry: Any, place: str) -> AnyNuisance:
-    from sealscope.parameters import declared_names
-    from sealscope.parameters.fields import choices_of, unit_of
-    from sealscope.parameters.names import resolve
-    from sealscope.parameters.rig import _declared
-    from sealscope.units import to_si
-
-    _known(
-        entry, ("name", "parameters", "range", "unit", "scale", "values", "each", "drift", "why"), "a nuisance", place
-    )
-    name = _text(entry, "name", "a nuisance", place)
-    why = _text(entry, "why", name, place)
-    given = entry.get("parameters")
-    if not isinstance(given, list) or not given or not all(isinstance(item, str) for item in given):
-        raise InputError(f"parameters of {name} must be a list of names, got {given!r} ({place})")
-    try:
-        parameters = tuple(resolve(item, declared_names()) for item in given)
-    except InputError as error:
-        raise InputError(f"{error} ({name}, {place})") from None
-    if "values" in entry:
-        return NuisanceChoice(name, parameters, _values(entry, name, parameters, place), why)
-    fields = [_declared()[parameter] for parameter in parameters]
-    if choice := next(
-        (parameter for parameter, field in zip(parameters, fields, strict=True) if choices_of(field)), None
-    ):
-        raise InputError(f"{choice} is a choice and cannot be drawn from a range ({name}, {place})")
-    scales = "scale" in entry
-    if scales == ("range" in entry) or (scales and "unit" in entry):
-        raise InputError(f"{name} must have a range with its unit or a scale without one ({place})")
-    low, high = _pair(entry["scale" if scales else "range"], f"{'scale' if scales else 'range'} of {name}", place)
-    units = {unit_of(field) for field in fields}
-    if not scales:
-        if len(units) > 1:
-            got = ", ".join(sorted(units))
-            raise InputError(f"parameters of one range must have one unit, got {got} ({name}, {place})")
-        unit = _text(entry, "unit", name, place)
-        low, high = (to_si(value, unit, next(iter(units)), name=name, place=place) for value in (low, high))
-    elif low <= 0:
-        raise InputError(f"scale of {name} must be > 0, got {low:g} ({place})")
-    each = entry.get("each", False)
-    if not isinstance(each, bool):
-        raise InputError(f"each of {name} must be true or false, got {each!r} ({place})")
-    drift = None if "drift" not in entry else _drift(entry["drift"], name, parameters, place)
-    return Nuisance(name, parameters, low, high, scales, each, drift, why)
-
-
-def _values(entry: dict[str, Any], name: str, parameters: tuple[str, ...], place: str) -> tuple[float | str, ...]:
+def _values(entry: _NuisanceEntry, choices: tuple[str, ...], si_unit: str) -> tuple[float | str, ...]:
     """Return the values of a `NuisanceChoice`: of a choice as they are, of a number in SI."""
-    from sealscope.parameters.fields import choices_of, unit_of
-    from sealscope.parameters.rig import _declared
-    from sealscope.units import to_si
-
-    _known(entry, ("name", "parameters", "values", "unit", "why"), "a nuisance with values", place)
-    given = entry["values"]
-    fields = [_declared()[parameter] for parameter in parameters]
-    allowed = {choices_of(field) for field in fields}
-    units = {unit_of(field) for field in fields}
-    if len(allowed) > 1 or len(units) > 1:
-        raise InputError(f"parameters of one list of values must be of one kind and unit ({name}, {place})")
-    choices = next(iter(allowed))
-    if not isinstance(given, list) or not given:
-        raise InputError(f"values of {name} must be a list of one or more, got {given!r} ({place})")
+    for value in entry.values or ():
+        if choices and value not in choices:
+            raise InputError(f"values must be among {', '.join(choices)}, got {value!r}")
+        if not choices and (isinstance(value, str) or entry.unit is None):
+            raise InputError(f"values must be numbers with a unit, got {value!r}")
     if choices:
-        for value in given:
-            if value not in choices:
-                raise InputError(f"values of {name} must be among {', '.join(choices)}, got {value!r} ({place})")
-        return tuple(given)
-    for value in given:
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise InputError(f"values of {name} must be numbers, got {value!r} ({place})")
-    unit = _text(entry, "unit", name, place)
-    return tuple(to_si(float(value), unit, next(iter(units)), name=name, place=place) for value in given)
+        return tuple(entry.values or ())
+    return tuple(to_si(float(value), entry.unit or "", si_unit, name="values") for value in entry.values or ())
 
 
-def _drift(table: Any, name: str, parameters: tuple[str, ...], place: str) -> DriftRange:
-    from sealscope.parameters.fields import unit_of
-    from sealscope.parameters.rig import _declared
-    from sealscope.units import to_si
-
-    _known(table, ("size", "unit", "shapes", "oil"), f"the drift of {name}", place)
-    low, high = _pair(table.get("size"), f"size of the drift of {name}", place)
-    unit = _text(table, "unit", f"the drift of {name}", place)
-    try:
-        absolute = drifts_absolutely(parameters[0])
-        for parameter in parameters:
-            ParameterDrift(parameter, Linear(0.0, 1.0), absolute)
-    except InputError as error:
-        raise InputError(f"{error} ({name}, {place})") from None
-    si_unit = unit_of(_declared()[parameters[0]]) if absolute else "1"
-    low, high = (to_si(value, unit, si_unit, name=f"drift of {name}", place=place) for value in (low, high))
-    falls = table.get("oil") != 1.0  # with the oil alone, which warms, it only rises
+def _drift(entry: _DriftEntry, parameters: tuple[str, ...], si_unit: str) -> DriftRange:
+    absolute = drifts_absolutely(parameters[0])
+    for parameter in parameters:
+        ParameterDrift(parameter, Linear(0.0, 1.0), absolute)
+    low, high = (
+        to_si(value, entry.unit, si_unit if absolute else "1", name="drift") for value in _pair(entry.size, "size")
+    )
+    falls = entry.oil != 1.0  # with the oil alone, which warms, it only rises
     if low < 0 or (not absolute and falls and high >= 1):
-        raise InputError(f"size of the drift of {name} must be >= 0 and < 100 %, got {low:g} to {high:g} ({place})")
-    if "shapes" in table and "oil" in table:
-        raise InputError(f"the drift of {name} must have shapes or oil, got both ({place})")
-    shapes = table.get("shapes", ["wander"] if "oil" in table else list(_SHAPES))
-    if not isinstance(shapes, list) or not shapes or any(shape not in _SHAPES for shape in shapes):
-        raise InputError(f"shapes of the drift of {name} must be of {', '.join(_SHAPES)}, got {shapes!r} ({place})")
-    oil = table.get("oil", 0.0)
-    if isinstance(oil, bool) or not isinstance(oil, int | float) or not -1 <= oil <= 1:
-        raise InputError(f"oil of {name} must be a weight in -1..1, got {oil!r} ({place})")
-    return DriftRange((low, high), absolute, tuple(shapes), float(oil))
+        raise InputError(f"size of the drift must be >= 0 and < 100 %, got {low:g} to {high:g}")
+    if entry.shapes is not None and entry.oil is not None:
+        raise InputError("the drift must have shapes or oil, got both")
+    shapes = entry.shapes or (["linear", "wander"] if entry.oil is None else ["wander"])
+    return DriftRange((low, high), absolute, tuple(shapes), float(entry.oil or 0.0))
 
 
-def _duty(table: Any, place: str) -> Duty:
-    if table is None:
-        raise InputError(f"a profile must have [duty], got none ({place})")
-    _known(table, ("commands", "closed", "amplitude", "loads", "controllers", "why"), "[duty]", place)
-    commands = _texts(table, "commands", place)
-    amplitude = _pair(table.get("amplitude", [1.0, 1.0]), "amplitude of [duty]", place)
-    for text in commands:
-        try:
-            command = command_or_target(text)
-        except InputError as error:
-            raise InputError(f"{error} ({place})") from None
-        if "controllers" in table and not isinstance(command, Position):
-            raise InputError(f"a controller must have a target to follow, got {text!r} ({place})")
+def _duty(entry: _DutyEntry | None) -> Duty:
+    assert entry is not None
+    amplitude = _pair(entry.amplitude, "amplitude of [duty]")
+    for text in entry.commands:
+        command = command_or_target(text)
+        if entry.controllers and not isinstance(command, Position):
+            raise InputError(f"a controller must have a target to follow, got {text!r}")
         if amplitude != (1.0, 1.0) and not hasattr(command, "amplitude"):
-            raise InputError(f"{text!r} has no amplitude to be drawn ({place})")
-    closed = table.get("closed", [0])
-    if not isinstance(closed, list) or not closed or not all(_percent(share) for share in closed):
-        raise InputError(f"closed of [duty] must be a list of per cent, 0 to 99, got {closed!r} ({place})")
-    shares = tuple(share / 100.0 for share in closed)
-    why = _text(table, "why", "[duty]", place)
-    loads, controllers = (_texts(table, key, place) if key in table else () for key in ("loads", "controllers"))
-    for text in loads:
-        try:
-            parse_force(text)
-        except InputError as error:
-            raise InputError(f"{error} ({place})") from None
-    return Duty(commands, shares, amplitude, why, loads, controllers)
-
-
-def _texts(table: dict[str, Any], key: str, place: str) -> tuple[str, ...]:
-    given = table.get(key)
-    if not isinstance(given, list) or not given or not all(isinstance(item, str) for item in given):
-        raise InputError(f"{key} of [duty] must be a list of texts, got {given!r} ({place})")
-    return tuple(given)
-
-
-def _percent(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value <= 99
+            raise InputError(f"{text!r} has no amplitude to be drawn")
+    for text in entry.loads:
+        parse_force(text)
+    closed = tuple(share / 100.0 for share in entry.closed)
+    return Duty(tuple(entry.commands), closed, amplitude, entry.why, tuple(entry.loads), tuple(entry.controllers))

@@ -150,7 +150,7 @@ def with_leak(quick: bool = False) -> Iterator[SimulatedTest]:
 
     The first test of each condition is proved by halving the step, except in a quick reproduction.
     """
-    from sealscope.simulation.faults import From
+    from sealscope.simulation.leaks import From
     from sealscope.simulation.simulate import prove, simulate_with_truth
     from sealscope.simulation.sizing import sized_leaks
 
