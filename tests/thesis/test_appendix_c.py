@@ -7,9 +7,9 @@ import pytest
 
 from sealscope.parameters import load_rig
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.thesis.chapters.appendix_c import simulation
-from sealscope.thesis.chapters.appendix_c import tables as appendix_c
-from sealscope.thesis.chapters.appendix_c.simulation import RigDrift, draw_rig_drift, sheet_of
+from sealscope.thesis.chapters import appendix_c
+from sealscope.thesis.chapters import appendix_c_runs as simulation
+from sealscope.thesis.chapters.appendix_c_runs import RigDrift, draw_rig_drift, sheet_of
 from sealscope.thesis.engine.products import Product, ThesisTable
 from sealscope.thesis.sheet import APPENDIX_C, QUANTITIES, DataSheet
 
@@ -37,13 +37,7 @@ def tables() -> dict[str, tuple[ThesisTable, ...]]:
         patch.setattr(simulation, "APPENDIX_C", TWO)
         patch.setattr(simulation, "QUICK_HALF", 20.0)
         context = Made({}, None)
-        items = {item.id: item for item in appendix_c.ITEMS}
-        makers = {
-            "appendix-c-leak": appendix_c.leak_table,
-            "appendix-c-no-leak": appendix_c.no_leak_table,
-            "appendix-c-drift": appendix_c.drift_table,
-        }
-        return {name: make(context, items[name]) for name, make in makers.items()}  # type: ignore[arg-type]
+        return {item.id: simulation.runs_table(context, item) for item in simulation.ITEMS}  # type: ignore[arg-type]
 
 
 def test_a_table_reads_back_as_the_sheet_it_holds(tables: dict[str, tuple[ThesisTable, ...]]) -> None:
@@ -165,10 +159,10 @@ def test_the_appendix_stands_beside_the_sheet_where_there_is_one(given: bool) ->
 @pytest.mark.long
 def test_the_thesis_s_rule_fires_like_a_coin_where_nothing_leaks() -> None:
     context = Made({}, None)
-    items = {item.id: item for item in appendix_c.ITEMS}
-    still = sheet_of(appendix_c.no_leak_table(context, items["appendix-c-no-leak"])[0])  # type: ignore[arg-type]
-    drift = sheet_of(appendix_c.drift_table(context, items["appendix-c-drift"])[0])  # type: ignore[arg-type]
-    leak = sheet_of(appendix_c.leak_table(context, items["appendix-c-leak"])[0])  # type: ignore[arg-type]
+    items = {item.id: item for item in simulation.ITEMS}
+    still = sheet_of(simulation.runs_table(context, items["appendix-c-no-leak"])[0])  # type: ignore[arg-type]
+    drift = sheet_of(simulation.runs_table(context, items["appendix-c-drift"])[0])  # type: ignore[arg-type]
+    leak = sheet_of(simulation.runs_table(context, items["appendix-c-leak"])[0])  # type: ignore[arg-type]
     for sheet in (still, drift):  # beyond 9 to 32 one column in 4000 of coins
         for chamber in CHAMBERS:
             assert 9 <= np.sum(sheet.log_change(chamber, "d1") < 0) <= 32, chamber

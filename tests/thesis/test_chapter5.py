@@ -12,7 +12,7 @@ import pytest
 
 from sealscope.errors import SimulationFailed
 from sealscope.recordings.recording import CHANNEL_UNITS, Recording
-from sealscope.thesis.chapters.appendix_c.simulation import detail_rms
+from sealscope.thesis.chapters.appendix_c_runs import detail_rms
 from sealscope.thesis.chapters.chapter5 import (
     ITEMS,
     TESTS,

@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.thesis.chapters.appendix_c.simulation import SimulatedTest, table_of
+from sealscope.thesis.chapters.appendix_c_runs import SimulatedTest, table_of
 from sealscope.thesis.chapters.chapter5 import TESTS, ShownMeasures
 from sealscope.thesis.claims import detection as claims
 from sealscope.thesis.claims import rig as claims_rig
 from sealscope.thesis.claims import sheet as claims_sheet
-from sealscope.thesis.claims import tests as claims_tests
 from sealscope.thesis.claims.evidence import NO_SHEET, ClaimEvidence, correlated
 from sealscope.thesis.engine.products import Claim, Product
 from sealscope.thesis.sheet import APPENDIX_C, QUANTITIES, DataSheet
@@ -74,8 +73,8 @@ def evidence(measured: DataSheet | None, leak: DataSheet | None = None) -> Claim
 def every_claim(of: ClaimEvidence) -> dict[str, Claim]:
     found = (
         *claims_sheet.claims(of),
-        *claims_tests.curves(of),
-        claims_tests.consistent(of),
+        *claims_sheet.curves(of),
+        claims_sheet.consistent(of),
         *claims_rig.claims(of),
     )
     return {claim.id: claim for claim in found}
@@ -100,7 +99,7 @@ def measured() -> dict[str, Claim]:
 
 def test_ids_are_unique_and_every_part_is_told(said: dict[str, Claim]) -> None:
     of = evidence(made(14, AS_SAID))
-    listed = [*claims_sheet.claims(of), *claims_tests.curves(of), *claims_rig.claims(of)]
+    listed = [*claims_sheet.claims(of), *claims_sheet.curves(of), *claims_rig.claims(of)]
     assert len({claim.id for claim in listed}) == len(listed)
     for claim in said.values():
         assert re.fullmatch(r"claim-[a1-6](\.\d+)+", claim.id)
@@ -146,9 +145,8 @@ def test_verdicts_on_the_thesis_s_own_sheet(measured: dict[str, Claim]) -> None:
 
 
 def test_leak_sizes_are_judged_by_the_conditions() -> None:
-    from sealscope.thesis.claims import tests as claims_tests
 
-    found = {claim.id: claim for claim in claims_tests.levels()}
+    found = {claim.id: claim for claim in claims_sheet.levels()}
     assert found["claim-5.1.2"].verdict == "does not hold"
     assert found["claim-5.1.3"].verdict == "does not hold"
     assert "0.0163" in found["claim-5.1.3"].sheet

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from sealscope.errors import InputError
 from sealscope.evaluation.binomial import at_least, clopper_pearson, holm, sign_test
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.thesis.chapters.appendix_c.success_rates import (
+from sealscope.thesis.chapters.success_rates import (
     CLAIMED,
     RATES,
     UNCLAIMED,
@@ -23,15 +23,14 @@ from sealscope.thesis.chapters.appendix_c.success_rates import (
     drift_threshold,
     thresholds,
 )
-from sealscope.thesis.claims.regressions import (
+from sealscope.thesis.claims.evidence import (
     change_columns,
     condition_columns,
     left_out_r2,
-    mean_leaks,
     partial_correlation,
     told_apart_by_levels,
 )
-from sealscope.thesis.sheet import QUANTITIES, DataSheet
+from sealscope.thesis.sheet import QUANTITIES, DataSheet, mean_leaks
 
 FOLDER = Path(__file__).resolve().parents[3] / "shared" / "data"
 needs_sheet = pytest.mark.skipif(

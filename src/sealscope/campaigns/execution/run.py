@@ -93,7 +93,7 @@ def _carry_out(task: Task, plan: SimulatedPlan, keep: Path | None, case: Campaig
 def _rows(
     task: Callable[[CampaignCase], CaseRow], cases: Sequence[CampaignCase], carry: Callable[..., Any]
 ) -> Generator[CaseRow, None, None]:
-    """Yield the rows of the cases as they end; a case whose process dies is tried once more, last, then a failed row."""
+    """Yield the rows of the cases as they end; a case whose process dies is tried once more, then failed."""
     died: list[CampaignCase] = []
     for waiting in (cases, died):
         with closing(carry(task, tuple(waiting))) as ended:

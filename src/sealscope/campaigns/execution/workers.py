@@ -1,4 +1,4 @@
-"""Items carried out by processes of this machine, or by a Dask cluster; the death of one costs its item and no other."""
+"""Items carried out by processes of this machine, or by a Dask cluster; the death of one costs its item alone."""
 
 from __future__ import annotations
 
