@@ -88,7 +88,7 @@ def test_kinds_of_records_take_turns(tiny):
         ('closed = ["0 %"', 'closed = ["100 %"', "closed must be 0 to under 100 %"),
         ('closed = ["0 %", "50 %"]', 'opened = ["0 %"]', "factors.opened"),
         ('use = "calibrate"', 'use = "guess"', "records[1].use must be 'calibrate' or 'judge'"),
-        ("count = 6", "count = 0", "records[1].count must be greater than or equal to 1"),
+        ("count = 6", "count = 0", "records[2].count must be greater than or equal to 1"),
         ('leak = "0.015 L/min"', 'leak = "0.015 L"', "leak"),
         ('leak = "30 cm^3/min"', 'leak = "0.015 L/min"', "records must differ"),
         ('use = "calibrate"', 'use = "calibrate"\nleak = "1 L/min"', "must be leak-free"),

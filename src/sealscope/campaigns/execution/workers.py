@@ -46,12 +46,11 @@ def carried_out(
     lifeline, held = context.Pipe(duplex=False)
     idle: list[ProcessPoolExecutor] = []
     busy: dict[Future[Result], tuple[ProcessPoolExecutor, Item]] = {}
-    begin = {"mp_context": context, "initializer": _begin, "initargs": (task, lifeline)}
     try:
         while True:
             for item in islice(waiting, jobs - len(busy)):
                 with _worker_environment():  # a process starts with its first item
-                    pool = idle.pop() if idle else ProcessPoolExecutor(1, **begin)  # type: ignore[arg-type]
+                    pool = idle.pop() if idle else ProcessPoolExecutor(1, context, _begin, (task, lifeline))
                     busy[pool.submit(_carry_out, item)] = pool, item
             if not busy:
                 return

@@ -79,7 +79,9 @@ def read_plan(tree: Mapping[str, Any], place: str = "plan") -> AnyPlan:
         if key not in _TABLES[kind]:
             known = ", ".join(f"[{name}]" for name in _TABLES[kind])
             raise InputError(f"[{key}] is not known; a plan with [{kind}] has {known} ({place})")
-    return {"recordings": _recorded, "held_out": _held_out, "records": _simulated}[kind](tree, place)
+    if kind == "recordings":
+        return _recorded(tree, place)
+    return _held_out(tree, place) if kind == "held_out" else _simulated(tree, place)
 
 
 def _in(entry: str, place: str, read: Callable[[], _T]) -> _T:
@@ -178,14 +180,12 @@ def _views(given: Any, head: dict[str, Any], place: str) -> dict[str, tuple[str,
             raise InputError(f"{entry} must be a plain name without '@' ({place})")
     if "channels" in head:
         views[""] = ("campaign.channels", head.pop("channels"))
-    for entry, given in views.values():
-        if not isinstance(given, list) or not given or len({repr(name) for name in given}) < len(given):
-            raise InputError(f"{entry} must be a list of channels, each once, got {given!r} ({place})")
-        for channel in given:
-            if channel not in map(str, CHANNEL_UNITS):
-                raise InputError(f"{entry} must be a list of channels, each once, got {given!r} ({place})")
-            if channel == "q_leak":
-                raise InputError(f"{entry} must not hold q_leak: it measures what detectors are to find ({place})")
+    for entry, channels in views.values():
+        known = isinstance(channels, list) and channels and all(name in list(CHANNEL_UNITS) for name in channels)
+        if not known or len(set(channels)) < len(channels):
+            raise InputError(f"{entry} must be a list of channels, each once, got {channels!r} ({place})")
+        if "q_leak" in channels:
+            raise InputError(f"{entry} must not hold q_leak: it measures what detectors are to find ({place})")
     return {name: tuple(channels) for name, (_, channels) in views.items()}
 
 

@@ -136,8 +136,11 @@ def _leak_free_paths(duration: float) -> Callable[[Condition], Trajectory]:
     """Return what simulates an operating condition without a leak, each once for this call: a path is large."""
     from sealscope.simulation.integrate import trajectory
 
-    path = cache(lambda group: trajectory(_experiment(Condition(0, *group, 0.0, ""), duration), ()))
-    return lambda condition: path(condition.group)
+    @cache
+    def path(command: str, closed_pct: float) -> Trajectory:
+        return trajectory(_experiment(Condition(0, command, closed_pct, 0.0, ""), duration), ())
+
+    return lambda condition: path(*condition.group)
 
 
 def with_leak(half: float, quick: bool) -> Iterator[SimulatedTest]:

@@ -20,7 +20,7 @@ from sealscope.thesis.engine.context import Context, RunSpec, SimulatedRun, simu
 from sealscope.thesis.engine.items import Item, collect, select_items, with_needed
 from sealscope.thesis.engine.kept import ResultsFolder
 from sealscope.thesis.engine.products import Claim, Figure, Product, ThesisTable, thinned
-from sealscope.thesis.sheet import MISSING, find_sheet, read_sheet
+from sealscope.thesis.sheet import MISSING, DataSheet, find_sheet, read_sheet
 
 #: Draws an item's products into a folder and returns its files, relative to the folder.
 Publish = Callable[[Item, tuple[Product | Claim, ...], Path], tuple[str, ...]]
@@ -58,7 +58,10 @@ class Reproduction:
     ) -> None:
         self.folder, self.items = ResultsFolder(folder), {item.id: item for item in items}
         self.quick, self.publish, self._sheet_folder = quick, publish, sheet
-        self.sheet, self._sheet_key = (None, "") if sheet is None else read_sheet(sheet)
+        self.sheet: DataSheet | None = None
+        self._sheet_key = ""
+        if sheet is not None:
+            self.sheet, self._sheet_key = read_sheet(sheet)
         self.statuses: dict[str, ItemStatus] = {}
         self._run = lru_cache(maxsize=2)(self._kept_run)
 
