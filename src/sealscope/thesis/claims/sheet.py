@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, Literal
@@ -13,14 +14,7 @@ import numpy as np
 from sealscope.evaluation.binomial import at_least
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.thesis.chapters.chapter5 import NOMINAL_LPM, TESTS, ShownTest
-from sealscope.thesis.chapters.success_rates import (
-    CLAIMED,
-    DIRECTION,
-    UNCLAIMED,
-    Rule,
-    d1_threshold,
-    drift_threshold,
-)
+from sealscope.thesis.chapters.success_rates import CLAIMED, DIRECTION, UNCLAIMED, Rule, d1_threshold, drift_threshold
 from sealscope.thesis.claims import evidence as ev
 from sealscope.thesis.claims.evidence import (
     NO_SHEET,
@@ -42,16 +36,6 @@ from sealscope.thesis.sheet import APPENDIX_C, DataSheet, mean_leaks
 
 _N = len(APPENDIX_C)
 _A_D3, _, _A_BOTH, _, _, _B_BOTH, _TOGETHER = CLAIMED
-#: Where each cell of Table 5.1 is drawn, and its printed rates [%]: the table's, and the one the text has beside it.
-_CELLS: tuple[tuple[Rule, str, tuple[int, ...]], ...] = tuple(
-    (rule, where, printed)
-    for rule, where, printed in zip(
-        CLAIMED,
-        (*(f"Fig. 5.{number}" for number in range(90, 96)), "section 5.6"),
-        ((100,), (64, 65), (85,), (48,), (76,), (76,), (65,)),
-        strict=True,
-    )
-)
 
 
 def _past_noise(sheet: DataSheet, chamber: str, name: str) -> np.ndarray:
@@ -66,8 +50,8 @@ def _controls(evidence: ClaimEvidence, rule: Rule) -> str:
     )
 
 
-def _cell(rule: Rule, where: str, printed: tuple[int, ...]) -> SheetClaim:
-    chance = 0.5 ** len(rule.details)
+def _cell(rule: Rule, where: str) -> SheetClaim:
+    chance, printed = 0.5 ** len(rule.details), [int(of) for of in re.findall(r"\d+", rule.printed)]
 
     def test(sheet: DataSheet) -> Iterator[Finding]:
         fires = rule.fires(sheet)
@@ -228,8 +212,9 @@ _CLAIMS: dict[str, SheetClaim] = {
 
 def claims(evidence: ClaimEvidence) -> Iterator[Claim]:
     """Judge the claims of the abstract, sections 5.6 and 5.7, Table 5.1, and chapter 6 on what was detected."""
-    for number, cell in enumerate(_CELLS, start=1):
-        yield _cell(*cell).judge(evidence, f"5.4.{number}", "5.4")
+    for number, rule in enumerate(CLAIMED, start=1):
+        where = "section 5.6" if rule is _TOGETHER else f"Fig. 5.{89 + number}"
+        yield _cell(rule, where).judge(evidence, f"5.4.{number}", "5.4")
     for id, of in _CLAIMS.items():
         yield of.judge(evidence, id)
 
