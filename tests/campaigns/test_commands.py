@@ -54,11 +54,11 @@ def test_no_more_processes_than_two_a_core(call, tiny, tmp_path, monkeypatch):
     assert [workers.process_count(asked) for asked in (None, 1, 4, 30)] == [2, 1, 4, 4]
     started = []
 
-    def rows(task, cases, jobs):
+    def ended(task, cases, jobs):
         started.append(jobs)
-        return (CaseRow.of(case, error="not carried out") for case in cases)
+        yield from ((case, CaseRow.of(case, error="not carried out")) for case in cases)
 
-    monkeypatch.setattr(run, "_in_processes", rows)
+    monkeypatch.setattr(run, "carried_out", ended)
     _, _, err = call("campaign", "run", tiny, "-o", tmp_path / "out", "-j", "30")
     assert started == [4]
     assert err.startswith("sealscope: --jobs 30: 4 processes are started, two a core\n")

@@ -262,13 +262,13 @@ def test_what_names_stand_for(plan):
     ("before", "after", "told"),
     [
         ('pressures = ["u"', 'pressures = ["q_leak"', "must not hold q_leak"),
-        ('pressures = ["u"', 'pressures = ["v"', "must be channels such as"),
+        ('pressures = ["u"', 'pressures = ["v"', "must be a list of channels"),
         ('pressures = ["u", "p_A", "p_B"]', "pressures = []", "must be a list of channels"),
         ("[views]", '[views]\n"a @ b" = ["u"]', "plain name"),
         ("seed = 3", 'seed = 3\nassume = "nowhere"', "campaign.assume"),
-        ("seed = 3", "seed = 3\nassume_set = 3", "assume_set must be a table"),
+        ("seed = 3", "seed = 3\nassume_set = 3", "campaign.assume: must be a table"),
         ("seed = 3", 'seed = 3\nassume_set = { "V_9" = 1.0 }', "campaign.assume"),
-        ('"watcher",', '"watcher", 3,', "must be a list of names"),
+        ('"watcher",', '"watcher", 3,', "campaign.detectors.1 must be"),
     ],
 )
 def test_what_breaks_a_rule_is_one_line(plan, tmp_path, before, after, told):

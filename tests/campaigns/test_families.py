@@ -13,7 +13,7 @@ from sealscope.campaigns.judging.tables import tables_of
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.errors import InputError
-from sealscope.reporting.campaign.tables import family_lines
+from sealscope.reporting.campaign.tables import page_tables
 from sealscope.simulation.experiment import Experiment
 
 NAME = "diagnose"
@@ -76,7 +76,7 @@ def test_the_table_says_which_half_it_is():
 
 
 def test_the_page_shows_each_family():
-    lines = family_lines(judge(ROWS, [NAME]))
+    lines = page_tables(judge(ROWS, [NAME]), "L/min")["families"].rows
     assert lines[0][:3] == (NAME, ALL, "no leak")
     both = next(line for line in lines if line[1:3] == ("hoses", "0.004 any"))
     assert both[3].startswith("50 %")

@@ -94,9 +94,9 @@ def test_a_file_that_cannot_be_judged_is_a_row_with_its_error(folder):
     ("before", "after", "told"),
     [
         ('files = "leaky-*.csv"', 'files = "../*.csv"', "files must be a pattern within the folder"),
-        ("size = 0.3", "size = -1.0", "size must be >= 0"),
+        ("size = 0.3", "size = -1.0", "recordings.sets[3].size must be greater than or equal to 0"),
         ("end = 11", "end = 11\nsize = 1.0", "0 to calibrate"),
-        ('rate = "500 Hz"', "map = 3", "map must be a table"),
+        ('rate = "500 Hz"', "map = 3", "recordings.map must be a valid"),
         ("size = 0.3", "colour = 1", "colour is not known"),
     ],
 )

@@ -3,7 +3,7 @@
 import pytest
 
 import sealscope as ss
-from sealscope.campaigns.cases.online import online
+from sealscope.campaigns.cases.scoring import online
 from sealscope.campaigns.plans.detectors import check_detector, plan_detector
 from sealscope.errors import InputError
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import multiprocessing
 import time
 from functools import partial
 from importlib import import_module
@@ -10,17 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from sealscope.campaigns.execution.workers import Workers
-
-
-def carried_out(workers, items):
-    """Item -> result of all items, as many at a time as the workers take."""
-    waiting, results = list(items), {}
-    while waiting or workers.items:
-        while waiting and workers.free:
-            workers.begin(waiting.pop(0))
-        results.update(workers.ended())
-    return results
+from sealscope.campaigns.execution.workers import carried_out
 
 
 @pytest.fixture
@@ -30,23 +21,27 @@ def die_on(monkeypatch):
 
 
 def test_a_process_that_dies_loses_its_own_item_alone(die_on):
-    with Workers(2, partial(die_on, 3)) as workers:
-        assert carried_out(workers, range(8)) == {item: None if item == 3 else item for item in range(8)}
+    results = dict(carried_out(partial(die_on, 3), range(8), 2))
+    assert results == {item: None if item == 3 else item for item in range(8)}
 
 
 def test_what_a_task_raises_is_raised():
-    with Workers(2, math.sqrt) as workers, pytest.raises(ValueError, match="math domain error"):
-        carried_out(workers, [4.0, -1.0])
+    with pytest.raises(ValueError, match="math domain error"):
+        list(carried_out(math.sqrt, [4.0, -1.0], 2))
 
 
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="looks at processes in /proc")
-def test_leaving_the_block_ends_processes_at_work(die_on, tmp_path):
-    began = time.monotonic()
-    with Workers(1, partial(time.sleep)) as workers:
-        workers.begin(600.0)
-        (pool,) = (pool for pool, _ in workers._busy.values())
-        (pid,) = pool._processes
-        assert Path(f"/proc/{pid}").is_dir()
-    while Path(f"/proc/{pid}").is_dir() and time.monotonic() < began + 60:
+def test_closing_ends_processes_at_work():
+    def alive():
+        return {child.pid for child in multiprocessing.active_children()}
+
+    others = alive()
+    ended = carried_out(time.sleep, [0.0, 600.0], 2)
+    next(ended)
+    (*_, pid) = alive() - others
+    assert Path(f"/proc/{pid}").is_dir()
+    ended.close()
+    until = time.monotonic() + 60
+    while alive() - others and time.monotonic() < until:
         time.sleep(0.05)
-    assert not Path(f"/proc/{pid}").is_dir()
+    assert not alive() - others

@@ -108,7 +108,7 @@ def test_no_library_runs_where_python_itself_begins_in_the_folder(planted: Path,
 
 
 def test_none_runs_in_worker_processes(run: Ran) -> None:
-    ((_, loaded),) = in_order(1, eval, [LOADED])
+    ((_, loaded),) = in_order(2, eval, [LOADED])
     assert loaded is not None
     assert "multiprocessing.spawn" in loaded
     text = "from sealscope.campaigns.execution.workers import in_order\n"

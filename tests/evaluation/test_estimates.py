@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sealscope.errors import InputError
 from sealscope.evaluation.estimates import estimate_error, mean_of, onset_errors, order_ranks, quantile_of
 from sealscope.evaluation.table import events_per_hour, poisson_interval
 
@@ -130,23 +129,3 @@ def test_errors_of_an_onset():
     assert found.median.value == 0.0
     assert (found.median_size.value, found.ninety_size.value) == (2.0, 5.0)
     assert (found.coverage.count, found.coverage.n) == (1, 3)
-
-
-@pytest.mark.parametrize(
-    ("call", "line"),
-    [
-        (lambda: poisson_interval(-1), "a number of events must be whole and >= 0, got -1"),
-        (lambda: events_per_hour(1, 0.0), "operating hours must be > 0, got 0.0"),
-        (lambda: quantile_of([], 0.5), "values for a quantile must be at least 1 and none of them nan"),
-        (lambda: quantile_of([1.0], 1.0), "the order of a quantile must be between 0 and 1, got 1.0"),
-        (lambda: estimate_error([1.0], [1.0, 2.0]), "estimates must be as many as the true values, got (1,) for 2"),
-        (
-            lambda: onset_errors([math.nan], [1.0]),
-            "onset errors need at least one estimated onset, got none in 1 records",
-        ),
-    ],
-)
-def test_impossible_times(call, line):
-    with pytest.raises(InputError) as error:
-        call()
-    assert str(error.value) == line

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sealscope.errors import InputError
 from sealscope.evaluation.pod import by_size, fit_hit_miss, proven_size
 
 # Dalal, Fowlkes, Hoadley, JASA 84 (1989) 945-957: launch temperature [F], O-ring distress, before the Challenger's last
@@ -163,22 +162,3 @@ def test_detection_by_size_and_what_it_proves():
     assert proven_size(rows) == math.inf  # ten of ten prove nothing, so nothing above 3.0 is proven
     assert proven_size(rows[:3]) == 3.0
     assert proven_size(rows, 0.7) == 2.0
-
-
-@pytest.mark.parametrize(
-    ("call", "line"),
-    [
-        (
-            lambda: fit_hit_miss([0.0, 1.0], [0, 1]),
-            "leak sizes must be > 0, got 0.0 (a record without a leak is no size of leak)",
-        ),
-        (lambda: fit_hit_miss([1.0, 2.0], [1, 1]), "a curve needs hits and misses, got 2 hits of 2"),
-        (lambda: fit_hit_miss([1.0, 1.0], [0, 1]), "a curve needs leaks of at least 2 sizes, got 2 of one size"),
-        (lambda: fit_hit_miss([1.0, 2.0], [0, 0.5]), "hits must be yes or no (1 or 0), got 0.5"),
-        (lambda: fit_hit_miss([1.0, 2.0], [0]), "hits must be as many as the records, got 1 for 2"),
-    ],
-)
-def test_impossible_data(call, line):
-    with pytest.raises(InputError) as error:
-        call()
-    assert str(error.value) == line

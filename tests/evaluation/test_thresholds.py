@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from sealscope.errors import InputError
 from sealscope.evaluation.thresholds import quantile_threshold, records_needed
 
 distinct = st.lists(st.integers(-10_000, 10_000), min_size=25, max_size=120, unique=True)
@@ -97,29 +96,3 @@ def test_ties_never_raise_the_probability():
     found = quantile_threshold([0.0] * 50 + [1.0] * 50, 0.1)
     assert found.value == 1.0
     assert math.isclose(found.expected, 10 / 101)
-
-
-@pytest.mark.parametrize(
-    ("call", "line"),
-    [
-        (
-            lambda: quantile_threshold(range(50), 0.01),
-            "leak-free records must be at least 99 for a false-alarm probability of 0.01, got 50",
-        ),
-        (
-            lambda: quantile_threshold(range(298), 0.01, promise="bound"),
-            "leak-free records must be at least 299 for a false-alarm probability of 0.01, got 298",
-        ),
-        (lambda: quantile_threshold(range(50), 1.5), "the false-alarm probability must be between 0 and 1, got 1.5"),
-        (lambda: quantile_threshold([1.0, math.inf], 0.5), "leak-free scores must be finite, got inf (number 2 of 2)"),
-        (
-            lambda: quantile_threshold(range(50), 0.1, promise="hope"),
-            "the promise must be 'average' or 'bound', got 'hope'",
-        ),
-        (lambda: records_needed(0.0), "the false-alarm probability must be between 0 and 1, got 0.0"),
-    ],
-)
-def test_too_few_records_and_impossible_probabilities(call, line):
-    with pytest.raises(InputError) as error:
-        call()
-    assert str(error.value) == line

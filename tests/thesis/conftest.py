@@ -1,4 +1,4 @@
-"""A small chapter of makers, and a made-up data sheet of the right form."""
+"""What makers may ask for, a small chapter of makers, and a made-up data sheet of the right form."""
 
 from __future__ import annotations
 
@@ -8,9 +8,63 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from sealscope.thesis.sheet import APPENDIX_C, FILES, QUANTITIES
+from sealscope.recordings.chambers import CHAMBERS
+from sealscope.thesis.engine.context import RunSpec, SimulatedRun, simulated_run
+from sealscope.thesis.engine.products import Claim, Product
+from sealscope.thesis.sheet import APPENDIX_C, FILES, QUANTITIES, DataSheet, read_sheet
+
+#: The folder of the measured sheet beside this checkout.
+FOLDER = Path(__file__).resolve().parents[3] / "shared" / "data"
+needs_sheet = pytest.mark.skipif(
+    not (FOLDER / FILES["p_A"]).is_file(), reason="../shared/data/appendix_c_pa.csv is absent"
+)
+
+
+class Kept:
+    """A context that keeps its runs in memory and hands out the products that it was given."""
+
+    quick = True
+
+    def __init__(
+        self,
+        products: dict[str, tuple[Product | Claim, ...]] | None = None,
+        sheet: DataSheet | None = None,
+        runs: dict[RunSpec, SimulatedRun] | None = None,
+    ) -> None:
+        self.products, self.sheet, self.runs = products or {}, sheet, {} if runs is None else runs
+
+    def run(self, spec: RunSpec) -> SimulatedRun:
+        if spec not in self.runs:
+            self.runs[spec] = simulated_run(spec.experiment(), spec.prove)
+        return self.runs[spec]
+
+    def product(self, item: str) -> tuple[Product | Claim, ...]:
+        return self.products[item]
+
+
+def made_sheet(
+    seed: int, shifts: dict[tuple[str, str], float] | None = None, scatter: float = 0.05, n: int = 41
+) -> DataSheet:
+    """A sheet whose log changes scatter about the stated shifts (0 elsewhere)."""
+    random = np.random.default_rng(seed)
+    rms: dict[str, dict[str, np.ndarray]] = {}
+    for chamber in CHAMBERS:
+        rms[chamber] = {}
+        for name in QUANTITIES:
+            before = np.exp(random.normal(0.5, 0.2, n))
+            change = random.normal((shifts or {}).get((chamber, name), 0.0), scatter, n)
+            rms[chamber][name] = np.column_stack([before, before * np.exp(change)])
+    return DataSheet(rms)
+
+
+@pytest.fixture(scope="session")
+def measured_sheet() -> DataSheet:
+    """The measured sheet; for tests that are marked `needs_sheet`."""
+    return read_sheet(FOLDER)[0]
+
 
 CHAPTER = """
 import os, time

@@ -2,33 +2,22 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
 from sealscope.parameters import load_rig
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.thesis.chapters.appendix_c import simulation
-from sealscope.thesis.chapters.appendix_c import tables as appendix_c
-from sealscope.thesis.chapters.appendix_c.simulation import RigDrift, draw_rig_drift, sheet_of
-from sealscope.thesis.engine.products import Product, ThesisTable
+from sealscope.thesis.chapters import appendix_c
+from sealscope.thesis.chapters import appendix_c_runs as simulation
+from sealscope.thesis.chapters.appendix_c_runs import RigDrift, draw_rig_drift, sheet_of
+from sealscope.thesis.engine.products import Claim, Product, ThesisTable
 from sealscope.thesis.sheet import APPENDIX_C, QUANTITIES, DataSheet
 
+from .conftest import Kept, made_sheet
+
 TWO = (APPENDIX_C[10], APPENDIX_C[11], APPENDIX_C[39])
-
-
-class Made:
-    """Hands out the tables of the items it was given."""
-
-    quick = True
-
-    def __init__(self, products: dict[str, tuple[Product, ...]], sheet: DataSheet | None) -> None:
-        self.products, self.sheet = products, sheet
-
-    def product(self, item: str) -> tuple[Product, ...]:
-        return self.products[item]
-
-    def run(self, spec: object) -> object:
-        raise AssertionError("nothing here may run")
 
 
 @pytest.fixture(scope="module")
@@ -36,14 +25,8 @@ def tables() -> dict[str, tuple[ThesisTable, ...]]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulation, "APPENDIX_C", TWO)
         patch.setattr(simulation, "QUICK_HALF", 20.0)
-        context = Made({}, None)
-        items = {item.id: item for item in appendix_c.ITEMS}
-        makers = {
-            "appendix-c-leak": appendix_c.leak_table,
-            "appendix-c-no-leak": appendix_c.no_leak_table,
-            "appendix-c-drift": appendix_c.drift_table,
-        }
-        return {name: make(context, items[name]) for name, make in makers.items()}  # type: ignore[arg-type]
+        context = Kept()
+        return {item.id: simulation.runs_table(context, item) for item in simulation.ITEMS}  # type: ignore[arg-type]
 
 
 def test_a_table_reads_back_as_the_sheet_it_holds(tables: dict[str, tuple[ThesisTable, ...]]) -> None:
@@ -107,18 +90,6 @@ def test_a_drifted_rig_differs_in_friction_bulk_modulus_and_noise_alone() -> Non
     )  # fmt: skip
 
 
-def made_sheet(seed: int, shift: float) -> DataSheet:
-    """41 tests whose every change is `shift` and noise."""
-    random = np.random.default_rng(seed)
-    rms = {}
-    for chamber in CHAMBERS:
-        rms[chamber] = {}
-        for name in QUANTITIES:
-            before = np.exp(random.normal(0.5, 0.2, 41))
-            rms[chamber][name] = np.column_stack([before, before * np.exp(random.normal(shift, 0.01, 41))])
-    return DataSheet(rms)
-
-
 def full_table(sheet: DataSheet, item: str) -> ThesisTable:
     rows = [
         simulation.SimulatedTest(
@@ -135,12 +106,13 @@ def full_table(sheet: DataSheet, item: str) -> ThesisTable:
 
 @pytest.mark.parametrize("given", [True, False], ids=["with sheet", "without sheet"])
 def test_the_appendix_stands_beside_the_sheet_where_there_is_one(given: bool) -> None:
-    measured = made_sheet(1, -0.2)
+    everywhere = dict.fromkeys(itertools.product(CHAMBERS, QUANTITIES), -0.2)
+    measured = made_sheet(1, everywhere, 0.01)
     twice = DataSheet({c: {q: 2.0 * pairs for q, pairs in of.items()} for c, of in measured.rms.items()})
     leak = full_table(twice, "appendix-c-leak")
-    still = full_table(made_sheet(2, 0.0), "appendix-c-no-leak")
-    products: dict[str, tuple[Product, ...]] = {"appendix-c-leak": (leak,), "appendix-c-no-leak": (still,)}
-    context = Made(products, measured if given else None)
+    still = full_table(made_sheet(2, scatter=0.01), "appendix-c-no-leak")
+    products: dict[str, tuple[Product | Claim, ...]] = {"appendix-c-leak": (leak,), "appendix-c-no-leak": (still,)}
+    context = Kept(products, measured if given else None)
     items = {item.id: item for item in appendix_c.ITEMS}
     summary, of_a, of_b = appendix_c.appendix(context, items["appendix-c"])  # type: ignore[arg-type]
     assert (summary.id, of_a.id, of_b.id) == ("appendix-c", "appendix-c-pa", "appendix-c-pb")
@@ -164,11 +136,11 @@ def test_the_appendix_stands_beside_the_sheet_where_there_is_one(given: bool) ->
 @pytest.mark.slow
 @pytest.mark.long
 def test_the_thesis_s_rule_fires_like_a_coin_where_nothing_leaks() -> None:
-    context = Made({}, None)
-    items = {item.id: item for item in appendix_c.ITEMS}
-    still = sheet_of(appendix_c.no_leak_table(context, items["appendix-c-no-leak"])[0])  # type: ignore[arg-type]
-    drift = sheet_of(appendix_c.drift_table(context, items["appendix-c-drift"])[0])  # type: ignore[arg-type]
-    leak = sheet_of(appendix_c.leak_table(context, items["appendix-c-leak"])[0])  # type: ignore[arg-type]
+    context = Kept()
+    items = {item.id: item for item in simulation.ITEMS}
+    still = sheet_of(simulation.runs_table(context, items["appendix-c-no-leak"])[0])  # type: ignore[arg-type]
+    drift = sheet_of(simulation.runs_table(context, items["appendix-c-drift"])[0])  # type: ignore[arg-type]
+    leak = sheet_of(simulation.runs_table(context, items["appendix-c-leak"])[0])  # type: ignore[arg-type]
     for sheet in (still, drift):  # beyond 9 to 32 one column in 4000 of coins
         for chamber in CHAMBERS:
             assert 9 <= np.sum(sheet.log_change(chamber, "d1") < 0) <= 32, chamber

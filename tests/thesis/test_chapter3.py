@@ -15,26 +15,10 @@ from sealscope.thesis.chapters.chapter3 import (
     wavelet_spectrum,
 )
 from sealscope.thesis.claims import chapter3 as chapter3_claims
-from sealscope.thesis.engine.context import RunSpec, SimulatedRun, simulated_run
+from sealscope.thesis.engine.context import RunSpec, SimulatedRun
 from sealscope.thesis.engine.products import Claim, Figure, verdict_of
 
-
-class Kept:
-    """A context that keeps its runs in memory."""
-
-    quick = True
-    sheet = None
-
-    def __init__(self) -> None:
-        self.runs: dict[RunSpec, SimulatedRun] = {}
-
-    def run(self, spec: RunSpec) -> SimulatedRun:
-        if spec not in self.runs:
-            self.runs[spec] = simulated_run(spec.experiment(), spec.prove)
-        return self.runs[spec]
-
-    def product(self, item: str) -> tuple[Figure | Claim, ...]:
-        raise AssertionError(f"no item of chapter 3 needs another, asked for {item}")
+from .conftest import Kept
 
 
 @pytest.fixture(scope="module")

@@ -32,27 +32,11 @@ from sealscope.thesis.chapters.chapter4.cases import (
 from sealscope.thesis.chapters.chapter4.friction import falls_up_to, jumps_at_threshold
 from sealscope.thesis.claims import chapter4 as chapter4_claims
 from sealscope.thesis.claims.chapter4 import ringing, sine_fit
-from sealscope.thesis.engine.context import RunSpec, SimulatedRun, simulated_run
+from sealscope.thesis.engine.context import RunSpec, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Claim, Figure, ThesisTable
 
-
-class Kept:
-    """A context that keeps its runs in memory."""
-
-    quick = True
-    sheet = None
-
-    def __init__(self, runs: dict[RunSpec, SimulatedRun] | None = None) -> None:
-        self.runs = {} if runs is None else runs
-
-    def run(self, spec: RunSpec) -> SimulatedRun:
-        if spec not in self.runs:
-            self.runs[spec] = simulated_run(spec.experiment(), spec.prove)
-        return self.runs[spec]
-
-    def product(self, item: str) -> tuple[Figure | ThesisTable | Claim, ...]:
-        raise AssertionError(f"no item of chapter 4 needs another, asked for {item}")
+from .conftest import Kept
 
 
 @pytest.fixture(scope="module")
@@ -227,7 +211,7 @@ def test_a_run_that_diverged_leaves_its_reason_and_no_curve(kept: Kept) -> None:
                 return SimulatedRun(None, np.empty(0), {}, 0.0, False, diverged="the run diverged: p_1 is not finite")
             return super().run(spec)
 
-    failing = Failing(kept.runs)
+    failing = Failing(runs=kept.runs)
     (figure,) = make(failing, ALL["fig-4.10"])
     assert figure.resolved is False
     assert "p_1 is not finite" in figure.notes
@@ -327,7 +311,7 @@ def test_claims_on_the_orifice_follow_their_numbers(kept: Kept, claims: dict[str
             outputs["p_2"] = outputs["p_2"] + 2.0 * visible_pressure()
             return replace(run, outputs=outputs)
 
-    found = make(AsClaimed(kept.runs), ALL["chapter-4-claims"])
+    found = make(AsClaimed(runs=kept.runs), ALL["chapter-4-claims"])
     verdicts = {one.id: one.verdict for one in found if isinstance(one, Claim)}
     assert verdicts["claim-4.8"] != "holds"
     assert claims["claim-4.8"].verdict == "holds"

@@ -4,41 +4,28 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
-import numpy as np
 import pytest
 
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.thesis.chapters.appendix_c.simulation import SimulatedTest, table_of
+from sealscope.thesis.chapters.appendix_c_runs import SimulatedTest, table_of
 from sealscope.thesis.chapters.chapter5 import TESTS, ShownMeasures
 from sealscope.thesis.claims import detection as claims
 from sealscope.thesis.claims import rig as claims_rig
 from sealscope.thesis.claims import sheet as claims_sheet
-from sealscope.thesis.claims import tests as claims_tests
 from sealscope.thesis.claims.evidence import NO_SHEET, ClaimEvidence, correlated
 from sealscope.thesis.engine.products import Claim, Product
 from sealscope.thesis.sheet import APPENDIX_C, QUANTITIES, DataSheet
 
-FOLDER = Path(__file__).resolve().parents[3] / "shared" / "data"
-needs_sheet = pytest.mark.skipif(
-    not (FOLDER / "appendix_c_pa.csv").is_file(), reason="../shared/data/appendix_c_pa.csv is absent"
-)
+from .conftest import Kept, made_sheet, needs_sheet
+
 #: Log changes of a rig on which everything the thesis says of its columns is true.
 AS_SAID = {("p_A", "d3"): -0.3, ("p_A", "d4"): -0.3, ("p_A", "d3d4"): -0.6}
 AS_SAID |= {("p_B", "d3"): 0.3, ("p_B", "d4"): 0.3, ("p_B", "d3d4"): 0.6}
 
 
 def made(seed: int, shifts: dict[tuple[str, str], float] | None = None) -> DataSheet:
-    random = np.random.default_rng(seed)
-    rms: dict[str, dict[str, np.ndarray]] = {}
-    for chamber in CHAMBERS:
-        rms[chamber] = {}
-        for name in QUANTITIES:
-            before = np.exp(random.normal(0.5, 0.2, 41))
-            change = random.normal((shifts or {}).get((chamber, name), 0.0), 0.03, 41)
-            rms[chamber][name] = np.column_stack([before, before * np.exp(change)])
-    return DataSheet(rms)
+    return made_sheet(seed, shifts, 0.03)
 
 
 def one_shown(section: str, step_s: float | None = None) -> ShownMeasures:
@@ -74,8 +61,8 @@ def evidence(measured: DataSheet | None, leak: DataSheet | None = None) -> Claim
 def every_claim(of: ClaimEvidence) -> dict[str, Claim]:
     found = (
         *claims_sheet.claims(of),
-        *claims_tests.curves(of),
-        claims_tests.consistent(of),
+        *claims_sheet.curves(of),
+        claims_sheet.consistent(of),
         *claims_rig.claims(of),
     )
     return {claim.id: claim for claim in found}
@@ -91,16 +78,14 @@ def nothing() -> dict[str, Claim]:
     return every_claim(evidence(made(15)))
 
 
-@pytest.fixture(scope="module")
-def measured() -> dict[str, Claim]:
-    from sealscope.thesis.sheet import read_sheet
-
-    return every_claim(evidence(read_sheet(FOLDER)[0]))
+@pytest.fixture
+def measured(measured_sheet: DataSheet) -> dict[str, Claim]:
+    return every_claim(evidence(measured_sheet))
 
 
 def test_ids_are_unique_and_every_part_is_told(said: dict[str, Claim]) -> None:
     of = evidence(made(14, AS_SAID))
-    listed = [*claims_sheet.claims(of), *claims_tests.curves(of), *claims_rig.claims(of)]
+    listed = [*claims_sheet.claims(of), *claims_sheet.curves(of), *claims_rig.claims(of)]
     assert len({claim.id for claim in listed}) == len(listed)
     for claim in said.values():
         assert re.fullmatch(r"claim-[a1-6](\.\d+)+", claim.id)
@@ -146,9 +131,8 @@ def test_verdicts_on_the_thesis_s_own_sheet(measured: dict[str, Claim]) -> None:
 
 
 def test_leak_sizes_are_judged_by_the_conditions() -> None:
-    from sealscope.thesis.claims import tests as claims_tests
 
-    found = {claim.id: claim for claim in claims_tests.levels()}
+    found = {claim.id: claim for claim in claims_sheet.levels()}
     assert found["claim-5.1.2"].verdict == "does not hold"
     assert found["claim-5.1.3"].verdict == "does not hold"
     assert "0.0163" in found["claim-5.1.3"].sheet
@@ -196,17 +180,8 @@ def test_the_table_of_claims_gathers_all_chapters_in_order() -> None:
         "chapter-6-claims": (),
     }
 
-    class Given:
-        quick, sheet = True, None
-
-        def product(self, item: str) -> tuple[Product | Claim, ...]:
-            return products[item]
-
-        def run(self, spec: object) -> object:
-            raise AssertionError("nothing here may run")
-
     item = next(one for one in claims.ITEMS if one.id == "claims")
-    table, verdicts = claims.table(Given(), item)  # type: ignore[arg-type]
+    table, verdicts = claims.table(Kept(products), item)  # type: ignore[arg-type]
     assert [row[0] for row in table.rows] == ["claim-a.1", "claim-3.2", "claim-4.2", "claim-4.10", "claim-5.1.1"]
     assert dict(verdicts.rows) == {"holds": 3, "holds in part": 1, "does not hold": 1, "cannot be tested": 0}
     assert "not given" in table.notes

@@ -22,7 +22,7 @@ from sealscope.errors import InputError
 from sealscope.thesis.engine import build
 from sealscope.thesis.engine.build import Reproduction, reproduce
 from sealscope.thesis.engine.context import RunSpec, simulated_run
-from sealscope.thesis.engine.items import Item, collect, select_items, with_needed
+from sealscope.thesis.engine.items import Item, collect, select_items
 from sealscope.thesis.engine.kept import ResultsFolder
 from sealscope.thesis.engine.products import Claim, Figure, FigureCurve, Image, Number, Panel, ThesisTable
 from sealscope.thesis.sheet import MISSING
@@ -53,7 +53,7 @@ def worked(tmp_path: Path) -> list[str]:
 
 
 def states(outcome: Reproduction) -> dict[str, str]:
-    return {status.item.id: status.state for status in outcome.statuses}
+    return {name: status.state for name, status in outcome.statuses.items()}
 
 
 # registry
@@ -85,9 +85,10 @@ def test_ids_are_unique_file_names_and_what_is_needed_exists_without_a_circle() 
     assert {of.chapter for of in items} == {3, 4, 5, 6}
 
 
-def test_what_is_needed_comes_first() -> None:
-    items = (bare("t-1", "t-3"), bare("t-2"), bare("t-3", "t-2"))
-    assert [one.id for one in with_needed(items, items[:1])] == ["t-2", "t-3", "t-1"]
+def test_what_is_needed_is_made_first(fakes: Path, tmp_path: Path) -> None:
+    items = (item("t-1", "doubled", "t-3"), item("t-2", "table"), item("t-3", "doubled", "t-2"))
+    assert states(reproduce(["t-1"], "out", items=items, jobs=1)) == dict.fromkeys(("t-1", "t-2", "t-3"), "made")
+    assert worked(tmp_path) == ["t-2", "t-3", "t-1"]
 
 
 # kept results
@@ -100,7 +101,7 @@ def test_a_second_call_makes_nothing(fakes: Path, tmp_path: Path) -> None:
     assert states(first) == {"t-1": "made", "t-2": "made"}
     assert states(second) == {"t-1": "kept", "t-2": "kept"}
     assert worked(tmp_path) == ["t-1", "t-2"]
-    (table,) = second.products(second.statuses[1])
+    (table,) = second.products("t-2") or ()
     assert isinstance(table, ThesisTable)
     assert table.rows == ((2,),)
 
@@ -150,7 +151,7 @@ def test_only_the_asked_items_and_their_needs_are_made(fakes: Path, tmp_path: Pa
 def test_a_maker_may_ask_only_for_what_it_named(fakes: Path, tmp_path: Path) -> None:
     items = (item("t-1", "table"), item("t-2", "unknown_need"))
     outcome = reproduce(["all"], "out", items=items, jobs=1)
-    assert outcome.statuses[1].reason == "t-2 must name t-1 among its needs to ask for its products"
+    assert outcome.statuses["t-2"].reason == "t-2 must name t-1 among its needs to ask for its products"
 
 
 def test_a_folder_in_use_is_refused(fakes: Path, tmp_path: Path) -> None:
@@ -197,14 +198,14 @@ def test_without_the_sheet_items_that_need_it_are_left_out(
     )
     without = reproduce(["all"], "out", items=items, jobs=1)
     assert states(without) == {"t-1": "left out", "t-2": "made", "t-3": "made"}
-    assert without.statuses[0].reason == MISSING
+    assert without.statuses["t-1"].reason == MISSING
     sheet = write_sheet(tmp_path / "sheet")
     given = reproduce(["all"], "out", items=items, jobs=1, sheet=sheet)
     assert states(given) == {"t-1": "made", "t-2": "made", "t-3": "kept"}
     write_sheet(sheet, 1.0)
     changed = reproduce(["all"], "out", items=items, jobs=1, sheet=sheet)
     assert states(changed) == {"t-1": "made", "t-2": "made", "t-3": "kept"}
-    (table,) = changed.products(changed.statuses[0])
+    (table,) = changed.products("t-1") or ()
     assert isinstance(table, ThesisTable)
     assert table.rows == ((2.0,),)
 
@@ -221,7 +222,7 @@ def test_equal_runs_are_simulated_once_and_kept_exactly(
     second = reproduce(["all"], "out", items=items, jobs=1)
     assert len(calls) == 1
     assert not (tmp_path / "out" / "kept" / "runs").exists()
-    (fresh,), (loaded,) = (second.products(second.statuses[k]) for k in (0, 2))
+    (fresh,), (loaded,) = (second.products(f"fig-4.{k}") or () for k in (0, 2))
     assert isinstance(fresh, Figure)
     assert isinstance(loaded, Figure)
     np.testing.assert_array_equal(fresh.panels[0].curves[0].y, loaded.panels[0].curves[0].y)
@@ -289,8 +290,8 @@ def test_a_failure_is_told_and_the_others_go_on(fakes: Path, tmp_path: Path, job
     items = (item("t-0", "broken"), item("t-1", "table"), item("t-2", "doubled", "t-0"), item("t-3", "doubled", "t-1"))
     outcome = reproduce(["all"], "out", items=items, jobs=jobs)
     assert states(outcome) == {"t-0": "failed", "t-1": "made", "t-2": "failed", "t-3": "made"}
-    assert outcome.statuses[0].reason == "RuntimeError: no such curve"
-    assert outcome.statuses[2].reason == "needs t-0, which failed"
+    assert outcome.statuses["t-0"].reason == "RuntimeError: no such curve"
+    assert outcome.statuses["t-2"].reason == "needs t-0, which failed"
     assert "second line" in (tmp_path / "out" / "kept" / "failed" / "t-0.txt").read_text()
 
 
@@ -298,4 +299,4 @@ def test_a_process_that_dies_takes_only_its_item(fakes: Path, tmp_path: Path) ->
     items = (item("t-1", "dies"), *(item(f"t-{number}", "table") for number in range(2, 6)))
     outcome = reproduce(["all"], "out", items=items, jobs=2)
     assert states(outcome) == {"t-1": "failed", "t-2": "made", "t-3": "made", "t-4": "made", "t-5": "made"}
-    assert outcome.statuses[0].reason == "the process that made it died"
+    assert outcome.statuses["t-1"].reason == "the process that made it died"

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from sealscope.parameters import load_rig
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.signals.details import details
-from sealscope.thesis.engine.context import RunSpec, SimulatedRun
-from sealscope.thesis.engine.products import Claim, Product
 from sealscope.thesis.identification import (
     ITEMS,
     Hypothesis,
@@ -31,26 +26,10 @@ from sealscope.thesis.sheet import (
     DataSheet,
     experiment_values,
     groups,
-    read_sheet,
 )
 from sealscope.units import PSI
 
-DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
-needs_sheet = pytest.mark.skipif(not (DATA / "appendix_c_pa.csv").is_file(), reason="the thesis's data sheet is absent")
-
-
-@dataclass(frozen=True)
-class Asked:
-    """A context of the reproduction with a sheet, or none, and nothing simulated."""
-
-    sheet: DataSheet | None
-    quick: bool = True
-
-    def run(self, spec: RunSpec) -> SimulatedRun:
-        raise AssertionError(spec)
-
-    def product(self, item: str) -> tuple[Product | Claim, ...]:
-        raise AssertionError(item)
+from .conftest import Kept, needs_sheet
 
 
 def test_conditions_are_the_tests_of_the_appendix() -> None:
@@ -101,9 +80,9 @@ def test_a_sensor_that_reads_less_lowers_its_own_chamber_only() -> None:
 
 
 @needs_sheet
-def test_the_identified_rig_meets_the_leak_free_columns_within_a_quarter() -> None:
+def test_the_identified_rig_meets_the_leak_free_columns_within_a_quarter(measured_sheet: DataSheet) -> None:
     """Geometric mean of simulated/measured for each of d1..d4 in both chambers within 25 %."""
-    sheet, _ = read_sheet(DATA)
+    sheet = measured_sheet
     ratio = np.exp(log_residuals(load_rig(BENCH_RIG), sheet).mean(axis=0))
     assert ratio.shape == (2, 5)
     assert np.all(np.abs(ratio[:, :4] - 1.0) <= 0.25), ratio
@@ -114,9 +93,9 @@ def test_the_identified_rig_meets_the_leak_free_columns_within_a_quarter() -> No
 @needs_sheet
 @pytest.mark.slow
 @pytest.mark.long
-def test_the_sign_of_d3_on_p_A_is_predicted_from_leak_free_data() -> None:
+def test_the_sign_of_d3_on_p_A_is_predicted_from_leak_free_data(measured_sheet: DataSheet) -> None:
     """At least 39 of 41, with leak columns that the fit never saw."""
-    sheet, _ = read_sheet(DATA)
+    sheet = measured_sheet
     made = predicted_sheet(load_rig(BENCH_RIG))
     change, real = (np.log(of.rms["p_A"]["d3"][:, 1] / of.rms["p_A"]["d3"][:, 0]) for of in (made, sheet))
     assert np.sum(np.sign(change) == np.sign(real)) >= 39
@@ -126,8 +105,8 @@ def test_the_sign_of_d3_on_p_A_is_predicted_from_leak_free_data() -> None:
 
 
 @needs_sheet
-def test_only_the_leak_free_columns_are_read() -> None:
-    sheet, _ = read_sheet(DATA)
+def test_only_the_leak_free_columns_are_read(measured_sheet: DataSheet) -> None:
+    sheet = measured_sheet
     blind = DataSheet(
         {c: {q: np.stack([v[:, 0], np.full(41, np.nan)], axis=1) for q, v in of.items()} for c, of in sheet.rms.items()}
     )
@@ -136,7 +115,7 @@ def test_only_the_leak_free_columns_are_read() -> None:
 
 
 def test_the_table_of_parameters_shows_every_fitted_value_with_its_interval() -> None:
-    table = parameters_table(Asked(None), ITEMS[0])[0]
+    table = parameters_table(Kept(), ITEMS[0])[0]
     values = {row[0]: row for row in table.rows}
     assert {"fluid.K_oil", "motor.omega_per_volt", "line.V_1", "line.V_2", "sensors.p_A.noise"} <= set(values)
     assert all(
@@ -147,8 +126,8 @@ def test_the_table_of_parameters_shows_every_fitted_value_with_its_interval() ->
 
 
 @needs_sheet
-def test_the_table_of_the_fit_has_every_condition_once() -> None:
-    summary, by_condition = fit_table(Asked(read_sheet(DATA)[0]), ITEMS[1])
+def test_the_table_of_the_fit_has_every_condition_once(measured_sheet: DataSheet) -> None:
+    summary, by_condition = fit_table(Kept(sheet=measured_sheet), ITEMS[1])
     assert [row[:2] for row in summary.rows] == [(c, q) for c in CHAMBERS for q in QUANTITIES]
     assert sum(int(str(row[2])) for row in by_condition.rows) == 41
     weights = np.array([float(str(row[2])) for row in by_condition.rows])

@@ -11,7 +11,9 @@ import pytest
 
 from sealscope.errors import InputError
 from sealscope.thesis.engine.items import collect
-from sealscope.thesis.sheet import FILES, MISSING, find_sheet, read_sheet
+from sealscope.thesis.sheet import FILES, MISSING, DataSheet, find_sheet, read_sheet
+
+from .conftest import needs_sheet
 
 WriteSheet = Callable[..., Path]
 
@@ -61,13 +63,10 @@ def test_a_sheet_with_a_row_missing_is_refused(tmp_path: Path, write_sheet: Writ
         read_sheet(folder)
 
 
-def test_the_real_sheet_is_read() -> None:
-    folder = Path(__file__).parents[3] / "shared" / "data"
-    if not (folder / FILES["p_A"]).is_file():
-        pytest.skip("the thesis's data sheet is not beside this checkout")
-    sheet, _ = read_sheet(folder)
-    assert sheet.rms["p_A"]["d3"].shape == (41, 2)
-    assert (np.diff(sheet.rms["p_A"]["d3"], axis=1) < 0).sum() == 41
+@needs_sheet
+def test_the_real_sheet_is_read(measured_sheet: DataSheet) -> None:
+    assert measured_sheet.rms["p_A"]["d3"].shape == (41, 2)
+    assert (np.diff(measured_sheet.rms["p_A"]["d3"], axis=1) < 0).sum() == 41
 
 
 def command(*words: str, monkeypatch: pytest.MonkeyPatch) -> int:

@@ -1,19 +1,13 @@
-"""Exact statistics against published examples, and Table 5.1 counted anew."""
+"""Table 5.1 counted anew, and what the columns of the sheet say of the leak."""
 
 from __future__ import annotations
 
-import math
-from pathlib import Path
-
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from sealscope.errors import InputError
-from sealscope.evaluation.binomial import at_least, clopper_pearson, holm, sign_test
+from sealscope.evaluation.binomial import clopper_pearson
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.thesis.chapters.appendix_c.success_rates import (
+from sealscope.thesis.chapters.success_rates import (
     CLAIMED,
     RATES,
     UNCLAIMED,
@@ -23,100 +17,21 @@ from sealscope.thesis.chapters.appendix_c.success_rates import (
     drift_threshold,
     thresholds,
 )
-from sealscope.thesis.claims.regressions import (
+from sealscope.thesis.claims.evidence import (
     change_columns,
     condition_columns,
     left_out_r2,
-    mean_leaks,
     partial_correlation,
     told_apart_by_levels,
 )
-from sealscope.thesis.sheet import QUANTITIES, DataSheet
+from sealscope.thesis.sheet import DataSheet, mean_leaks
 
-FOLDER = Path(__file__).resolve().parents[3] / "shared" / "data"
-needs_sheet = pytest.mark.skipif(
-    not (FOLDER / "appendix_c_pa.csv").is_file(), reason="../shared/data/appendix_c_pa.csv is absent"
-)
-
-
-@pytest.fixture(scope="module")
-def measured() -> DataSheet:
-    from sealscope.thesis.sheet import read_sheet
-
-    return read_sheet(FOLDER)[0]
-
-
-def made(
-    seed: int, shifts: dict[tuple[str, str], float] | None = None, scatter: float = 0.05, n: int = 41
-) -> DataSheet:
-    """Sheets whose log changes scatter about the stated shifts (0 elsewhere)."""
-    random = np.random.default_rng(seed)
-    rms: dict[str, dict[str, np.ndarray]] = {}
-    for chamber in CHAMBERS:
-        rms[chamber] = {}
-        for name in QUANTITIES:
-            before = np.exp(random.normal(0.5, 0.2, n))
-            change = random.normal((shifts or {}).get((chamber, name), 0.0), scatter, n)
-            rms[chamber][name] = np.column_stack([before, before * np.exp(change)])
-    return DataSheet(rms)
-
-
-# Newcombe, Statistics in Medicine 17 (1998) 857-872, Table I, method 5 (Clopper-Pearson).
-@pytest.mark.parametrize(
-    ("k", "n", "low", "high"),
-    [(81, 263, 0.2527, 0.3676), (15, 148, 0.0578, 0.1617), (0, 20, 0.0, 0.1684), (1, 29, 0.0009, 0.1776)],
-)
-def test_clopper_pearson_as_newcombe_tabulates(k: int, n: int, low: float, high: float) -> None:
-    assert clopper_pearson(k, n) == pytest.approx((low, high), abs=5e-5)
-
-
-@given(st.integers(1, 200).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))), st.floats(0.5, 0.999))
-def test_clopper_pearson_leaves_half_of_alpha_beyond_each_end(pair: tuple[int, int], confidence: float) -> None:
-    k, n = pair
-    low, high = clopper_pearson(k, n, confidence)
-    assert 0.0 <= low <= k / n <= high <= 1.0
-    tail = (1.0 - confidence) / 2.0
-    if k > 0:
-        assert at_least(k, n, low) == pytest.approx(tail, rel=1e-6)
-    if k < n:
-        assert 1.0 - at_least(k + 1, n, high) == pytest.approx(tail, rel=1e-6)
-
-
-@given(st.integers(1, 60).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))), st.floats(0.01, 0.99))
-def test_the_tail_is_the_sum_of_its_terms(pair: tuple[int, int], p: float) -> None:
-    k, n = pair
-    terms = math.fsum(math.comb(n, i) * p**i * (1 - p) ** (n - i) for i in range(k, n + 1))
-    assert at_least(k, n, p) == pytest.approx(terms, rel=1e-9)
-
-
-def test_sign_test_of_arbuthnot_s_82_years() -> None:
-    assert at_least(82, 82) == pytest.approx(0.5**82)
-    assert sign_test(82, 82) == sign_test(0, 82) == pytest.approx(0.5**81)
-
-
-def test_sign_test_by_hand() -> None:
-    assert sign_test(8, 10) == pytest.approx(2 * (45 + 10 + 1) / 1024)
-    assert sign_test(5, 10) == 1.0
-
-
-def test_holm_by_hand_and_in_the_order_given() -> None:
-    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx((0.03, 0.06, 0.06, 0.02))
-    assert holm([]) == ()
-    assert holm([0.9, 0.8]) == (1.0, 1.0)
-
-
-@pytest.mark.parametrize("call", [
-    lambda: clopper_pearson(3, 2), lambda: clopper_pearson(0, 0), lambda: clopper_pearson(1, 2, 1.0),
-    lambda: sign_test(-1, 4), lambda: holm([0.5, 1.5]), lambda: at_least(1, 2, -0.1),
-])  # fmt: skip
-def test_impossible_input_is_refused(call: object) -> None:
-    with pytest.raises(InputError, match="must be"):
-        call()  # type: ignore[operator]
+from .conftest import made_sheet, needs_sheet
 
 
 @needs_sheet
-def test_table_5_1_from_the_sheet(measured: DataSheet) -> None:
-    counts = {rule.name: int(rule.fires(measured).sum()) for rule in (*CLAIMED, *UNCLAIMED)}
+def test_table_5_1_from_the_sheet(measured_sheet: DataSheet) -> None:
+    counts = {rule.name: int(rule.fires(measured_sheet).sum()) for rule in (*CLAIMED, *UNCLAIMED)}
     assert counts == {
         "P_A d3 down": 41, "P_A d4 down": 27, "P_A d3d4 down": 35,
         "P_B d3 up": 21, "P_B d4 up": 31, "P_B d3d4 up": 32, "both d3d4": 26,
@@ -125,8 +40,8 @@ def test_table_5_1_from_the_sheet(measured: DataSheet) -> None:
 
 
 @needs_sheet
-def test_what_the_columns_of_the_sheet_show_beyond_chance(measured: DataSheet) -> None:
-    rows = {(row[0], row[1]): row for row in column_tests(measured)}
+def test_what_the_columns_of_the_sheet_show_beyond_chance(measured_sheet: DataSheet) -> None:
+    rows = {(row[0], row[1]): row for row in column_tests(measured_sheet)}
     assert {key for key, row in rows.items() if row[-1] == "yes"} == {
         ("p_A", "d2"), ("p_A", "d3"), ("p_A", "d3d4"), ("p_B", "d4"), ("p_B", "d3d4"),
     }  # fmt: skip
@@ -135,26 +50,26 @@ def test_what_the_columns_of_the_sheet_show_beyond_chance(measured: DataSheet) -
 
 
 @needs_sheet
-def test_with_a_threshold_from_d1_the_sheet_s_d3_finds_35_of_41(measured: DataSheet) -> None:
-    rows = {row[0]: row for row in thresholds(measured, made(1), made(2))}
+def test_with_a_threshold_from_d1_the_sheet_s_d3_finds_35_of_41(measured_sheet: DataSheet) -> None:
+    rows = {row[0]: row for row in thresholds(measured_sheet, made_sheet(1), made_sheet(2))}
     assert rows["P_A d3 down"][2] == "35/41"
-    assert d1_threshold(measured, "p_A") == pytest.approx(0.0723, abs=5e-4)
+    assert d1_threshold(measured_sheet, "p_A") == pytest.approx(0.0723, abs=5e-4)
 
 
 @needs_sheet
-def test_the_condition_tells_more_of_the_leak_than_the_features_do(measured: DataSheet) -> None:
+def test_the_condition_tells_more_of_the_leak_than_the_features_do(measured_sheet: DataSheet) -> None:
     leak, given_condition = mean_leaks(), condition_columns()
-    change = np.log(measured.rms["p_A"]["d3"][:, 1] / measured.rms["p_A"]["d3"][:, 0])
+    change = np.log(measured_sheet.rms["p_A"]["d3"][:, 1] / measured_sheet.rms["p_A"]["d3"][:, 0])
     assert abs(partial_correlation(change, leak, given_condition)) < 0.1
     assert np.corrcoef(change, leak)[0, 1] < -0.6
     assert left_out_r2(given_condition, leak) == pytest.approx(0.76, abs=0.01)
-    assert left_out_r2(change_columns(measured), leak) == pytest.approx(0.45, abs=0.01)
+    assert left_out_r2(change_columns(measured_sheet), leak) == pytest.approx(0.45, abs=0.01)
 
 
 @needs_sheet
-def test_absolute_levels_of_both_chambers_tell_leak_from_none(measured: DataSheet) -> None:
-    accuracy, auc = told_apart_by_levels(measured, "test")
-    accuracy_by_condition, auc_by_condition = told_apart_by_levels(measured, "condition")
+def test_absolute_levels_of_both_chambers_tell_leak_from_none(measured_sheet: DataSheet) -> None:
+    accuracy, auc = told_apart_by_levels(measured_sheet, "test")
+    accuracy_by_condition, auc_by_condition = told_apart_by_levels(measured_sheet, "condition")
     assert accuracy > 0.9
     assert auc > 0.95
     assert auc_by_condition <= auc
@@ -162,9 +77,9 @@ def test_absolute_levels_of_both_chambers_tell_leak_from_none(measured: DataShee
 
 
 def test_rates_stand_beside_their_controls() -> None:
-    leak = made(1, {("p_A", "d3"): -0.3, ("p_A", "d3d4"): -0.5, ("p_B", "d3d4"): 0.5})
-    drift = made(3, n=123)
-    rows = {str(row[0]): dict(zip(RATES, row, strict=True)) for row in counts(None, leak, made(2), drift)}
+    leak = made_sheet(1, {("p_A", "d3"): -0.3, ("p_A", "d3d4"): -0.5, ("p_B", "d3d4"): 0.5})
+    drift = made_sheet(3, n=123)
+    rows = {str(row[0]): dict(zip(RATES, row, strict=True)) for row in counts(None, leak, made_sheet(2), drift)}
     assert rows["P_A d3 down"]["simulated leak: fires"] == "41/41"
     assert rows["both d3d4"]["simulated leak: rate [%]"] == 100.0
     assert rows["P_A d3 down"]["sheet: fires"] is None
@@ -180,7 +95,7 @@ def test_rates_stand_beside_their_controls() -> None:
 
 
 def test_thresholds_let_the_stated_share_of_leak_free_tests_through() -> None:
-    still = made(4, n=20_000)
+    still = made_sheet(4, n=20_000)
     for chamber in CHAMBERS:
         assert d1_threshold(still, chamber) == pytest.approx(1.645 * 0.05, rel=0.03)
         assert d1_threshold(still, chamber, either_side=True) == pytest.approx(1.960 * 0.05, rel=0.03)
@@ -191,9 +106,9 @@ def test_thresholds_let_the_stated_share_of_leak_free_tests_through() -> None:
 
 
 def test_column_tests_find_what_moves_and_little_else() -> None:
-    moved = {(row[0], row[1]) for row in column_tests(made(5, {("p_B", "d4"): 0.2})) if row[-1] == "yes"}
+    moved = {(row[0], row[1]) for row in column_tests(made_sheet(5, {("p_B", "d4"): 0.2})) if row[-1] == "yes"}
     assert moved == {("p_B", "d4")}
-    false = sum(any(row[-1] == "yes" for row in column_tests(made(seed))) for seed in range(100, 300))
+    false = sum(any(row[-1] == "yes" for row in column_tests(made_sheet(seed))) for seed in range(100, 300))
     assert false <= 20  # 200 sheets of nothing: at most 5 % of them name any column, 20 is four deviations above
 
 
@@ -217,5 +132,5 @@ def test_partial_correlation_takes_the_common_cause_out() -> None:
 
 
 def test_levels_without_information_tell_nothing() -> None:
-    _, auc = told_apart_by_levels(made(8, scatter=0.4), "test")
+    _, auc = told_apart_by_levels(made_sheet(8, scatter=0.4), "test")
     assert 0.3 < auc < 0.7

@@ -228,7 +228,7 @@ def _result(plan: AnyPlan, folder: Path, sheet: Path | None, data: Path | None) 
 
 def _sheet_samples(folder: Path | None) -> MeasuredSamples:
     """Return the thesis's data sheet as samples; raise InputError where there is none."""
-    from sealscope.thesis.claims.regressions import samples_of
+    from sealscope.thesis.claims.evidence import samples_of
     from sealscope.thesis.sheet import MISSING, find_sheet, read_sheet
 
     path = find_sheet(folder)

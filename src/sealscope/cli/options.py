@@ -122,10 +122,10 @@ JobsOption = Annotated[
 
 def say_jobs(jobs: int | None) -> None:
     """Say so on standard error where fewer processes are started than `--jobs` asks for."""
-    from sealscope.campaigns.execution.workers import most_processes
+    from sealscope.campaigns.execution.workers import process_count
 
-    if jobs is not None and jobs > most_processes():
-        complain(f"--jobs {jobs}: {most_processes()} processes are started, two a core")
+    if jobs is not None and jobs > (most := process_count(jobs)):
+        complain(f"--jobs {jobs}: {most} processes are started, two a core")
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +13,7 @@ import typer
 from sealscope.cli.options import JobsOption, complain, say_jobs
 
 if TYPE_CHECKING:
-    from sealscope.thesis.engine.build import Progress, Reproduction
+    from sealscope.thesis.engine.build import Progress
 
 
 def complete_items(incomplete: str) -> list[str]:
@@ -57,33 +58,28 @@ def reproduce(
     from sealscope.reporting.thesis.page import write_thesis_page
     from sealscope.reporting.thesis.plots import require_drawing
     from sealscope.thesis.engine.build import reproduce as build
+    from sealscope.thesis.sheet import MISSING
 
     if not ids:
         raise InputError("an item must be named: an id, chapter-N or all (sealscope reproduce --list)")
     require_drawing()
     say_jobs(jobs)
     with _progress() as progress:
-        reproduction = build(ids, output, quick=quick, jobs=jobs, sheet=sheet, publish=publish, progress=progress)
-    products = ((status, reproduction.products(status)) for status in reproduction.statuses)
-    page = write_thesis_page(output, products, quick=quick, sheet=reproduction.job.sheet is not None)
-    _summarise(reproduction, page)
-    if reproduction.among("failed"):
-        raise typer.Exit(1)
-
-
-def _summarise(reproduction: Reproduction, page: Path) -> None:
-    for status in reproduction.among("failed"):
-        complain(f"{status.item.id} failed: {status.reason}")
-    counts = {
-        "made": len(reproduction.among("made")),
-        "kept from before": len(reproduction.among("kept")),
-        "failed": len(reproduction.among("failed")),
-    }
-    typer.echo("items: " + ", ".join(f"{count} {state}" for state, count in counts.items() if count))
-    left_out = reproduction.among("left out")
-    if left_out:
-        typer.echo(f"left out: {len(left_out)} ({left_out[0].reason})")
+        made = build(ids, output, quick=quick, jobs=jobs, sheet=sheet, publish=publish, progress=progress)
+    statuses = made.statuses.values()
+    products = ((status, (made.products(status.item.id) or ()) if status.available else ()) for status in statuses)
+    page = write_thesis_page(output, products, quick=quick, sheet=made.sheet is not None)
+    for status in statuses:
+        if status.state == "failed":
+            complain(f"{status.item.id} failed: {status.reason}")
+    counts = Counter(status.state for status in statuses)
+    shown = {"made": counts["made"], "kept from before": counts["kept"], "failed": counts["failed"]}
+    typer.echo("items: " + ", ".join(f"{count} {state}" for state, count in shown.items() if count))
+    if counts["left out"]:
+        typer.echo(f"left out: {counts['left out']} ({MISSING})")
     typer.echo(f"page:  {page}")
+    if counts["failed"]:
+        raise typer.Exit(1)
 
 
 def _list(patterns: Sequence[str], sheet: Path | None) -> None:

@@ -10,7 +10,7 @@ sigma is independent of it and has the RMS sigma in each detail d_j, so the RMS 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.resources import files
 from typing import TYPE_CHECKING, Literal
@@ -22,15 +22,7 @@ from sealscope.recordings.recording import Array
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, ThesisTable
-from sealscope.thesis.sheet import (
-    APPENDIX_C,
-    BENCH_RIG,
-    QUANTITIES,
-    Condition,
-    DataSheet,
-    experiment_values,
-    groups,
-)
+from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, QUANTITIES, Condition, DataSheet, experiment_values, groups
 from sealscope.units import PSI
 
 if TYPE_CHECKING:
@@ -125,13 +117,9 @@ class Hypothesis:
     law: Literal["laminar", "orifice"] = "laminar"
 
 
-def _hypotheses() -> Iterator[Hypothesis]:
-    tree = tomllib.loads(files(__package__).joinpath("hypotheses.toml").read_text(encoding="utf-8"))
-    yield from (Hypothesis(name, **values) for name, values in tree.items())
-
-
+_TREE = tomllib.loads(files(__package__).joinpath("hypotheses.toml").read_text(encoding="utf-8"))
 #: The hypotheses on what the symmetric rig leaves unexplained; the first is that rig itself.
-HYPOTHESES: tuple[Hypothesis, ...] = tuple(_hypotheses())
+HYPOTHESES: tuple[Hypothesis, ...] = tuple(Hypothesis(name, **values) for name, values in _TREE.items())
 
 
 def predicted_sheet(

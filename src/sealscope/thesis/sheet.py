@@ -12,6 +12,7 @@ import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.resources import files
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,8 @@ from sealscope.recordings.recording import Array
 
 #: Columns of the sheet: RMS of the details of a chamber's pressure and of the product of the third and the fourth.
 QUANTITIES = ("d1", "d2", "d3", "d4", "d3d4")
+#: Chamber and quantity of each column.
+COLUMNS = tuple(product(("p_A", "p_B"), QUANTITIES))
 #: Units of the columns. The sheet names none; it is taken to be in psi.
 UNITS = {name: "psi^2" if name == "d3d4" else "psi" for name in QUANTITIES}
 #: The packaged rig that stands for the bench of Appendix C: fitted to its leak-free columns.
@@ -83,6 +86,11 @@ def groups(conditions: tuple[Condition, ...] = APPENDIX_C) -> tuple[tuple[str, f
     return tuple(dict.fromkeys(condition.group for condition in conditions))
 
 
+def mean_leaks() -> Array:
+    """Return the mean leak of each test [L/min], (n,)."""
+    return np.array([row.mean_leak_lpm for row in APPENDIX_C])
+
+
 @dataclass(frozen=True, eq=False)
 class DataSheet:
     """The data sheet of Appendix C, measured or simulated.
@@ -142,34 +150,31 @@ def read_sheet(folder: Path) -> tuple[DataSheet, str]:
             raise InputError(f"the sheet must have {len(APPENDIX_C)} rows, got {len(rows)} ({path})")
         for row, condition in zip(rows, APPENDIX_C, strict=True):
             _check_condition(row, condition, path)
+        numbered = list(enumerate(rows, 1))
         rms[chamber] = {
-            quantity: np.array(
-                [[_positive(row, f"{quantity}_{half}", n, path) for half in _HALVES] for n, row in enumerate(rows, 1)]
-            )
-            for quantity in QUANTITIES
+            name: np.array([[_number(row, f"{name}_{half}", n, path) for half in _HALVES] for n, row in numbered])
+            for name in QUANTITIES
         }
     return DataSheet(rms), digest.hexdigest()
 
 
-def _number(text: str | None) -> float:
+def _number(row: dict[str, str], column: str, number: int, path: Path, zero: bool = False) -> float:
+    """Return a number of a row: > 0, or where `zero` may stand >= 0."""
     try:
-        return float(text or "nan")
+        value = float(row[column] or "nan")
     except ValueError:
-        return math.nan
-
-
-def _positive(row: dict[str, str], column: str, number: int, path: Path) -> float:
-    value = _number(row[column])
-    if not (math.isfinite(value) and value > 0):
-        raise InputError(f"{column} must be a number > 0, got {row[column]!r} ({path}, row {number})")
+        value = math.nan
+    if not (0.0 < value < math.inf or (zero and value == 0.0)):
+        rule = f"a number {'>=' if zero else '>'} 0"
+        raise InputError(f"{column} must be {rule}, got {row[column]!r} ({path}, row {number})")
     return value
 
 
 def _check_condition(row: dict[str, str], condition: Condition, path: Path) -> None:
-    leak, amplitude, omega = (_positive(row, column, condition.number, path) for column in _CONDITION[:3])
+    leak, amplitude, omega = (_number(row, column, condition.number, path) for column in _CONDITION[:3])
+    closed = _number(row, _CONDITION[3], condition.number, path, zero=True)
     command = f"{amplitude:g} sin({'' if omega == 1 else f'{omega:g}'}t)"
-    closed, level = _number(row["orifice_closed_pct"]), (row["leakage_level"] or "").strip()
-    given = Condition(condition.number, command, closed, leak, level)
+    given = Condition(condition.number, command, closed, leak, (row["leakage_level"] or "").strip())
     if given != condition:
         wanted, got = (
             f"{of.command!r}, {of.closed_pct:g} % closed, {of.mean_leak_lpm:g} L/min, {of.level}"

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections import deque
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from sealscope.campaigns.cases.case import CampaignCase, cases_of, interleaved
 from sealscope.campaigns.cases.recordings import ProgressCallback
 from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.cases.work import work
 from sealscope.campaigns.execution import batches, store
-from sealscope.campaigns.execution.cluster import on_cluster
-from sealscope.campaigns.execution.workers import Workers, process_count
+from sealscope.campaigns.execution.workers import carried_out, on_cluster, process_count
 from sealscope.campaigns.plans.duty import check_controllers
 from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.errors import InputError
@@ -64,25 +63,22 @@ def run(
         if retry:
             rows = {name: row for name, row in rows.items() if row.error is None}
         waiting = [case for case in interleaved(cases) if case.id not in rows]
-        failures = sum(row.error is not None for row in rows.values())
-        done = len(rows)
-        if progress is not None:
-            progress(done, plan.size, failures)
-        keep = None
-        if plan.keep_recordings:
-            keep = inner_folder(place, RECORDINGS)
+        failures, done = sum(row.error is not None for row in rows.values()), len(rows)
+        report = progress or (lambda done, size, failures: None)
+        report(done, plan.size, failures)
+        keep = inner_folder(place, RECORDINGS) if plan.keep_recordings else None
         jobs = process_count(jobs)
         if batch:
             new_rows = batches.in_batches(plan, waiting, jobs)
         else:
-            new_rows = _rows(partial(_carry_out, task, plan, keep), waiting, jobs, cluster)
+            carry = partial(on_cluster, address=cluster) if cluster else partial(carried_out, jobs=jobs)
+            new_rows = _rows(partial(_carry_out, task, plan, keep), waiting, carry)
         with store.appending(place) as append, closing(new_rows):
             for row in new_rows:
                 append(row)
                 done += 1
                 failures += row.error is not None
-                if progress is not None:
-                    progress(done, plan.size, failures)
+                report(done, plan.size, failures)
     return store.progress_of(plan, place)
 
 
@@ -91,35 +87,16 @@ def _carry_out(task: Task, plan: SimulatedPlan, keep: Path | None, case: Campaig
 
 
 def _rows(
-    task: Callable[[CampaignCase], CaseRow], cases: Sequence[CampaignCase], jobs: int, cluster: str | None
+    task: Callable[[CampaignCase], CaseRow], cases: Sequence[CampaignCase], carry: Callable[..., Any]
 ) -> Generator[CaseRow, None, None]:
-    """Yield the rows of the cases as they end."""
-    if cases and cluster is not None:
-        yield from on_cluster(task, cases, cluster)
-    elif jobs == 1 or not cases:
-        yield from map(task, cases)
-    else:
-        yield from _in_processes(task, cases, min(jobs, len(cases)))
-
-
-def _in_processes(
-    task: Callable[[CampaignCase], CaseRow], cases: Sequence[CampaignCase], jobs: int
-) -> Generator[CaseRow, None, None]:
-    """Yield the rows of the cases from `jobs` processes; a case whose process dies twice is a failed row."""
-    waiting, died = deque(cases), set[str]()
-    with Workers(jobs, task) as workers:
-        while waiting or workers.items:
-            while waiting and workers.free:
-                workers.begin(waiting.popleft())
-            rows = []
-            for case, row in workers.ended():
+    """Yield the rows of the cases as they end; a case whose process dies is tried once more, then failed."""
+    died: list[CampaignCase] = []
+    for waiting in (cases, died):
+        with closing(carry(task, tuple(waiting))) as ended:
+            for case, row in ended if waiting else ():
                 if row is not None:
-                    rows.append(row)
-                elif case.id in died:
-                    rows.append(CaseRow.of(case, error="the process that carried it out died"))
-                else:  # by a hand or the memory's end: tried once more, last
-                    died.add(case.id)
-                    waiting.append(case)
-            while waiting and workers.free:
-                workers.begin(waiting.popleft())
-            yield from rows
+                    yield row
+                elif waiting is cases:  # by a hand or the memory's end
+                    died.append(case)
+                else:
+                    yield CaseRow.of(case, error="the process that carried it out died")

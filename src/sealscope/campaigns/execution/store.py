@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from sealscope.campaigns.cases.case import cases_of, code_key, digest, world
 from sealscope.campaigns.cases.row import CaseRow
@@ -194,11 +194,10 @@ def begin(folder: Path, source: Mapping[str, Any]) -> None:
 def appending(folder: Path) -> Iterator[Callable[[CaseRow], None]]:
     """Give a function that appends a row to the folder; each line is on disk before the next is begun."""
     with open_inner(folder / ROWS, "a campaign's file of rows", "ab+") as file:
-        size = keep = file.seek(0, os.SEEK_END)
-        while keep and _byte(file, keep - 1) != b"\n":  # a line that was being written when the power went
-            keep -= 1
-        if keep < size:
-            file.truncate(keep)
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(0, size - _LONGEST_ROW))
+        torn = file.read().rpartition(b"\n")[2]  # a line that was being written when the power went
+        file.truncate(size - len(torn))
 
         def append(row: CaseRow) -> None:
             line = json.dumps(row.as_dict(), allow_nan=False, sort_keys=True).encode() + b"\n"
@@ -210,11 +209,6 @@ def appending(folder: Path) -> Iterator[Callable[[CaseRow], None]]:
                 raise InputError(f"cannot write {folder / ROWS}: {error.strerror or error}") from error
 
         yield append
-
-
-def _byte(file: IO[bytes], at: int) -> bytes:
-    file.seek(at)
-    return file.read(1)
 
 
 @contextmanager

@@ -1,20 +1,22 @@
-"""Worker processes of this machine; the death of one costs the item that it carried out and no other."""
+"""Items carried out by processes of this machine, or by a Dask cluster; the death of one costs its item alone."""
 
 from __future__ import annotations
 
 import os
 import signal
 import threading
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from functools import partial
+from itertools import islice
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
-from types import TracebackType
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
+
+from sealscope.campaigns.cases.case import code_key
+from sealscope.errors import InputError, MissingExtra
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -23,67 +25,109 @@ Result = TypeVar("Result")
 _ENVIRONMENT = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "PYTHONSAFEPATH"), "1"
 )
+#: Items handed out ahead of each worker of a cluster, so that it never waits.
+_AHEAD = 4
 
 
-class Workers(Generic[Item, Result]):
-    """Up to `jobs` spawned processes that carry out `task(item)`, one item each at a time.
+def carried_out(
+    task: Callable[[Item], Result], items: Iterable[Item], jobs: int
+) -> Generator[tuple[Item, Result | None], None, None]:
+    """Yield each item and its result as it ends, from up to `jobs` spawned processes; 1: from this process.
 
-    `task` and items are pickled; `task` goes to each process once. Every process is an executor of its own, so that
-    one that dies breaks no other and the item it had is known. Processes ignore the interrupt, and end when the block
-    ends or the parent does, however that ends.
+    An item is taken from `items` when a process is free for it. `task` and items are pickled; `task` goes to each
+    process once. Every process is an executor of its own, so that one that dies breaks no other: its item has the
+    result None. Processes ignore the interrupt, and end when the generator is closed or the parent ends, however that
+    ends. Raises what `task` raised.
     """
-
-    def __init__(self, jobs: int, task: Callable[[Item], Result]) -> None:
-        self._jobs, self._task = jobs, task
-        self._idle: list[ProcessPoolExecutor] = []
-        self._busy: dict[Future[Result], tuple[ProcessPoolExecutor, Item]] = {}
-        self._lifeline, self._held = get_context("spawn").Pipe(duplex=False)
-
-    def __enter__(self) -> Workers[Item, Result]:
-        return self
-
-    @property
-    def items(self) -> list[Item]:
-        """The items in work."""
-        return [item for _, item in self._busy.values()]
-
-    @property
-    def free(self) -> bool:
-        """Whether another item can begin."""
-        return len(self._busy) < self._jobs
-
-    def begin(self, item: Item) -> None:
-        """Begin an item in an idle process, or in a new one."""
-        with _worker_environment():  # a process starts with its first item
-            pool = self._idle.pop() if self._idle else self._new_process()
-            self._busy[pool.submit(_carry_out, item)] = pool, item
-
-    def ended(self) -> list[tuple[Item, Result | None]]:
-        """Wait until an item ends, and return those that have with their results, None where the process died.
-
-        Raises what `task` raised.
-        """
-        results: list[tuple[Item, Result | None]] = []
-        for future in wait(self._busy, return_when=FIRST_COMPLETED).done:
-            pool, item = self._busy.pop(future)
-            try:
-                results.append((item, future.result()))
-                self._idle.append(pool)
-            except BrokenProcessPool:
-                results.append((item, None))
-        return results
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._held.close()
-        self._lifeline.close()
-        for pool in (*self._idle, *(pool for pool, _ in self._busy.values())):
+    if jobs == 1:
+        yield from ((item, task(item)) for item in items)
+        return
+    context, waiting = get_context("spawn"), iter(items)
+    lifeline, held = context.Pipe(duplex=False)
+    idle: list[ProcessPoolExecutor] = []
+    busy: dict[Future[Result], tuple[ProcessPoolExecutor, Item]] = {}
+    try:
+        while True:
+            for item in islice(waiting, jobs - len(busy)):
+                with _worker_environment():  # a process starts with its first item
+                    pool = idle.pop() if idle else ProcessPoolExecutor(1, context, _begin, (task, lifeline))
+                    busy[pool.submit(_carry_out, item)] = pool, item
+            if not busy:
+                return
+            for future in wait(busy, return_when=FIRST_COMPLETED).done:
+                pool, item = busy.pop(future)
+                try:
+                    result: Result | None = future.result()
+                    idle.append(pool)
+                except BrokenProcessPool:
+                    result = None
+                yield item, result
+    finally:
+        held.close()
+        lifeline.close()
+        for pool in (*idle, *(pool for pool, _ in busy.values())):
             pool.shutdown(wait=False, cancel_futures=True)
 
-    def _new_process(self) -> ProcessPoolExecutor:
-        context = get_context("spawn")
-        return ProcessPoolExecutor(1, mp_context=context, initializer=_begin, initargs=(self._task, self._lifeline))
+
+def in_order(jobs: int, task: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[Item, Result | None]]:
+    """Yield as `carried_out`, in the order given: an item as soon as it and all before it are there."""
+    results: dict[int, Result | None] = {}
+    place = 0
+    for (number, _), result in carried_out(partial(_numbered, task), enumerate(items), jobs):
+        results[number] = result
+        while place in results:
+            yield items[place], results.pop(place)
+            place += 1
+
+
+def on_cluster(
+    task: Callable[[Item], Result], items: Iterable[Item], address: str
+) -> Generator[tuple[Item, Result | None], None, None]:
+    """Yield each item and its result as it ends, from the workers of the Dask scheduler at `address`; None: one failed.
+
+    Raises MissingExtra without Dask, InputError where no scheduler answers or a worker has another Sealscope.
+    """
+    try:
+        import distributed
+    except ImportError:
+        raise MissingExtra("a cluster needs Dask: pip install 'sealscope[cluster]'") from None
+    dask: Any = distributed
+    try:
+        client = dask.Client(address, timeout=10, set_as_default=False)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise InputError(f"--cluster must be the address of a Dask scheduler, got {address}: {error}") from None
+    with client:
+        if not client.nthreads():
+            raise InputError(f"--cluster must have workers, got none ({address})")
+        try:
+            keys = set(client.run(code_key).values())
+        except Exception as error:
+            raise InputError(f"the cluster's workers must have Sealscope, got: {error} ({address})") from None
+        if keys != {code_key()}:
+            raise InputError(f"the cluster's workers must have this machine's Sealscope, got another ({address})")
+        shared, waiting = client.scatter(task, broadcast=True), iter(items)
+        by_key: dict[str, Item] = {}
+
+        def submitted(count: int) -> list[Any]:
+            futures = []
+            for item in islice(waiting, count):
+                futures.append(client.submit(_call, shared, item, pure=False, retries=1))
+                by_key[futures[-1].key] = item
+            return futures
+
+        futures = dask.as_completed(submitted(_AHEAD * sum(client.nthreads().values())), loop=client.loop)
+        for future in futures:
+            yield by_key.pop(future.key), None if future.exception() is not None else future.result()
+            future.release()
+            futures.update(submitted(1))
+
+
+def _call(task: Callable[[Item], Result], item: Item) -> Result:
+    return task(item)
+
+
+def _numbered(task: Callable[[Item], Result], numbered: tuple[int, Item]) -> Result:
+    return task(numbered[1])
 
 
 #: In a worker process: what it carries out its items with.
@@ -121,39 +165,9 @@ def _worker_environment() -> Iterator[None]:
 
 def cores() -> int:
     """Return the number of cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return max(1, len(os.sched_getaffinity(0)))
-    return os.cpu_count() or 1
-
-
-def most_processes() -> int:
-    """Return how many processes are started at most, whatever is asked for: two a core."""
-    return 2 * cores()
+    return max(1, len(os.sched_getaffinity(0))) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def process_count(asked: int | None) -> int:
     """Return how many processes to start: as many as asked for, at most two a core; by default one a core."""
-    return min(asked or cores(), most_processes())
-
-
-def in_order(jobs: int, task: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[Item, Result | None]]:
-    """Yield each item and its result in the order given, as soon as it and all before it are there.
-
-    The result is None where the process died that carried the item out. Raises what `task` raised.
-    """
-    waiting = deque(enumerate(items))
-    results: dict[int, Result | None] = {}
-    place = 0
-    with Workers(jobs, partial(_numbered, task)) as workers:
-        while place < len(items):
-            while waiting and workers.free:
-                workers.begin(waiting.popleft())
-            for (number, _), result in workers.ended():
-                results[number] = result
-            while place in results:
-                yield items[place], results.pop(place)
-                place += 1
-
-
-def _numbered(task: Callable[[Item], Result], numbered: tuple[int, Item]) -> Result:
-    return task(numbered[1])
+    return min(asked or cores(), 2 * cores())

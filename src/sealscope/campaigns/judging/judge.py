@@ -7,9 +7,9 @@ truth: when the leak began, how large it is, what the fault is.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from sealscope.evaluation.roc import Area, Roc, auc, roc_curve
 from sealscope.evaluation.table import ALWAYS, NEVER, JudgedRecord, SummaryRow, summary
 from sealscope.evaluation.thresholds import Promise, Threshold, quantile_threshold, records_needed
 
+_K = TypeVar("_K")
 #: (detector, row id) -> verdict
 Verdicts = Mapping[tuple[str, str], str]
 #: (detector, duty) -> threshold from leak-free records of that duty
@@ -218,7 +219,7 @@ def judge(
     records = [
         JudgedRecord(name, row.id, row.leak_lpm, verdicts[name, row.id], hours) for name in detectors for row in plain
     ]
-    group = _Groups(detectors, verdicts, confidence, false_alarm)
+    these = _Judging(plain, judged, detectors, verdicts, confidence, false_alarm)
     return Judgement(
         thresholds=thresholds,
         leak_free=sum(row.use == "calibrate" and row.error is None for row in rows) if thresholds else 0,
@@ -226,14 +227,14 @@ def judge(
         failed=tuple(row for row in sorted(rows, key=lambda row: row.id) if row.error is not None),
         table=tuple(summary(records, confidence)) if plain else (),
         overall=tuple(_any_size(records, confidence)) if plain else (),
-        onsets=tuple(_onsets(plain, detectors, verdicts, onset_s, confidence)),
-        flows=tuple(_flows(plain, detectors, confidence)),
-        causes=tuple(_causes(judged, detectors, confidence)),
-        pods=tuple(_pods(plain, detectors, verdicts, confidence)),
-        rocs=tuple(_rocs(plain, detectors, confidence)),
-        cells=tuple(group.by_cell(plain)),
-        faults=tuple(group.by_fault(judged)),
-        families=tuple(group.by_family(plain)),
+        onsets=() if onset_s is None else tuple(these.onsets(onset_s)),
+        flows=tuple(these.flows()),
+        causes=tuple(these.causes()),
+        pods=tuple(these.pods()),
+        rocs=tuple(these.rocs()),
+        cells=tuple(these.by_cell()),
+        faults=tuple(these.by_fault()),
+        families=tuple(these.by_family()),
         realised=_realised(plain),
     )
 
@@ -256,53 +257,76 @@ def _statement(row: CaseRow, detector: str) -> Evidence | None:
     return row.statements.get(detector) if row.error is None else None
 
 
-def _stating(rows: Sequence[CaseRow], detectors: Sequence[str]) -> list[str]:
-    """Return the detectors that state evidence."""
-    return [name for name in detectors if any(name in row.statements for row in rows)]
-
-
 def _flow(row: CaseRow) -> float:
     return row.leak_lpm if row.flow_lpm is None else row.flow_lpm
 
 
-def _sizes(rows: Sequence[CaseRow]) -> list[float]:
-    return sorted({row.leak_lpm for row in rows if row.leak_lpm > 0})
+def _by(rows: Iterable[CaseRow], key: Callable[[CaseRow], _K]) -> dict[_K, list[CaseRow]]:
+    """Return the rows by what they have in common, in rising order."""
+    groups: dict[_K, list[CaseRow]] = {}
+    for row in rows:
+        groups.setdefault(key(row), []).append(row)
+    return dict(sorted(groups.items(), key=lambda group: group[0]))  # type: ignore[arg-type, return-value]
+
+
+def _any_size(records: Sequence[JudgedRecord], confidence: float) -> list[SummaryRow]:
+    """Return the table with all leaks in one row."""
+    together = [replace(record, leak_lpm=1.0 if record.leak_lpm else 0.0) for record in records]
+    return [replace(row, leak_lpm=math.nan) for row in summary(together, confidence)]
+
+
+def _realised(rows: Sequence[CaseRow]) -> dict[float, tuple[float, float]]:
+    realised = {}
+    for size, own in _by((row for row in rows if row.leak_lpm > 0), lambda row: row.leak_lpm).items():
+        flows = [row.flow_lpm for row in own if row.flow_lpm is not None]
+        if flows:
+            spread = float(np.std(flows, ddof=1)) if len(flows) > 1 else math.nan
+            realised[size] = (float(np.mean(flows)), spread)
+    return realised
+
+
+def _ends(pairs: Iterable[tuple[float, float] | None]) -> tuple[list[float], list[float]]:
+    ends = [(math.nan, math.nan) if pair is None else pair for pair in pairs]
+    return [low for low, _ in ends], [high for _, high in ends]
 
 
 @dataclass(frozen=True)
-class _Groups:
-    """Alarms of the detectors on groups of rows."""
+class _Judging:
+    """What follows from the verdicts: `plain` rows have no fault beside the leak, `rows` are all."""
 
+    plain: Sequence[CaseRow]
+    rows: Sequence[CaseRow]
     detectors: Sequence[str]
     verdicts: Verdicts
     confidence: float
     false_alarm: float
 
-    def by_cell(self, rows: Sequence[CaseRow]) -> Iterator[AlarmShares]:
+    def by_cell(self) -> Iterator[AlarmShares]:
         """Yield the alarms at each size in each cell of the factors."""
-        groups: dict[tuple[float, tuple[tuple[str, str | float], ...]], list[CaseRow]] = {}
-        for row in rows:
-            groups.setdefault((row.leak_lpm, tuple(row.levels.items())), []).append(row)
+        groups = _by(self.plain, lambda row: (row.leak_lpm, repr(tuple(row.levels.items()))))
         for name in self.detectors:
-            for size, levels in sorted(groups, key=lambda key: (key[0], repr(key[1]))):
-                yield self._shares(name, groups[size, levels], leak_lpm=size, levels=dict(levels))
+            for (size, _), here in groups.items():
+                yield self._shares(name, here, leak_lpm=size, levels=dict(here[0].levels))
 
-    def by_fault(self, rows: Sequence[CaseRow]) -> Iterator[AlarmShares]:
+    def by_fault(self) -> Iterator[AlarmShares]:
         """Yield the alarms on records with each fault that is no piston leak."""
-        faults = sorted({row.fault for row in rows if row.fault and row.leak_lpm == 0})
-        for name in (*self.detectors, ALWAYS, NEVER) if faults else ():
-            for fault in faults:
-                here = [row for row in rows if row.fault == fault and row.leak_lpm == 0]
+        groups = _by((row for row in self.rows if row.fault and row.leak_lpm == 0), lambda row: row.fault)
+        for name in (*self.detectors, ALWAYS, NEVER):
+            for fault, here in groups.items():
                 yield self._shares(name, here, fault=fault)
 
-    def by_family(self, rows: Sequence[CaseRow]) -> Iterator[AlarmShares]:
-        """Yield the alarms by family, size and law; all families together first, none where there are no families."""
-        names = sorted({str(row.levels[FAMILY]) for row in rows if FAMILY in row.levels})
-        for name in self.detectors if names else ():
-            for family in (ALL, *names):
-                own = [row for row in rows if family in (ALL, row.levels.get(FAMILY))]
-                for size, law, here in _kinds(own):
-                    yield self._shares(name, here, family=family, leak_lpm=size, law=law)
+    def by_family(self) -> Iterator[AlarmShares]:
+        """Yield the alarms by family, size and law; all families together first, none where there are no families.
+
+        Each size has its laws apart, and together where there are several.
+        """
+        own = _by((row for row in self.plain if FAMILY in row.levels), lambda row: str(row.levels[FAMILY]))
+        for name in self.detectors if own else ():
+            for family, rows in {ALL: self.plain, **own}.items():
+                for size, here in _by(rows, lambda row: row.leak_lpm).items():
+                    laws = _by(here, lambda row: row.law) if size else {}
+                    for law, these in laws.items() if len(laws) == 1 else {ANY_LAW: here, **laws}.items():
+                        yield self._shares(name, these, family=family, leak_lpm=size, law=law)
 
     def _shares(self, detector: str, rows: Sequence[CaseRow], **common: Any) -> AlarmShares:
         given = [{ALWAYS: "leak", NEVER: "no leak"}.get(detector) or self.verdicts[detector, row.id] for row in rows]
@@ -320,135 +344,102 @@ class _Groups:
         found = [verdict == "leak" for row, verdict in zip(rows, given, strict=True) if self._allowed(row)]
         return AlarmShares(
             detector=detector,
-            alarms=proportion(given.count("leak"), len(rows), self.confidence),
-            cannot_tell=proportion(given.count(CANNOT_TELL), len(rows), self.confidence),
-            coverage=proportion(sum(held), len(held), self.confidence),
-            named=proportion(sum(named), len(named), self.confidence) if any(stated) else None,
-            reachable=proportion(len(found), bounded, self.confidence) if bounded else None,
-            allowed=proportion(sum(found), len(found), self.confidence) if bounded else None,
+            alarms=self._proportion(given.count("leak"), len(rows)),
+            cannot_tell=self._proportion(given.count(CANNOT_TELL), len(rows)),
+            coverage=self._proportion(sum(held), len(held)),
+            named=self._proportion(sum(named), len(named)) if any(stated) else None,
+            reachable=self._proportion(len(found), bounded) if bounded else None,
+            allowed=self._proportion(sum(found), len(found)) if bounded else None,
             failed=sum(row.error is not None for row in rows),
             **common,
         )
+
+    def _proportion(self, k: int, n: int) -> Proportion:
+        return proportion(k, n, self.confidence)
 
     def _allowed(self, row: CaseRow) -> bool:
         """Whether the best test at this false-alarm probability finds the leak of a row nine times in ten."""
         bound = row.bound_lpm
         return bound is not None and smallest_found(bound, self.false_alarm, ALLOWED_DETECTION) <= _flow(row)
 
+    def _stating(self, rows: Sequence[CaseRow]) -> list[str]:
+        """Return the detectors that state evidence."""
+        return [name for name in self.detectors if any(name in row.statements for row in rows)]
 
-def _kinds(rows: Sequence[CaseRow]) -> Iterator[tuple[float, str, list[CaseRow]]]:
-    """Yield size, law and rows: each size with its laws apart, and together where there are several."""
-    for size in sorted({row.leak_lpm for row in rows}):
-        here = [row for row in rows if row.leak_lpm == size]
-        laws = sorted({row.law for row in here}) if size else []
-        if len(laws) != 1:
-            yield size, ANY_LAW, here
-        for law in laws:
-            yield size, law, [row for row in here if row.law == law]
+    def pods(self) -> Iterator[DetectorPod]:
+        """Yield the probability of detection over the size, where there are leaks."""
+        leaky = [row for row in self.plain if row.leak_lpm > 0]
+        sizes = [row.leak_lpm for row in leaky]
+        for name in self.detectors if leaky else ():
+            hits = [self.verdicts[name, row.id] == "leak" for row in leaky]
+            detections = by_size(sizes, hits, self.confidence)
+            curve, why = None, ""
+            try:
+                curve = fit_hit_miss(sizes, hits)
+            except InputError as error:
+                why = str(error)
+            yield DetectorPod(name, tuple(detections), curve, why, proven_size(detections))
 
-
-def _any_size(records: Sequence[JudgedRecord], confidence: float) -> list[SummaryRow]:
-    """Return the table with all leaks in one row."""
-    together = [replace(record, leak_lpm=1.0 if record.leak_lpm else 0.0) for record in records]
-    return [replace(row, leak_lpm=math.nan) for row in summary(together, confidence)]
-
-
-def _pods(
-    rows: Sequence[CaseRow], detectors: Sequence[str], verdicts: Verdicts, confidence: float
-) -> Iterator[DetectorPod]:
-    leaky = [row for row in rows if row.leak_lpm > 0]
-    sizes = [row.leak_lpm for row in leaky]
-    for name in detectors if leaky else ():
-        hits = [verdicts[name, row.id] == "leak" for row in leaky]
-        detections = by_size(sizes, hits, confidence)
-        curve, why = None, ""
-        try:
-            curve = fit_hit_miss(sizes, hits)
-        except InputError as error:
-            why = str(error)
-        yield DetectorPod(name, tuple(detections), curve, why, proven_size(detections))
-
-
-def _rocs(rows: Sequence[CaseRow], detectors: Sequence[str], confidence: float) -> Iterator[SizeRoc]:
-    """Yield curves over the scores, with no threshold; a record that cannot be judged counts as the lowest score."""
-    sizes = _sizes(rows)
-    for name in detectors:
-        value = {row.id: row.scores[name][0] if row.error is None else None for row in rows}
-        lowest = min((score for score in value.values() if score is not None), default=None)
-        if lowest is None:
-            continue
-        by_leak: dict[float, list[float]] = {}
-        for row in rows:
-            score = value[row.id]
-            by_leak.setdefault(row.leak_lpm, []).append(lowest - 1.0 if score is None else score)
-        free = by_leak.pop(0.0, [])
-        by_leak[math.nan] = [score for scores in by_leak.values() for score in scores]
-        for size in (math.nan, *sizes) if len(free) > 1 else ():
-            leaky = by_leak[size]
-            if len(leaky) > 1:
-                yield SizeRoc(name, size, roc_curve(free, leaky, confidence), auc(free, leaky, confidence))
-
-
-def _realised(rows: Sequence[CaseRow]) -> dict[float, tuple[float, float]]:
-    realised = {}
-    for size in _sizes(rows):
-        flows = [row.flow_lpm for row in rows if row.leak_lpm == size and row.flow_lpm is not None]
-        if flows:
-            spread = float(np.std(flows, ddof=1)) if len(flows) > 1 else math.nan
-            realised[size] = (float(np.mean(flows)), spread)
-    return realised
-
-
-def _ends(pairs: Iterable[tuple[float, float] | None]) -> tuple[list[float], list[float]]:
-    ends = [(math.nan, math.nan) if pair is None else pair for pair in pairs]
-    return [low for low, _ in ends], [high for _, high in ends]
-
-
-def _onsets(
-    rows: Sequence[CaseRow], detectors: Sequence[str], verdicts: Verdicts, onset_s: float | None, confidence: float
-) -> Iterator[OnsetAccuracy]:
-    """Yield, for detectors that search for the onset, its error over the alarms, by size."""
-    for name in detectors if onset_s is not None else ():
-        for size in _sizes(rows):
-            alarmed = [row for row in rows if row.leak_lpm == size and verdicts[name, row.id] == "leak"]
-            timed = [(at, row) for row in alarmed if (at := row.scores[name][1]) is not None]
-            if not timed or onset_s is None:
+    def rocs(self) -> Iterator[SizeRoc]:
+        """Yield curves over the scores, with no threshold; a record that cannot be judged counts as the lowest."""
+        for name in self.detectors:
+            value = {row.id: row.scores[name][0] if row.error is None else None for row in self.plain}
+            lowest = min((score for score in value.values() if score is not None), default=None)
+            if lowest is None:
                 continue
-            stated = [_statement(row, name) for _, row in timed]
-            low, high = _ends(None if ev is None else ev.onset_interval_s for ev in stated)
-            errors = onset_errors([at for at, _ in timed], [onset_s] * len(timed), low, high, confidence)
-            yield OnsetAccuracy(name, size, errors)
+            by_leak: dict[float, list[float]] = {}
+            for row in self.plain:
+                score = value[row.id]
+                by_leak.setdefault(row.leak_lpm, []).append(lowest - 1.0 if score is None else score)
+            free = by_leak.pop(0.0, [])
+            together = [score for scores in by_leak.values() for score in scores]
+            for size, leaky in ((math.nan, together), *sorted(by_leak.items())):
+                if min(len(free), len(leaky)) > 1:
+                    curve, area = (of(free, leaky, self.confidence) for of in (roc_curve, auc))
+                    yield SizeRoc(name, size, curve, area)  # type: ignore[arg-type]
 
+    def onsets(self, onset_s: float) -> Iterator[OnsetAccuracy]:
+        """Yield, for detectors that search for the onset, its error over the alarms, by size."""
+        groups = _by((row for row in self.plain if row.leak_lpm > 0), lambda row: row.leak_lpm)
+        for name in self.detectors:
+            for size, rows in groups.items():
+                alarmed = [row for row in rows if self.verdicts[name, row.id] == "leak"]
+                timed = [(at, row) for row in alarmed if (at := row.scores[name][1]) is not None]
+                if timed:
+                    stated = [_statement(row, name) for _, row in timed]
+                    low, high = _ends(None if ev is None else ev.onset_interval_s for ev in stated)
+                    truth = [onset_s] * len(timed)
+                    errors = onset_errors([at for at, _ in timed], truth, low, high, self.confidence)
+                    yield OnsetAccuracy(name, size, errors)
 
-def _flows(rows: Sequence[CaseRow], detectors: Sequence[str], confidence: float) -> Iterator[FlowAccuracy]:
-    """Yield, for detectors that state a flow, its errors against the flow that the record really had, by size."""
-    for name in _stating(rows, detectors):
-        for size in sorted({row.leak_lpm for row in rows}):
-            own = [(row, ev) for row in rows if row.leak_lpm == size and (ev := _statement(row, name)) is not None]
-            truth = [_flow(row) for row, _ in own]
-            given = [math.nan if ev.leak_lpm is None else ev.leak_lpm for _, ev in own]
-            if not np.isfinite(given).any():
-                continue
-            low, high = _ends(ev.leak_interval_lpm for _, ev in own)
-            error = np.array(given) - np.array(truth)
-            error = error[np.isfinite(error)]
-            errors = estimate_error(given, truth, low, high, confidence)
-            medians = quantile_of(error, 0.5, confidence), quantile_of(np.abs(error), 0.5, confidence)
-            yield FlowAccuracy(name, size, errors, *medians)
+    def flows(self) -> Iterator[FlowAccuracy]:
+        """Yield, for detectors that state a flow, its errors against the flow that the record really had, by size."""
+        for name in self._stating(self.plain):
+            for size, rows in _by(self.plain, lambda row: row.leak_lpm).items():
+                own = [(row, ev) for row in rows if (ev := _statement(row, name)) is not None]
+                truth = [_flow(row) for row, _ in own]
+                given = [math.nan if ev.leak_lpm is None else ev.leak_lpm for _, ev in own]
+                if not np.isfinite(given).any():
+                    continue
+                low, high = _ends(ev.leak_interval_lpm for _, ev in own)
+                error = np.array(given) - np.array(truth)
+                error = error[np.isfinite(error)]
+                errors = estimate_error(given, truth, low, high, self.confidence)
+                medians = (quantile_of(of, 0.5, self.confidence) for of in (error, np.abs(error)))
+                yield FlowAccuracy(name, size, errors, *medians)
 
+    def causes(self) -> Iterator[NamedCauses]:
+        """Yield the causes that detectors name, where there are faults.
 
-def _causes(rows: Sequence[CaseRow], detectors: Sequence[str], confidence: float) -> Iterator[NamedCauses]:
-    """Yield the causes that detectors name, where there are faults.
-
-    A record with a leak and another fault is left out; one that failed is `cannot tell`.
-    """
-    single = [row for row in rows if not (row.leak_lpm > 0 and row.fault)]
-    order = sorted({cause_of(row.fault) for row in single if row.fault})
-    truth = [PISTON_LEAK if row.leak_lpm > 0 else cause_of(row.fault) if row.fault else NO_CAUSE for row in single]
-    causes = [cause for cause in (NO_CAUSE, PISTON_LEAK) if cause in truth] + order
-    for name in _stating(rows, detectors) if order else ():
-        statements = [_statement(row, name) for row in single]
-        named = [CANNOT_TELL if ev is None else named_cause(ev) for ev in statements]
-        others = sorted(set(named) - set(causes) - {CANNOT_TELL})
-        covered = proportion(sum(map(covers, named, truth)), len(truth), confidence)
-        yield NamedCauses(name, confusion_matrix(truth, named, [*causes, *others], confidence), covered)
+        A record with a leak and another fault is left out; one that failed is `cannot tell`.
+        """
+        single = [row for row in self.rows if not (row.leak_lpm > 0 and row.fault)]
+        order = sorted({cause_of(row.fault) for row in single if row.fault})
+        truth = [PISTON_LEAK if row.leak_lpm > 0 else cause_of(row.fault) if row.fault else NO_CAUSE for row in single]
+        causes = [cause for cause in (NO_CAUSE, PISTON_LEAK) if cause in truth] + order
+        for name in self._stating(single) if order else ():
+            statements = [_statement(row, name) for row in single]
+            named = [CANNOT_TELL if ev is None else named_cause(ev) for ev in statements]
+            others = sorted(set(named) - set(causes) - {CANNOT_TELL})
+            covered = self._proportion(sum(map(covers, named, truth)), len(truth))
+            yield NamedCauses(name, confusion_matrix(truth, named, [*causes, *others], self.confidence), covered)

@@ -5,16 +5,54 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from pathlib import Path
+from typing import Annotated, Literal, TypeAlias
 
-if TYPE_CHECKING:
-    from sealscope.parameters import Rig
+from pydantic import AfterValidator, BeforeValidator, Field
+
+from sealscope.parameters import Rig
+from sealscope.units import parse_quantity
 
 Use = Literal["calibrate", "judge"]
 LeakLaw = Literal["laminar", "orifice", "mixture"]
 Promise = Literal["average", "bound"]
 DataSet = Literal["appendix-c", "hydraulic"]
 LeaveOut = Literal["test", "condition"]
+
+_LONGEST_NAME = 80
+
+
+def _quantity(unit: str) -> BeforeValidator:
+    """Return what takes a text of a number with its unit for the number."""
+    return BeforeValidator(lambda value: parse_quantity(value, unit) if isinstance(value, str) else value)
+
+
+def _file_name(name: str) -> str:
+    if not all(c.isalnum() or c in "-_." for c in name) or name.startswith(".") or len(name) > _LONGEST_NAME:
+        raise ValueError(f"must be of at most {_LONGEST_NAME} letters, digits, '-', '_' and '.'")
+    return name
+
+
+def _pattern(files: str) -> str:
+    parts = Path(files).parts
+    if Path(files).is_absolute() or ".." in parts:
+        raise ValueError("must be a pattern within the folder")
+    if "\0" in files or any("**" in part and part != "**" for part in parts) or files.count("**") > 1:
+        raise ValueError("must be a pattern of names, with ** once at most")
+    return files
+
+
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Share = Annotated[Number, Field(gt=0, lt=1)]
+Ridge = Annotated[Number, Field(gt=0)]
+Whole = Annotated[int, Field(strict=True, ge=0)]
+Flag = Annotated[bool, Field(strict=True)]
+Text = Annotated[str, Field(pattern=r"^[^\n]*$")]
+FileName = Annotated[str, Field(min_length=1), AfterValidator(_file_name)]
+Seconds = Annotated[Number, _quantity("s")]
+#: Names, one or more.
+Names = Annotated[tuple[str, ...], Field(min_length=1)]
+Level = str | Annotated[int, Field(strict=True)] | Number
 
 
 @dataclass(frozen=True)
@@ -27,12 +65,16 @@ class RecordGroup:
     machine allows, which does not depend on the size.
     """
 
-    use: Use
-    count: int
-    leak_lpm: float = 0.0
+    count: Annotated[Whole, Field(ge=1)]
+    use: Use = "judge"
+    leak_lpm: Annotated[Number, Field(ge=0), _quantity("L/min")] = 0.0
     law: LeakLaw = "laminar"
-    fault: str = ""
-    bound: bool = False
+    fault: Text = ""
+    bound: Flag = False
+
+    def __post_init__(self) -> None:
+        if self.use == "calibrate" and (self.leak_lpm or self.fault):
+            raise ValueError("must be leak-free and without a fault where use = 'calibrate'")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,15 +85,15 @@ class _JudgedPlan:
     may assume of the machine, None for the plan's rig, or the thesis's where it has none.
     """
 
-    name: str
-    title: str
-    false_alarm: float
-    promise: Promise
-    confidence: float
-    detectors: tuple[str, ...]
+    name: FileName
+    title: Text = ""
+    false_alarm: Share = 0.01
+    promise: Promise = "average"
+    confidence: Share = 0.95
+    detectors: Names
     place: str = ""
-    unit: str = "L/min"
-    note: str = ""
+    unit: Text = "L/min"
+    note: Text = ""
     views: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     assumed: Rig | None = None
 
@@ -67,14 +109,14 @@ class SimulatedPlan(_JudgedPlan):
     """
 
     rig: Rig
-    profile: str
-    duration_s: float
-    onset_s: float
-    seed: int
-    keep_recordings: bool
+    profile: str = ""
+    duration_s: Seconds
+    onset_s: Seconds
+    seed: Whole = 0
+    keep_recordings: Flag = False
     records: tuple[RecordGroup, ...]
-    factors: Mapping[str, tuple[str | float, ...]] = field(default_factory=dict)
-    part: str = ""
+    factors: Mapping[str, Annotated[tuple[Level, ...], Field(min_length=1)]] = field(default_factory=dict)
+    part: Text = ""
 
     @property
     def size(self) -> int:
@@ -95,20 +137,24 @@ class RecordingSet:
     `end`-th belong to the set; `size`: 0 for healthy recordings, else the grade of the leak.
     """
 
-    files: str
-    use: Use
-    size: float
-    first: int
-    end: int
-    label: str
+    files: Annotated[Text, AfterValidator(_pattern)]
+    use: Use = "judge"
+    size: Annotated[Number, Field(ge=0)] = 0.0
+    first: Annotated[Whole, Field(ge=1)] = 1
+    end: Annotated[Whole, Field(ge=2)] = 10**9
+    label: Text = ""
+
+    def __post_init__(self) -> None:
+        if self.use == "calibrate" and self.size > 0:
+            raise ValueError("must have the size 0 to calibrate")
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedPlan(_JudgedPlan):
     """A campaign over recordings in a folder of the caller."""
 
-    channel_map: Mapping[str, str]
-    rate_hz: float | None
+    channel_map: Mapping[str, str] = field(default_factory=dict)
+    rate_hz: Annotated[Number, _quantity("Hz")] | None = None
     sets: tuple[RecordingSet, ...]
 
 
@@ -116,9 +162,9 @@ class RecordedPlan(_JudgedPlan):
 class LogisticClassifier:
     """A logistic regression on `features` with a `ridge` on the standardised coefficients."""
 
-    name: str
-    features: tuple[str, ...]
-    ridge: float
+    name: Text
+    features: Names
+    ridge: Ridge = 1.0
 
 
 @dataclass(frozen=True)
@@ -129,9 +175,9 @@ class ChosenClassifier:
     held out within the training samples is taken.
     """
 
-    name: str
-    groups: tuple[tuple[str, ...], ...]
-    ridges: tuple[float, ...]
+    name: Text
+    groups: Annotated[tuple[Names, ...], Field(min_length=1, max_length=8)]
+    ridges: Annotated[tuple[Ridge, ...], Field(min_length=1)]
 
     def candidates(self) -> list[LogisticClassifier]:
         """Return every union of groups with every ridge, few features first and of these the larger ridge first."""
@@ -155,17 +201,17 @@ class HeldOutPlan:
     often labels are swapped within tests to estimate what chance reaches, 0 for no such check; `seed`: of the swaps.
     """
 
-    name: str
-    title: str
+    name: FileName
     data: DataSet
-    leave_out: LeaveOut
     detectors: tuple[Classifier, ...]
-    confidence: float
+    title: Text = ""
+    leave_out: LeaveOut = "test"
+    confidence: Share = 0.95
     place: str = ""
     unit: str = "L/min"
-    note: str = ""
-    permutations: int = 0
-    seed: int = 0
+    note: Text = ""
+    permutations: Annotated[Whole, Field(le=100_000)] = 0
+    seed: Whole = 0
 
 
 AnyPlan: TypeAlias = SimulatedPlan | HeldOutPlan | RecordedPlan

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
-from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, get_args
+from typing import Any, TypeVar
 
-from sealscope.campaigns.plans.detectors import plan_detector
+from sealscope.campaigns.plans.detectors import check_detector, plan_detector
 from sealscope.campaigns.plans.duty import (
     COMMAND,
     CONTROLLER,
@@ -23,38 +24,37 @@ from sealscope.campaigns.plans.duty import (
 from sealscope.campaigns.plans.model import (
     AnyPlan,
     ChosenClassifier,
-    Classifier,
-    DataSet,
     HeldOutPlan,
-    LeakLaw,
-    LeaveOut,
     LogisticClassifier,
-    Promise,
     RecordedPlan,
     RecordGroup,
     RecordingSet,
     SimulatedPlan,
-    Use,
 )
-from sealscope.campaigns.plans.table import PlanTable
 from sealscope.errors import InputError
+from sealscope.parameters import Rig, load_rig
 from sealscope.storage.opening import names_a_file
+from sealscope.storage.plain_values import as_type
 from sealscope.storage.toml_file import read_toml
-
-if TYPE_CHECKING:
-    from sealscope.parameters import Rig
 
 _T = TypeVar("_T")
 _PACKAGED = Path(__file__).parent / "packaged"
-#: Most records of a campaign: a mistyped count shall not plan a year of work.
-MOST_RECORDS = 1_000_000
-_LONGEST_NAME = 80
-#: Most combinations of the factors' levels.
-MOST_CELLS = 100_000
-#: Most swaps of labels by which chance is estimated.
-MOST_PERMUTATIONS = 100_000
-#: Most groups of features to choose from: more have too many unions to try them all.
-MOST_GROUPS = 8
+#: Most records of a campaign: a mistyped count shall not plan a year of work. Most combinations of levels.
+MOST_RECORDS, MOST_CELLS = 1_000_000, 100_000
+#: Entries of a plan that the model calls otherwise.
+_FIELDS = {
+    "leak": "leak_lpm", "duration": "duration_s", "onset": "onset_s", "rate": "rate_hz", "map": "channel_map",
+    "choose": "groups",
+}  # fmt: skip
+_ENTRIES = {field: entry for entry, field in _FIELDS.items()}
+#: Fields of the model that no entry sets.
+_NO_ENTRIES = {*_ENTRIES, "assumed", "place", "views"}
+#: What holds the records of a plan -> the tables that it has.
+_TABLES = {
+    "recordings": ("campaign", "views", "recordings"),
+    "held_out": ("campaign", "held_out"),
+    "records": ("campaign", "factors", "views", "records"),
+}
 
 
 def plan_names() -> tuple[str, ...]:
@@ -74,37 +74,14 @@ def load_plan(name_or_path: str | os.PathLike[str]) -> AnyPlan:
 
 def read_plan(tree: Mapping[str, Any], place: str = "plan") -> AnyPlan:
     """Read the plan in a TOML file's tables; its kind follows from the tables that are there."""
-    if "recordings" in tree:
-        _known(tree, ("campaign", "views", "recordings"), "a plan over recordings", place)
-        return _recorded(tree, place)
-    if "held_out" in tree:
-        _known(tree, ("campaign", "held_out"), "a plan over measured data", place)
-        return _held_out(tree, place)
-    _known(tree, ("campaign", "factors", "views", "[records]"), "a plan", place)
-    return _simulated(tree, place)
-
-
-def _known(tree: Mapping[str, Any], tables: tuple[str, ...], kind: str, place: str) -> None:
-    names = [name.strip("[]") for name in tables]
+    kind = next((name for name in _TABLES if name in tree), "records")
     for key in tree:
-        if key not in names:
-            known = ", ".join(f"[{name}]" for name in tables[:-1])
-            raise InputError(f"[{key}] is not known; {kind} has {known} and [{tables[-1]}] ({place})")
-
-
-def _judged(head: PlanTable, tree: Mapping[str, Any], rig: Rig | None) -> dict[str, Any]:
-    """Read what plans over recordings, simulated or not, have in common."""
-    views = head.views(tree.get("views", {}))
-    return {
-        "false_alarm": head.share("false_alarm", 0.01),
-        "promise": head.choice("promise", get_args(Promise), "average"),
-        "confidence": head.share("confidence", 0.95),
-        "detectors": head.detectors(views),
-        "note": head.text("note", ""),
-        "views": views,
-        "assumed": head.assumed(rig),
-        "place": head.place,
-    }
+        if key not in _TABLES[kind]:
+            known = ", ".join(f"[{name}]" for name in _TABLES[kind])
+            raise InputError(f"[{key}] is not known; a plan with [{kind}] has {known} ({place})")
+    if kind == "recordings":
+        return _recorded(tree, place)
+    return _held_out(tree, place) if kind == "held_out" else _simulated(tree, place)
 
 
 def _in(entry: str, place: str, read: Callable[[], _T]) -> _T:
@@ -115,149 +92,197 @@ def _in(entry: str, place: str, read: Callable[[], _T]) -> _T:
         raise InputError(f"{entry}: {error} ({place})") from None
 
 
-def _simulated(tree: Mapping[str, Any], place: str) -> SimulatedPlan:
-    head = PlanTable(tree.get("campaign", {}), "campaign", place)
-    name = _name(head)
-    duration = head.number("duration", unit="s")
-    onset = head.number("onset", duration / 2, unit="s")
-    if not 0.0 < onset < duration:
-        raise head.fail(f"onset must be within the duration, 0 s to {duration:g} s, got {onset:g}")
-    rig, profile = _rig(head), _profile(head)
-    plan = SimulatedPlan(
-        name=name,
-        title=head.text("title", name),
-        rig=rig,
-        profile=profile,
-        duration_s=duration,
-        onset_s=onset,
-        seed=head.whole("seed", 0),
-        keep_recordings=head.flag("keep_recordings"),
-        factors=_factors(tree.get("factors", {}), rig, profile, duration, place),
-        part=head.text("part", ""),
-        records=_records(tree.get("records", ()), onset, head.flag("bound"), place),
-        **_judged(head, tree, rig),
-    )
-    head.end()
-    if plan.size > MOST_RECORDS:
-        raise InputError(f"a campaign must have at most {MOST_RECORDS} records, got {plan.size} ({place})")
-    _enough_records(plan)
+def _table(given: Any, name: str, place: str, unknown: Collection[str] = ()) -> dict[str, Any]:
+    """Return a table's entries; InputError for one that is `unknown`."""
+    if not isinstance(given, Mapping):
+        raise InputError(f"[{name}] must be a table, got {given!r} ({place})")
+    for entry in given:
+        if entry in unknown:
+            raise InputError(f"{name}.{entry} is not known ({place})")
+    return dict(given)
+
+
+def _tables(given: Any, name: str, place: str) -> list[tuple[str, dict[str, Any]]]:
+    """Return the tables of a list of one or more, each with its name."""
+    if not isinstance(given, Sequence) or isinstance(given, str) or not given:
+        raise InputError(f"a plan must have a list of [[{name}]], got {given or 'none'!r} ({place})")
+    return [(f"{name}[{k}]", _table(entries, f"{name}[{k}]", place, _ENTRIES)) for k, entries in enumerate(given, 1)]
+
+
+def _part(
+    kind: type[_T], entries: Mapping[str, Any], name: str, place: str, second: tuple[str, Collection[str]] = ("", ())
+) -> _T:
+    """Return the entries of a table as the part `kind` of a plan; InputError names the entry that breaks a rule.
+
+    `second`: another table, and which of the entries stand there.
+    """
+    try:
+        return as_type(kind, {_FIELDS.get(entry, entry): value for entry, value in entries.items()})
+    except ValueError as error:
+        field, _, rule = str(error).partition(": ")
+        entry, *inner = field.split(".")
+        rule = re.sub(r"^\w+ should", "must", rule.removeprefix("Value error, "))
+        if rule == "not known" or rule.startswith("Field required"):
+            rule = "is not known" if rule == "not known" else "is missing"
+        if rule.count(", got ") > 1:
+            rule = rule.rpartition(", got ")[0]
+        entry = _ENTRIES.get(entry, entry)
+        table = second[0] if entry in second[1] else name
+        where = ".".join([table, *([] if entry == "value" else [entry]), *inner])
+        raise InputError(f"{where}{' ' if rule.startswith(('must', 'is ')) else ': '}{rule} ({place})") from None
+
+
+def _beside(name: Any, place: str) -> Any:
+    """Return the path of a file named in a plan, which lies beside the plan; another name as it is."""
+    return os.fspath(Path(place).parent / name) if isinstance(name, str) and name.endswith(".toml") else name
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise InputError(f"must be a text, got {value!r}")
+    return value
+
+
+def _changed(rig: Rig, values: Any, source: str) -> Rig:
+    if not isinstance(values, Mapping):
+        raise InputError(f"must be a table of parameters, got {values!r}")
+    return rig.with_overrides(values, source=source) if values else rig
+
+
+def _rig(head: dict[str, Any], place: str) -> Rig:
+    """Take the rig of a plan from its first table, with the values that it sets."""
+    rig = _in("campaign.rig", place, lambda: load_rig(_text(_beside(head.pop("rig", "thesis"), place))))
+    values = head.pop("set", {})
+    if "rate" in head:
+        values = {"daq.sample_rate": head.pop("rate"), **_table(values, "campaign.set", place)}
+    return _in("campaign.set", place, lambda: _changed(rig, values, "set by the plan"))
+
+
+def _assumed(head: dict[str, Any], rig: Rig | None, place: str) -> Rig | None:
+    """Take the rig that detectors may assume: `assume`, a rig's name or file, and `assume_set`, values of it."""
+
+    def read() -> Rig | None:
+        assumed = load_rig(_text(_beside(head.pop("assume"), place))) if "assume" in head else rig
+        if "assume_set" in head:
+            return _changed(assumed or load_rig("thesis"), head.pop("assume_set"), "assumed by the plan")
+        return assumed
+
+    return _in("campaign.assume", place, read)
+
+
+def _views(given: Any, head: dict[str, Any], place: str) -> dict[str, tuple[str, ...]]:
+    """Read the table [views], name -> channels, and under "" the entry `channels` where there is one."""
+    from sealscope.recordings.recording import CHANNEL_UNITS
+
+    views = {name: (f"views.{name}", channels) for name, channels in _table(given, "views", place).items()}
+    for name, (entry, _) in views.items():
+        if not name.strip() or name != name.strip() or "@" in name:
+            raise InputError(f"{entry} must be a plain name without '@' ({place})")
+    if "channels" in head:
+        views[""] = ("campaign.channels", head.pop("channels"))
+    for entry, channels in views.values():
+        known = isinstance(channels, list) and channels and all(name in list(CHANNEL_UNITS) for name in channels)
+        if not known or len(set(channels)) < len(channels):
+            raise InputError(f"{entry} must be a list of channels, each once, got {channels!r} ({place})")
+        if "q_leak" in channels:
+            raise InputError(f"{entry} must not hold q_leak: it measures what detectors are to find ({place})")
+    return {name: tuple(channels) for name, (_, channels) in views.items()}
+
+
+def _judged(
+    kind: type[_T], entries: dict[str, Any], tree: Mapping[str, Any], rig: Rig | None, place: str, **more: Any
+) -> _T:
+    """Return a plan over recordings, simulated or not, its detectors checked."""
+    views = _views(tree.get("views", {}), entries, place)
+    entries |= {"views": views, "assumed": _assumed(entries, rig, place), "place": place}
+    plan = _part(kind, entries, "campaign", place, **more)
+    names: tuple[str, ...] = plan.detectors  # type: ignore[attr-defined]
+    for name in names:
+        _in("campaign.detectors", place, partial(check_detector, name, views))
+    if len(set(names)) < len(names):
+        raise InputError(f"campaign.detectors must be named once each ({place})")
     return plan
 
 
-def _name(head: PlanTable) -> str:
-    """Return the campaign's name, which is that of its folder as well."""
-    name = head.text("name")
-    if not all(c.isalnum() or c in "-_." for c in name) or name.startswith(".") or len(name) > _LONGEST_NAME:
-        most = f"{_LONGEST_NAME} letters, digits, '-', '_' and '.'"
-        raise head.fail(f"name must be of at most {most}, got {name[:99]!r}")
-    return name
-
-
-def _rig(head: PlanTable) -> Rig:
-    from sealscope.parameters import load_rig
-
-    name = head.text("rig", "thesis")
-    rig = _in("campaign.rig", head.place, lambda: load_rig(head.beside(name)))
-    values: dict[str, float | str] = {}
-    if "rate" in head.left:
-        values["daq.sample_rate"] = head.number("rate", unit="Hz")
-    given = head.take("set", {})
-    if not isinstance(given, Mapping):
-        raise head.fail(f"set must be a table of parameters, got {given!r}")
-    values |= given
-    if not values:
-        return rig
-    return _in("campaign.set", head.place, lambda: rig.with_overrides(values, source="set by the plan"))
-
-
-def _profile(head: PlanTable) -> str:
-    name = head.text("profile", "none")
-    if name == "none":
-        return ""
+def _simulated(tree: Mapping[str, Any], place: str) -> SimulatedPlan:
     from sealscope.simulation.bench.profile import load_profile
 
-    name = head.beside(name)
-    _in("campaign.profile", head.place, lambda: load_profile(name))
-    return name
+    head = _table(tree.get("campaign", {}), "campaign", place, {*_NO_ENTRIES, "factors", "records"})
+    rig, profile = _rig(head, place), _beside(head.pop("profile", "none"), place)
+    if profile != "none":
+        _in("campaign.profile", place, lambda: load_profile(_text(profile)))
+    bound = head.pop("bound", False)
+    groups = _tables(tree.get("records"), "records", place)
+    head |= {
+        "rig": rig,
+        "profile": "" if profile == "none" else profile,
+        "onset": head.get("onset", 0.0),
+        "factors": _table(tree.get("factors", {}), "factors", place),
+        "records": tuple(_part(RecordGroup, {"bound": bound, **of}, name, place) for name, of in groups),
+    }
+    plan = _judged(SimulatedPlan, head, tree, rig, place)
+    onset = plan.onset_s if "onset" in tree["campaign"] else plan.duration_s / 2
+    if not 0.0 < onset < plan.duration_s:
+        rule = f"must be within the duration, 0 s to {plan.duration_s:g} s"
+        raise InputError(f"campaign.onset {rule}, got {onset:g} ({place})")
+    if plan.size > MOST_RECORDS:
+        raise InputError(f"a campaign must have at most {MOST_RECORDS} records, got {plan.size} ({place})")
+    plan = replace(plan, title=plan.title or plan.name, onset_s=onset)
+    _check_factors(plan)
+    _check_records(plan)
+    return plan
 
 
-def _factors(given: Any, rig: Rig, profile: str, duration: float, place: str) -> dict[str, tuple[str | float, ...]]:
-    table = PlanTable(given, "factors", place)
-    factors: dict[str, tuple[str | float, ...]] = {}
-    for name, levels in table.left.items():
-        if not isinstance(levels, list) or not levels:
-            raise table.fail(f"{name} must be a list of levels, got {levels!r}")
+def _check_factors(plan: SimulatedPlan) -> None:
+    """Raise InputError for a level that no run can have, and for too many of them."""
+    for name, levels in plan.factors.items():
         if len({repr(level) for level in levels}) < len(levels):
-            raise table.fail(f"{name} must hold each level once")
+            raise InputError(f"factors.{name} must hold each level once ({plan.place})")
         for level in levels:
-            if isinstance(level, bool) or not isinstance(level, (str, int, float)):
-                raise table.fail(f"{name} must be texts or numbers, got {level!r}")
-            _in(f"factors.{name}", place, partial(_check_level, name, level, rig, profile, duration))
-        factors[name] = tuple(levels)
-        cells = math.prod(map(len, factors.values()))
-        if cells > MOST_CELLS:
-            raise table.fail(f"their levels must make at most {MOST_CELLS} cells, got {cells} or more")
-    if CONTROLLER in factors and (command := voltage_in(_commands(factors, profile))) is not None:
-        raise table.fail(f"{CONTROLLER} must have targets to follow ('position 50 mm sin(2t)'), got {command!r}")
-    return factors
+            _in(f"factors.{name}", plan.place, partial(_check_level, plan, name, level))
+    cells = math.prod(map(len, plan.factors.values()))
+    if cells > MOST_CELLS:
+        raise InputError(f"factors: their levels must make at most {MOST_CELLS} cells, got {cells} ({plan.place})")
+    if CONTROLLER in plan.factors and (command := voltage_in(_commands(plan))) is not None:
+        rule = f"must have targets to follow ('position 50 mm sin(2t)'), got {command!r}"
+        raise InputError(f"factors.{CONTROLLER} {rule} ({plan.place})")
 
 
-def _commands(factors: Mapping[str, tuple[str | float, ...]], profile: str) -> tuple[str | float, ...]:
+def _commands(plan: SimulatedPlan) -> tuple[str | float, ...]:
     """Return the commands of a plan: its factor's, or else those of its profile, or of its families there."""
     from sealscope.simulation.bench.profile import load_profile
 
-    if COMMAND in factors or not profile:
-        return factors.get(COMMAND, ("3 sin(4t)",))
-    drawn = load_profile(profile)
-    kinds = [drawn.of_family(str(family)) for family in factors.get("family", ())] or [drawn]
+    if COMMAND in plan.factors or not plan.profile:
+        return plan.factors.get(COMMAND, ("3 sin(4t)",))
+    drawn = load_profile(plan.profile)
+    kinds = [drawn.of_family(str(family)) for family in plan.factors.get("family", ())] or [drawn]
     return tuple(command for kind in kinds for command in kind.duty.commands)
 
 
-def _check_level(name: str, level: str | float, rig: Rig, profile: str, duration: float) -> None:
+def _check_level(plan: SimulatedPlan, name: str, level: str | float) -> None:
     from sealscope.simulation.bench.profile import load_profile
 
     if name == "family":
-        if not profile:
+        if not plan.profile:
             raise InputError(f"a family must be of the plan's profile, got {level!r} and no profile")
-        load_profile(profile).family(str(level))
+        load_profile(plan.profile).family(str(level))
     elif name in (COMMAND, CONTROLLER, LOAD):
-        check_duty(name, level, rig, duration)
+        check_duty(name, level, plan.rig, plan.duration_s)
     else:
-        rig.with_overrides(closing_values(level) if name == "closed" else {name: level})
+        plan.rig.with_overrides(closing_values(level) if name == "closed" else {name: level})
 
 
-def _records(given: Any, onset: float, bound: bool, place: str) -> tuple[RecordGroup, ...]:
-    if not isinstance(given, list) or not given:
-        raise InputError(f"a plan must have [[records]], got none ({place})")
-    groups: dict[tuple[str, float, str, str], RecordGroup] = {}
-    for number, entries in enumerate(given, 1):
-        table = PlanTable(entries, f"records[{number}]", place)
-        group = RecordGroup(
-            use=table.choice("use", get_args(Use), "judge"),
-            count=table.whole("count", least=1),
-            leak_lpm=table.number("leak", 0.0, unit="L/min") if "leak" in table.left else 0.0,
-            law=table.choice("law", get_args(LeakLaw), "laminar"),
-            fault=table.text("fault", ""),
-            bound=table.flag("bound") or bound,
-        )
-        table.end()
-        if group.leak_lpm < 0:
-            raise table.fail(f"leak must be >= 0 L/min, got {group.leak_lpm:g}")
-        if group.use == "calibrate" and (group.leak_lpm or group.fault):
-            raise table.fail("use = 'calibrate' must be leak-free and without a fault")
-        if group.fault:
-            _in(f"records[{number}].fault", place, partial(fault_of, group.fault, onset))
-        kind = (group.use, group.leak_lpm, group.law, group.fault)
-        if kind in groups:
-            raise table.fail("records must differ from the others in use, leak, law or fault")
-        groups[kind] = group
-    return tuple(groups.values())
-
-
-def _enough_records(plan: SimulatedPlan) -> None:
-    """Refuse a plan without records to judge, or with too few for the scorers' thresholds."""
+def _check_records(plan: SimulatedPlan) -> None:
+    """Refuse records that say the same twice, a fault that is none, and too few records to judge or to calibrate."""
     from sealscope.evaluation.thresholds import records_needed
 
+    kinds = [(group.use, group.leak_lpm, group.law, group.fault) for group in plan.records]
+    for number, (kind, group) in enumerate(zip(kinds, plan.records, strict=True), 1):
+        if group.fault:
+            _in(f"records[{number}].fault", plan.place, partial(fault_of, group.fault, plan.onset_s))
+        if kind in kinds[: number - 1]:
+            rule = "records must differ from the others in use, leak, law or fault"
+            raise InputError(f"records[{number}].{rule} ({plan.place})")
     if not any(group.use == "judge" for group in plan.records):
         raise InputError(f"a plan must have records to judge, got none ({plan.place})")
     if not any(plan_detector(name).needs_threshold for name in plan.detectors):
@@ -273,94 +298,34 @@ def _enough_records(plan: SimulatedPlan) -> None:
         )
 
 
+def _two_tables(tree: Mapping[str, Any], name: str, own: Collection[str], place: str) -> tuple[dict[str, Any], ...]:
+    """Return the entries of [campaign], and those of the table that has the `own` ones."""
+    head = _table(tree.get("campaign", {}), "campaign", place, {*_NO_ENTRIES, *own})
+    part = _table(tree[name], name, place)
+    for entry in part.keys() - set(own):
+        raise InputError(f"{name}.{entry} is not known ({place})")
+    return head, part
+
+
 def _recorded(tree: Mapping[str, Any], place: str) -> RecordedPlan:
-    head = PlanTable(tree.get("campaign", {}), "campaign", place)
-    part = PlanTable(tree["recordings"], "recordings", place)
-    channel_map = part.take("map", {})
-    if not isinstance(channel_map, dict) or not all(isinstance(column, str) for column in channel_map.values()):
-        raise part.fail(f"map must be a table of channel = column, got {channel_map!r}")
-    name = _name(head)
-    plan = RecordedPlan(
-        name=name,
-        title=head.text("title", name),
-        channel_map=channel_map,
-        rate_hz=part.number("rate", unit="Hz") if "rate" in part.left else None,
-        sets=tuple(_recording_set(table) for table in part.tables("sets")),
-        unit=part.text("unit", "L/min"),
-        **_judged(head, tree, None),
-    )
-    head.end()
-    part.end()
+    head, part = _two_tables(tree, "recordings", ("map", "rate", "unit", "sets"), place)
+    sets = _tables(part.pop("sets", ()), "recordings.sets", place)
+    part["sets"] = tuple(_part(RecordingSet, of, name, place) for name, of in sets)
+    plan = _judged(RecordedPlan, {**head, **part}, tree, None, place, second=("recordings", part))
     if not any(recordings.use == "judge" for recordings in plan.sets):
-        raise part.fail("sets must have one to judge, got none")
-    return plan
-
-
-def _recording_set(table: PlanTable) -> RecordingSet:
-    recordings = RecordingSet(
-        files=table.text("files"),
-        use=table.choice("use", get_args(Use), "judge"),
-        size=table.number("size", 0.0),
-        first=table.whole("first", 1, least=1),
-        end=table.whole("end", 10**9, least=2),
-        label=table.text("label", ""),
-    )
-    table.end()
-    if recordings.size < 0 or (recordings.use == "calibrate" and recordings.size > 0):
-        raise table.fail(f"size must be >= 0, and 0 to calibrate, got {recordings.size:g}")
-    if Path(recordings.files).is_absolute() or ".." in Path(recordings.files).parts:
-        raise table.fail(f"files must be a pattern within the folder, got {recordings.files!r}")
-    if "\0" in recordings.files or any("**" in part and part != "**" for part in Path(recordings.files).parts):
-        raise table.fail(f"files must be a pattern of names, got {recordings.files!r}")
-    if recordings.files.count("**") > 1:
-        raise table.fail(f"files must have ** once at most, got {recordings.files!r}")
-    return recordings
+        raise InputError(f"recordings.sets must have one to judge, got none ({place})")
+    return replace(plan, title=plan.title or plan.name)
 
 
 def _held_out(tree: Mapping[str, Any], place: str) -> HeldOutPlan:
-    head = PlanTable(tree.get("campaign", {}), "campaign", place)
-    part = PlanTable(tree["held_out"], "held_out", place)
-    name, data = _name(head), part.choice("data", get_args(DataSet))
-    plan = HeldOutPlan(
-        name=name,
-        title=head.text("title", name),
-        data=data,
-        leave_out=part.choice("leave_out", get_args(LeaveOut), "test"),
-        detectors=tuple(_classifier(table) for table in part.tables("detectors")),
-        confidence=head.share("confidence", 0.95),
-        place=place,
-        unit="grade" if data == "hydraulic" else "L/min",
-        note=head.text("note", ""),
-        permutations=part.whole("permutations", 0, most=MOST_PERMUTATIONS),
-        seed=part.whole("seed", 0),
+    own = ("data", "leave_out", "permutations", "seed", "detectors")
+    head, part = _two_tables(tree, "held_out", own, place)
+    part["detectors"] = tuple(
+        _part(ChosenClassifier if "choose" in of else LogisticClassifier, of, name, place)
+        for name, of in _tables(part.pop("detectors", ()), "held_out.detectors", place)
     )
-    head.end()
-    part.end()
+    more = {"unit": "grade" if part.get("data") == "hydraulic" else "L/min", "place": place}
+    plan = _part(HeldOutPlan, {**head, **part, **more}, "campaign", place, ("held_out", part))
     if len({classifier.name for classifier in plan.detectors}) < len(plan.detectors):
-        raise part.fail("detectors must have names of their own")
-    return plan
-
-
-def _classifier(table: PlanTable) -> Classifier:
-    name = table.text("name")
-    if "choose" not in table.left:
-        features, ridge = table.texts("features"), table.number("ridge", 1.0)
-        if not ridge > 0:
-            raise table.fail(f"ridge must be > 0, got {ridge:g}")
-        table.end()
-        return LogisticClassifier(name, features, ridge)
-    given, rule = table.take("choose"), "choose must be a list of lists of names"
-    if not isinstance(given, list) or not given:
-        raise table.fail(f"{rule}, got {given!r}")
-    groups = tuple(table.checked_texts(group, rule) for group in given)
-    if len(groups) > MOST_GROUPS:
-        raise table.fail(f"choose must have at most {MOST_GROUPS} groups, got {len(groups)}")
-    ridges = table.take("ridges")
-    if not isinstance(ridges, list) or not ridges or not all(_is_number(ridge) and ridge > 0 for ridge in ridges):
-        raise table.fail(f"ridges must be a list of numbers > 0, got {ridges!r}")
-    table.end()
-    return ChosenClassifier(name, groups, tuple(float(ridge) for ridge in ridges))
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
+        raise InputError(f"held_out.detectors must have names of their own ({place})")
+    return replace(plan, title=plan.title or plan.name)

@@ -21,14 +21,7 @@ from sealscope.evaluation.roc import Area
 from sealscope.evaluation.table import SummaryRow
 from sealscope.reporting import template
 from sealscope.reporting.campaign.curves import CurvePlot, PlotCurve, draw
-from sealscope.reporting.campaign.tables import (
-    cause_tables,
-    family_lines,
-    fault_lines,
-    flow_lines,
-    onset_lines,
-    percent,
-)
+from sealscope.reporting.campaign.tables import cause_tables, page_tables, percent
 
 PAGE = "report.html"
 #: More sizes than this are shown together: a column for each could not be read.
@@ -267,11 +260,7 @@ def render_campaign_page(result: CampaignResult, files: Sequence[str] = ()) -> s
         notes=_notes(result),
         facts=_facts(result),
         sections=[_section(pod, judgement, result.plan.unit) for pod in judgement.pods],
-        faults=fault_lines(judgement),
-        families=family_lines(judgement),
-        part=result.plan.part if isinstance(result.plan, SimulatedPlan) else "",
-        flows=flow_lines(judgement),
-        onsets=onset_lines(judgement),
+        tables=page_tables(judgement, result.plan.unit, getattr(result.plan, "part", "")),
         causes=cause_tables(judgement),
         failed=[
             (row.id, ", ".join(f"{k} {v}" for k, v in row.levels.items()), row.error) for row in judgement.failed[:200]

@@ -31,12 +31,82 @@ def _p(share: float) -> str:
     )
 
 
-def fault_lines(judgement: Judgement) -> list[tuple[str, str, str, str, str]]:
-    """Return detector, fault, alarms, those of them that name its cause, cannot tell."""
-    return [
-        (fault.detector, fault.fault, percent(fault.alarms), percent(fault.named), percent(fault.cannot_tell))
-        for fault in judgement.faults
-    ]
+@dataclass(frozen=True)
+class PageTable:
+    """A table of the page: `words`, how many columns of text stand first; `about`: what it shows, in a sentence."""
+
+    id: str
+    title: str
+    about: str
+    heads: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    words: int = 1
+
+
+def page_tables(judgement: Judgement, unit: str, part: str = "") -> dict[str, PageTable]:
+    """Return the tables of what detectors state and of faults and families, by name; those that have rows."""
+    shown = (
+        PageTable(
+            "flows",
+            "How much",
+            "The flow that a detector states less the flow that the record really had, over all records with an "
+            "estimate, alarm or not; how often its interval holds the true flow.",
+            ("Detector", f"Leak [{unit}]", "Estimates", f"Bias [{unit}]", f"Median size of the error [{unit}]",
+             "Interval holds it"),
+            tuple(
+                (
+                    of.detector, f"{of.leak_lpm:g}" if of.leak_lpm else "no leak", str(of.errors.bias.n),
+                    f"{of.errors.bias.value:+.2g}", f"{of.median_size.value:.2g}", percent(of.errors.coverage),
+                )
+                for of in judgement.flows
+            ),
+        ),
+        PageTable(
+            "families",
+            f"Family by family ({part})" if part else "Family by family",
+            "Machines that depart from the rig as their family says. The bound allows a leak where the best test at "
+            "the stated false-alarm probability, by the Cramer-Rao bound of its machine from pressures and command, "
+            "finds it nine times in ten; the last column counts those alone.",
+            ("Detector", "Family", f"Leak [{unit}]", "Alarms", "Cannot tell", "Interval holds the flow",
+             "Bound allows", "Alarms where it does"),
+            tuple(
+                (
+                    of.detector, of.family, f"{of.leak_lpm:g} {of.law}" if of.leak_lpm else "no leak",
+                    percent(of.alarms), percent(of.cannot_tell), percent(of.coverage), _of(of.reachable),
+                    _counted(of.allowed),
+                )
+                for of in judgement.families
+            ),
+            words=3,
+        ),
+        PageTable(
+            "onsets",
+            "Since when",
+            "The onset that a detector finds in its alarms less the true one: the median size of the error, and how "
+            "often the stated interval holds the true onset.",
+            ("Detector", f"Leak [{unit}]", "Alarms with an onset", "Median size of the error [s]", "Interval holds it"),
+            tuple(
+                (
+                    of.detector, f"{of.leak_lpm:g}", str(of.errors.n), _quantile(of.errors.median_size),
+                    percent(of.errors.coverage),
+                )
+                for of in judgement.onsets
+            ),
+        ),
+        PageTable(
+            "faults",
+            "Other faults",
+            "Alarms on records with a fault that is no piston leak: what a detector cannot tell from a leak. An alarm "
+            "that names the fault, as a piston or pump leak does a pump leak, is no false one.",
+            ("Detector", "Fault", "Alarms", "Alarms that name it", "Cannot tell"),
+            tuple(
+                (of.detector, of.fault, percent(of.alarms), percent(of.named), percent(of.cannot_tell))
+                for of in judgement.faults
+            ),
+            words=2,
+        ),
+    )  # fmt: skip
+    return {table.id: table for table in shown if table.rows}
 
 
 @dataclass(frozen=True)
@@ -51,52 +121,6 @@ class CauseTable:
     rows: tuple[tuple[str, int, tuple[str, ...]], ...]
     right: str
     covered: str
-
-
-def onset_lines(judgement: Judgement) -> list[tuple[str, str, str, str, str]]:
-    """Return detector, size, alarms with an onset, median size of the error [s], coverage of the interval."""
-    return [
-        (
-            onset.detector,
-            f"{onset.leak_lpm:g}",
-            str(onset.errors.n),
-            _quantile(onset.errors.median_size),
-            percent(onset.errors.coverage),
-        )
-        for onset in judgement.onsets
-    ]
-
-
-def family_lines(judgement: Judgement) -> list[tuple[str, str, str, str, str, str, str, str]]:
-    """Return detector, family, leak, alarms, cannot tell, coverage of the flow, what the bound allows, alarms there."""
-    return [
-        (
-            row.detector,
-            row.family,
-            f"{row.leak_lpm:g} {row.law}" if row.leak_lpm else "no leak",
-            percent(row.alarms),
-            percent(row.cannot_tell),
-            percent(row.coverage),
-            _of(row.reachable),
-            _counted(row.allowed),
-        )
-        for row in judgement.families
-    ]
-
-
-def flow_lines(judgement: Judgement) -> list[tuple[str, str, str, str, str, str]]:
-    """Return detector, size, records with an estimate, its bias, its median error, coverage of the interval."""
-    return [
-        (
-            flow.detector,
-            f"{flow.leak_lpm:g}" if flow.leak_lpm else "no leak",
-            str(flow.errors.bias.n),
-            f"{flow.errors.bias.value:+.2g}",
-            f"{flow.median_size.value:.2g}",
-            percent(flow.errors.coverage),
-        )
-        for flow in judgement.flows
-    ]
 
 
 def cause_tables(judgement: Judgement) -> list[CauseTable]:

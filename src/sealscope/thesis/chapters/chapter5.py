@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sealscope.errors import SimulationFailed
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
-from sealscope.thesis.chapters.appendix_c.simulation import SETTLING, detail_rms, detail_series, pressure_range
+from sealscope.thesis.chapters.appendix_c_runs import SETTLING, detail_rms, detail_series, pressure_range
 from sealscope.thesis.engine.context import Context, RunSpec, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Figure, FigureCurve, Number, Panel, Role

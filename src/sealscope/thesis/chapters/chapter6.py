@@ -14,6 +14,7 @@ from sealscope.recordings.recording import Array
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, Figure, FigureCurve, Panel, Role, ThesisTable
+from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
     from sealscope.control import Controller
@@ -62,7 +63,7 @@ DUTY = f"position {1e3 * AMPLITUDE} mm sin({OMEGA!r}t)"
 
 def conductance(lpm: float, rig: Rig) -> float:
     """Return the conductance [m^3/(s Pa)] of a leak of `lpm` [L/min] under the load."""
-    return lpm / 6e4 / (LOAD / rig.cylinder.A_A)
+    return lpm * LITRE_PER_MINUTE / (LOAD / rig.cylinder.A_A)
 
 
 def controller_of(name: str, rig: Rig, lpm: float) -> Controller:
@@ -125,7 +126,7 @@ def on_duty(
 def tracking(run: Trajectory, late: Array) -> tuple[float, float, float]:
     """Return the rms error [mm], the electrical energy of a cycle [J] and the flow made good [L/min] on the duty."""
     error = AMPLITUDE * np.sin(OMEGA * run.t[late]) - run["x"][late]
-    flow = 0.0 if run.compensated is None else float(np.mean(run.compensated[late])) * 6e4
+    flow = 0.0 if run.compensated is None else float(np.mean(run.compensated[late])) / LITRE_PER_MINUTE
     return 1e3 * float(np.sqrt(np.mean(error**2))), float(np.mean(run["V"][late] * run["i"][late])) * CYCLE, flow
 
 
@@ -264,7 +265,7 @@ def outside_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     names, leaks = (CONTROLLERS[:1], (0.5,)) if context.quick else (CONTROLLERS[:4], LEAKS[1:])
     rows: list[tuple[Cell, ...]] = []
     for side, name, lpm in itertools.product(pressure, names, leaks):
-        values = {f"G_ext_{side}": lpm / 6e4 / pressure[side]}
+        values = {f"G_ext_{side}": lpm * LITRE_PER_MINUTE / pressure[side]}
         run, late = on_duty(name, 0.0, values=values)
         lower = np.minimum(run["p_A"], run["p_B"])
         third, fifth = (1e-3 * float(np.mean(lower[_cycle_of(run.t, k)])) for k in (2, 4))

@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from typing import get_args
 
-from sealscope.thesis.claims import rig, sheet, tests
+from sealscope.thesis.claims import rig, sheet
 from sealscope.thesis.claims.evidence import gather
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
@@ -17,10 +17,10 @@ def detection(context: Context, item: Item) -> tuple[Claim, ...]:
     """Judge the claims of the abstract and of chapters 1, 5 and 6, in the thesis's order."""
     evidence = gather(context)
     claims = (
-        *tests.levels(),
+        *sheet.levels(),
         *sheet.claims(evidence),
-        *tests.curves(evidence),
-        tests.consistent(evidence),
+        *sheet.curves(evidence),
+        sheet.consistent(evidence),
         *rig.claims(evidence),
     )
     return tuple(sorted(claims, key=_place))

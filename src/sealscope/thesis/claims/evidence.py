@@ -1,22 +1,29 @@
-"""What the claims on detection are judged by: the measured sheet, the simulated ones and the ten shown tests."""
+"""What the claims on detection are judged by: sheets and shown tests, counts, correlations and regressions.
+
+The regressions leave out the answer: a left-out test takes no part in its own prediction.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sealscope.evaluation.binomial import clopper_pearson
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
-from sealscope.thesis.chapters.appendix_c.success_rates import DIRECTION, Rule, column_tests
-from sealscope.thesis.chapters.appendix_c.tables import simulated_sheet
+from sealscope.thesis.chapters.appendix_c_runs import simulated_sheet
 from sealscope.thesis.chapters.chapter5 import TESTS, ShownMeasures, measure_test
+from sealscope.thesis.chapters.success_rates import DIRECTION, Rule, column_tests
 from sealscope.thesis.claims.judged import judged
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.products import Claim, ThesisTable
-from sealscope.thesis.sheet import DataSheet
+from sealscope.thesis.sheet import APPENDIX_C, DataSheet
+
+if TYPE_CHECKING:
+    from sealscope.campaigns.held_out.classifiers import MeasuredSamples
 
 NO_SHEET = "the thesis's data sheet was not given"
 #: The details that chapter 5 calls sensitive.
@@ -42,9 +49,9 @@ class ClaimEvidence:
 
 def gather(context: Context) -> ClaimEvidence:
     """Gather the evidence from the context's items and runs."""
-    table, leak = simulated_sheet(context, "appendix-c-leak")
-    _, still = simulated_sheet(context, "appendix-c-no-leak")
-    _, drift = simulated_sheet(context, "appendix-c-drift")
+    table, leak = simulated_sheet(context, "leak")
+    _, still = simulated_sheet(context, "no-leak")
+    _, drift = simulated_sheet(context, "drift")
     control = measure_test(context, TESTS["5.2a"], leak=False)
     shown = {section: measure_test(context, test) for section, test in TESTS.items()}
     return ClaimEvidence(context.sheet, leak, still, drift, table, shown, control)
@@ -114,3 +121,67 @@ def correlated(r: float, n: int, controls: int = 0) -> bool:
     By Fisher's z: ``|artanh r| sqrt(n - 3 - controls) > 1.96``. Source: Fisher, Metron 3 (1924) 329-332.
     """
     return bool(abs(np.arctanh(np.clip(r, -0.999999, 0.999999))) * np.sqrt(n - 3 - controls) > 1.959964)
+
+
+def condition_columns() -> Array:
+    """Return the operating condition as columns (n, commands + 1): one indicator a command, and the closed share."""
+    commands = sorted({row.command for row in APPENDIX_C})
+    indicators = [[float(row.command == command) for command in commands] for row in APPENDIX_C]
+    return np.column_stack([np.array(indicators), [row.closed_pct / 100.0 for row in APPENDIX_C]])
+
+
+def partial_correlation(x: Array, y: Array, given: Array) -> float:
+    """Return the correlation of what is left of `x` and `y`, (n,), after least squares on `given`, (n, k)."""
+    left = [v - given @ np.linalg.lstsq(given, v, rcond=None)[0] for v in (x, y)]
+    return float(np.corrcoef(left[0], left[1])[0, 1])
+
+
+def left_out_r2(columns: Array, y: Array) -> float:
+    """Return R^2 of least squares on `columns`, (n, k), with each test predicted from the others.
+
+    ``1 - sum (r_i/(1 - h_i))^2 / sum (y_i - mean y)^2`` with residuals r and leverages h. Source: Allen,
+    Technometrics 16 (1974) 125-127, doi 10.1080/00401706.1974.10489157.
+    """
+    hat = columns @ np.linalg.pinv(columns)
+    residuals = (y - hat @ y) / (1.0 - np.diag(hat))
+    return float(1.0 - np.sum(residuals**2) / np.sum((y - y.mean()) ** 2))
+
+
+def change_columns(sheet: DataSheet) -> Array:
+    """Return a column of ones and the six log changes of Table 5.1, (n, 7)."""
+    changes = [sheet.log_change(chamber, name) for chamber in CHAMBERS for name in SENSITIVE]
+    return np.column_stack([np.ones_like(changes[0]), *changes])
+
+
+def samples_of(sheet: DataSheet) -> MeasuredSamples:
+    """Return the sheet as samples: log RMS of each detail, each test without and with its leak."""
+    from sealscope.campaigns.held_out.classifiers import MeasuredSamples
+
+    leaks = [row.mean_leak_lpm for row in APPENDIX_C]
+    return MeasuredSamples(
+        features={
+            f"{quantity} of {chamber}": np.log(values).T.ravel()
+            for chamber, quantities in sheet.rms.items()
+            for quantity, values in quantities.items()
+        },
+        leak_lpm=np.array([0.0] * len(leaks) + leaks),
+        tests=[row.number for row in APPENDIX_C] * 2,
+        levels=[{"command": row.command, "closed": f"{row.closed_pct:g} %"} for row in APPENDIX_C] * 2,
+    )
+
+
+def told_apart_by_levels(sheet: DataSheet, leave_out: str) -> tuple[float, float]:
+    """Tell leak from no leak by the absolute log RMS of d1..d4 of both chambers, without the test's own baseline.
+
+    Logistic regression with a ridge of 1; `leave_out`: every "test" or every "condition" is left out in turn. Returns
+    the accuracy and the area under the curve.
+    """
+    from sealscope.campaigns.held_out.classifiers import held_out_scores
+    from sealscope.campaigns.plans.model import LogisticClassifier
+    from sealscope.evaluation.roc import auc
+
+    samples = samples_of(sheet)
+    features = tuple(f"d{level} of {chamber}" for chamber in CHAMBERS for level in range(1, 5))
+    scores = held_out_scores(samples, LogisticClassifier("levels", features, 1.0), leave_out)
+    leaking = samples.leak_lpm > 0
+    return float(np.mean((scores > 0) == leaking)), auc(scores[~leaking], scores[leaking]).value

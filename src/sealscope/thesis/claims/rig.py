@@ -8,8 +8,8 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.thesis.chapters.appendix_c.simulation import column
-from sealscope.thesis.chapters.appendix_c.success_rates import CLAIMED
+from sealscope.thesis.chapters.appendix_c_runs import column
+from sealscope.thesis.chapters.success_rates import CLAIMED
 from sealscope.thesis.claims.evidence import NO_SHEET, ClaimEvidence, counted_share, fired
 from sealscope.thesis.claims.judged import judged
 from sealscope.thesis.engine.products import Claim

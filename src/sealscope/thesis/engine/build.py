@@ -6,15 +6,15 @@ import hashlib
 import json
 import os
 import traceback
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, lru_cache
+from functools import cache, lru_cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
-from sealscope.campaigns.execution.workers import Workers, process_count
+from sealscope.campaigns.execution.workers import carried_out, process_count
 from sealscope.errors import InputError, SealscopeError
 from sealscope.thesis.engine.context import Context, RunSpec, SimulatedRun, simulated_run
 from sealscope.thesis.engine.items import Item, collect, select_items, with_needed
@@ -50,35 +50,78 @@ class ItemStatus:
         return self.state in ("made", "kept")
 
 
-@dataclass(frozen=True)
-class Job:
-    """One reproduction, as a worker process gets it."""
-
-    folder: Path
-    items: tuple[Item, ...]
-    quick: bool = False
-    sheet: Path | None = None
-    publish: Publish | None = None
-
-
-@dataclass(frozen=True)
 class Reproduction:
-    """The content of a results folder after a call: the status of every item of the list, in its order."""
+    """The items of a results folder: the status of each by its id, in the order of the list, and its products."""
 
-    job: Job
-    statuses: tuple[ItemStatus, ...]
+    def __init__(
+        self, folder: Path, items: Sequence[Item], quick: bool, sheet: Path | None, publish: Publish | None
+    ) -> None:
+        self.folder, self.items = ResultsFolder(folder), {item.id: item for item in items}
+        self.quick, self.publish, self._sheet_folder = quick, publish, sheet
+        self.sheet: DataSheet | None = None
+        self._sheet_key = ""
+        if sheet is not None:
+            self.sheet, self._sheet_key = read_sheet(sheet)
+        self.statuses: dict[str, ItemStatus] = {}
+        self._run = lru_cache(maxsize=2)(self._kept_run)
 
-    def among(self, *states: State) -> list[ItemStatus]:
-        """Return the items in one of the states."""
-        return [status for status in self.statuses if status.state in states]
+    def __reduce__(self) -> tuple[type[Reproduction], tuple[Any, ...]]:
+        given = self.folder.path, tuple(self.items.values()), self.quick, self._sheet_folder, self.publish
+        return Reproduction, given
 
-    def products(self, status: ItemStatus) -> tuple[Product | Claim, ...]:
-        """Read the products of an item from the folder; () where there are none."""
-        return (self._builder.products(status.item.id) or ()) if status.available else ()
+    def products(self, name: str) -> tuple[Product | Claim, ...] | None:
+        """Return the products of an item that the folder holds; None where it has none of these sources."""
+        return self.folder.products(name, self._key(self.items[name]))
 
-    @cached_property
-    def _builder(self) -> Builder:
-        return Builder(self.job)
+    def look(self) -> dict[str, ItemStatus]:
+        """Return the status of every item as the folder has it: kept, left out or not made."""
+        statuses = {}
+        for name, item in self.items.items():
+            files = self.folder.files(name, self._key(item))
+            statuses[name] = ItemStatus(item, "not made") if files is None else ItemStatus(item, "kept", files=files)
+            if self._left_out(item):
+                statuses[name] = ItemStatus(item, "left out", MISSING)
+        return statuses
+
+    def make(self, name: str) -> ItemStatus:
+        """Make and draw an item; the status holds the reason of a failure."""
+        item = self.items[name]
+        try:
+            products = self.products(name) or tuple(map(_thinned, item.make(self._context(item), item)))
+            files = () if self.publish is None else self.publish(item, products, self.folder.path)
+            self.folder.keep(name, self._key(item), products, files)
+        except Exception as error:
+            self.folder.keep_failure(name, traceback.format_exc())
+            text = str(error) if isinstance(error, SealscopeError) else f"{type(error).__name__}: {error}"
+            return ItemStatus(item, "failed", (text.strip() or type(error).__name__).splitlines()[0])
+        return ItemStatus(item, "made", files=files)
+
+    def _left_out(self, item: Item) -> bool:
+        return item.needs_sheet and self.sheet is None
+
+    def _key(self, item: Item) -> str:
+        """Digest of what an item's products and drawings rest on."""
+        sheet = self._sheet_key if item.needs_sheet or item.uses_sheet else ""
+        needs = [self._key(self.items[needed]) for needed in item.needs]
+        own = [item.id, item.title, item.make.__module__, item.make.__qualname__, item.inputs]
+        return _digest([own, needs, sheet, self.publish is not None, self.quick, sources_key()])
+
+    def _context(self, item: Item) -> Context:
+        def product(name: str) -> tuple[Product | Claim, ...]:
+            if name not in item.needs:
+                raise InputError(f"{item.id} must name {name} among its needs to ask for its products")
+            products = () if self._left_out(self.items[name]) else self.products(name)
+            if products is None:
+                raise InputError(f"needs {name}, which failed")
+            return products
+
+        sheet = self.sheet if item.needs_sheet or item.uses_sheet else None
+        return Context(self.quick, sheet, self._run, product)
+
+    def _kept_run(self, spec: RunSpec) -> SimulatedRun:
+        experiment = spec.experiment()
+        key = _digest([experiment.key(), spec.prove, sources_key()])
+        return self.folder.run(key, lambda: simulated_run(experiment, spec.prove))
 
 
 def reproduce(
@@ -90,7 +133,7 @@ def reproduce(
     sheet: str | os.PathLike[str] | None = None,
     items: Sequence[Item] | None = None,
     publish: Publish | None = None,
-    progress: Progress | None = None,
+    progress: Progress = lambda ended, total, in_work: None,
 ) -> Reproduction:
     """Make the chosen items (see `items.select_items`) and what they need, and draw them with `publish`.
 
@@ -102,113 +145,32 @@ def reproduce(
     """
     if jobs is not None and jobs < 1:
         raise InputError(f"jobs must be >= 1, got {jobs}")
-    every = tuple(items) if items is not None else collect()
+    every = collect() if items is None else items
     chosen = with_needed(every, select_items(every, patterns))
-    builder = Builder(Job(Path(folder), every, quick, find_sheet(sheet), publish))
-    with builder.folder.locked():
-        known = {item.id: builder.status(item) for item in every}
-        waiting = [item for item in chosen if known[item.id].state == "not made"]
-        total, ended = len(waiting), 0
+    result = Reproduction(Path(folder), every, quick, find_sheet(sheet), publish)
+    with result.folder.locked():
+        result.statuses = result.look()
+        waiting = [item for item in chosen if result.statuses[item.id].state == "not made"]
+        total, ended, in_work = len(waiting), 0, list[str]()
 
-        def report(in_work: Sequence[str]) -> None:
-            if progress is not None:
+        def begun(ready: Sequence[Item]) -> Iterator[str]:
+            for item in ready:
+                in_work.append(item.id)
                 progress(ended, total, in_work)
+                yield item.id
 
-        with closing(_built(builder, waiting, min(process_count(jobs), total), report)) as built:
-            for status in built:
-                known[status.item.id] = status
-                ended += 1
-        report(())
-    return Reproduction(builder.job, tuple(known.values()))
-
-
-def _built(
-    builder: Builder, waiting: list[Item], jobs: int, report: Callable[[Sequence[str]], None]
-) -> Generator[ItemStatus, None, None]:
-    """Build the items in this process or in several, each as soon as its needs have ended."""
-    if jobs <= 1:
-        for item in waiting:
-            report([item.id])
-            yield builder(item.id)
-        return
-    with Workers(jobs, builder) as workers:
-        while waiting or workers.items:
-            unfinished = {item.id for item in waiting}.union(workers.items)
-            for item in [item for item in waiting if unfinished.isdisjoint(item.needs)]:
-                if workers.free:
-                    waiting.remove(item)
-                    workers.begin(item.id)
-            report(workers.items)
-            for name, status in workers.ended():
-                yield status or ItemStatus(builder.items[name], "failed", "the process that made it died")
-
-
-class Builder:
-    """Makes and draws one item after the other, and decides which need it."""
-
-    def __init__(self, job: Job) -> None:
-        self.job = job
-        self.folder = ResultsFolder(job.folder)
-        self.items = {item.id: item for item in job.items}
-        self.sheet: DataSheet | None = None
-        self.sheet_key = ""
-        if job.sheet is not None:
-            self.sheet, self.sheet_key = read_sheet(job.sheet)
-        self.run = lru_cache(maxsize=2)(self._run)
-
-    def __reduce__(self) -> tuple[type[Builder], tuple[Job]]:
-        return Builder, (self.job,)
-
-    def __call__(self, name: str) -> ItemStatus:
-        """Make and draw an item; the status holds the reason of a failure."""
-        item, job = self.items[name], self.job
-        try:
-            products = self.products(name) or tuple(map(_thinned, item.make(self._context(item), item)))
-            files = () if job.publish is None else job.publish(item, products, job.folder)
-            self.folder.keep(name, self._key(item), products, files)
-        except Exception as error:
-            self.folder.keep_failure(name, traceback.format_exc())
-            text = str(error) if isinstance(error, SealscopeError) else f"{type(error).__name__}: {error}"
-            return ItemStatus(item, "failed", (text.strip() or type(error).__name__).splitlines()[0])
-        return ItemStatus(item, "made", files=files)
-
-    def status(self, item: Item) -> ItemStatus:
-        """Return the status of an item in the folder: kept, left out or not made."""
-        if item.needs_sheet and self.sheet is None:
-            return ItemStatus(item, "left out", MISSING)
-        files = self.folder.files(item.id, self._key(item))
-        return ItemStatus(item, "not made") if files is None else ItemStatus(item, "kept", files=files)
-
-    def products(self, name: str) -> tuple[Product | Claim, ...] | None:
-        """Return the products of an item that the folder holds; None where it has none of these sources."""
-        return self.folder.products(name, self._key(self.items[name]))
-
-    def _key(self, item: Item) -> str:
-        """Digest of what an item's products and drawings rest on."""
-        sheet = self.sheet_key if item.needs_sheet or item.uses_sheet else ""
-        needs = [self._key(self.items[needed]) for needed in item.needs]
-        draw = self.job.publish is not None
-        own = [item.id, item.title, item.make.__module__, item.make.__qualname__, item.inputs]
-        return _digest([own, needs, sheet, draw, self.job.quick, sources_key()])
-
-    def _context(self, item: Item) -> Context:
-        def product(name: str) -> tuple[Product | Claim, ...]:
-            if name not in item.needs:
-                raise InputError(f"{item.id} must name {name} among its needs to ask for its products")
-            if self.status(self.items[name]).state == "left out":
-                return ()
-            products = self.products(name)
-            if products is None:
-                raise InputError(f"needs {name}, which failed")
-            return products
-
-        sheet = self.sheet if item.needs_sheet or item.uses_sheet else None
-        return Context(self.job.quick, sheet, self.run, product)
-
-    def _run(self, spec: RunSpec) -> SimulatedRun:
-        experiment = spec.experiment()
-        key = _digest([experiment.key(), spec.prove, sources_key()])
-        return self.folder.run(key, lambda: simulated_run(experiment, spec.prove))
+        while waiting:
+            unmade = {item.id for item in waiting}
+            ready = [item for item in waiting if unmade.isdisjoint(item.needs)]
+            waiting = [item for item in waiting if item not in ready]
+            with closing(carried_out(result.make, begun(ready), min(process_count(jobs), len(ready)))) as made:
+                for name, status in made:
+                    died = ItemStatus(result.items[name], "failed", "the process that made it died")
+                    result.statuses[name] = status or died
+                    in_work.remove(name)
+                    ended += 1
+        progress(ended, total, in_work)
+    return result
 
 
 def _thinned(product: Product | Claim) -> Product | Claim:

@@ -29,9 +29,10 @@ MODULES = (
     "chapters.chapter4.figures",
     "claims.chapter4",
     "chapters.chapter5",
-    "chapters.appendix_c.tables",
+    "chapters.appendix_c_runs",
+    "chapters.appendix_c",
     "identification",
-    "chapters.appendix_c.success_rates",
+    "chapters.success_rates",
     "claims.detection",
     "chapters.chapter6",
     "claims.chapter6",
@@ -91,15 +92,8 @@ def select_items(items: Sequence[Item], patterns: Sequence[str]) -> tuple[Item, 
 
 
 def with_needed(items: Sequence[Item], chosen: Iterable[Item]) -> tuple[Item, ...]:
-    """Return the chosen items and all that they need, each after what it needs, otherwise in the list's order."""
-    by_id = {item.id: item for item in items}
-    ordered: dict[str, Item] = {}
-
-    def add(item: Item) -> None:
-        for needed in item.needs:
-            add(by_id[needed])
-        ordered[item.id] = item
-
-    for item in chosen:
-        add(item)
-    return tuple(ordered.values())
+    """Return the chosen items and all that they need, in the order of the list."""
+    by_id, wanted = {item.id: item for item in items}, {item.id for item in chosen}
+    while more := {needed for name in wanted for needed in by_id[name].needs} - wanted:
+        wanted |= more
+    return tuple(item for item in items if item.id in wanted)

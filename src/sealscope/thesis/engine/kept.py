@@ -36,7 +36,7 @@ class ResultsFolder:
     """The kept part of a results folder. Raises InputError where it cannot be created."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
+        self.path = folder
         self._kept = inner_folder(folder, "kept")
         for name in ("items", "runs", "failed"):
             inner_folder(self._kept, name)
@@ -47,8 +47,8 @@ class ResultsFolder:
 
         Raises InputError where another call holds it.
         """
-        with locked(self._kept / "lock", f"a results folder must be used by one call at a time, got {self.folder}"):
-            remove_temporaries(self.folder)
+        with locked(self._kept / "lock", f"a results folder must be used by one call at a time, got {self.path}"):
+            remove_temporaries(self.path)
             yield
             shutil.rmtree(self._kept / "runs", ignore_errors=True)
 
@@ -70,7 +70,7 @@ class ResultsFolder:
         if not isinstance(note, dict) or note.get("key") != key or not isinstance(note.get("files"), tuple):
             return None
         files = tuple(map(str, note["files"]))
-        return files if all(names_a_file(self.folder / name) for name in files) else None
+        return files if all(names_a_file(self.path / name) for name in files) else None
 
     def keep_failure(self, item: str, trace: str) -> None:
         """Keep the traceback of an item that failed."""

@@ -151,7 +151,7 @@ class SolverPair:
 
     def of(self, solver: Solver) -> SimulatedRun:
         """Return the run with that solver."""
-        return self.literal if solver == "literal" else self.converged
+        return {"literal": self.literal, "converged": self.converged}[solver]
 
     def runs(self) -> list[tuple[Solver, str, SimulatedRun]]:
         """Return solver, label and run of those that did not diverge."""
@@ -171,18 +171,18 @@ def steady(run: SimulatedRun) -> np.ndarray:
 
 
 def steady_output(run: SimulatedRun, name: str) -> Array:
-    """Return the output `name` over those whole periods."""
-    return np.asarray(run.outputs[name][steady(run)])
+    """Return the output `name` over those whole periods; a single nan where the run diverged."""
+    return np.array([math.nan]) if run.diverged else np.asarray(run.outputs[name][steady(run)])
 
 
 def span(run: SimulatedRun, name: str) -> float:
-    """Return the range (greatest less least) of an output over the whole periods; nan where the run diverged."""
-    return math.nan if run.diverged else float(np.ptp(steady_output(run, name)))
+    """Return the range (greatest less least) of an output over the whole periods."""
+    return float(np.ptp(steady_output(run, name)))
 
 
 def mean_difference(run: SimulatedRun, first: str, second: str) -> float:
-    """Return the mean of one output less another over the whole periods; nan where the run diverged."""
-    return math.nan if run.diverged else float(np.mean(steady_output(run, first) - steady_output(run, second)))
+    """Return the mean of one output less another over the whole periods."""
+    return float(np.mean(steady_output(run, first) - steady_output(run, second)))
 
 
 @dataclass(frozen=True)
@@ -205,9 +205,6 @@ class RunNumbers:
 
 def numbers_of(run: SimulatedRun) -> RunNumbers:
     """Return the numbers of one run; nan throughout where it diverged."""
-    if run.diverged:
-        nothing = dict.fromkeys(PRESSURES, math.nan)
-        return RunNumbers(nothing, nothing, nothing, *(math.nan,) * 4, False)
     of = {name: steady_output(run, name) for name in (*PRESSURES, "Q_A", "Q_B")}
     drops = [of["p_1"] - of["p_A"], of["p_2"] - of["p_B"]]
     return RunNumbers(
@@ -218,7 +215,7 @@ def numbers_of(run: SimulatedRun) -> RunNumbers:
         p_2_less_p_B=float(np.mean(drops[1])),
         largest_drop=float(np.abs(drops).max()),
         flows_differ=float(np.sqrt(np.mean((of["Q_A"] - of["Q_B"]) ** 2) / np.mean(of["Q_A"] ** 2))),
-        resolved=run.resolved,
+        resolved=False if run.diverged else run.resolved,
     )
 
 

@@ -108,8 +108,6 @@ def _both_solvers(pair: SolverPair, name: str) -> tuple[FigureCurve, ...]:
 
 def _difference(pair: SolverPair, name: str) -> float:
     """Rms of the difference between the two runs over the steady periods, in the figure's unit; nan if one diverged."""
-    if len(pair.runs()) < 2:
-        return float("nan")
     gap = steady_output(pair.literal, name) - steady_output(pair.converged, name)
     return float(np.sqrt(np.mean(gap**2)) * OUTPUTS[name][1])
 
@@ -121,8 +119,8 @@ def case_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     for name in list(OUTPUTS)[1:]:
         row: list[Cell] = [_label(name)]
         for run in (pair.literal, pair.converged):
-            values = np.array([]) if run.diverged else steady_output(run, name) * OUTPUTS[name][1]
-            row += [float(of(values)) if values.size else None for of in (np.min, np.max, np.std)]
+            values = steady_output(run, name) * OUTPUTS[name][1]
+            row += [None if run.diverged else float(of(values)) for of in (np.min, np.max, np.std)]
         rows.append((*row, _difference(pair, name)))
     heads = [
         f"{what}, {how}" for how in ("RK4 1e-4 s", "converged") for what in ("least", "greatest", "rms about mean")

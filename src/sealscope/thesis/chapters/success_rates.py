@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.evaluation.binomial import clopper_pearson, holm, sign_test
-from sealscope.recordings.chambers import CHAMBERS
-from sealscope.thesis.chapters.appendix_c.tables import simulated_sheet
+from sealscope.thesis.chapters.appendix_c_runs import simulated_sheet
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, ThesisTable
-from sealscope.thesis.sheet import QUANTITIES, DataSheet
+from sealscope.thesis.sheet import COLUMNS, DataSheet
 
 #: The direction in which each chamber's RMS is said to move when a leak opens, section 5.6.
 DIRECTION: Mapping[str, int] = {"p_A": -1, "p_B": 1}
@@ -22,7 +21,6 @@ DIRECTION: Mapping[str, int] = {"p_A": -1, "p_B": 1}
 FALSE_ALARMS = 0.05
 #: Normal quantiles that are passed with probability FALSE_ALARMS, to one side and to either.
 _ONE_SIDED, _EITHER_SIDE = 1.6448536269514722, 1.959963984540054
-_COUNTED = ("rate [%]", "95 % low [%]", "95 % high [%]")
 
 Fires = NDArray[np.bool_]
 
@@ -50,12 +48,8 @@ def _rule(chamber: str, detail: str, printed: str = "") -> Rule:
 
 #: The six cells of Table 5.1 and the cumulative one.
 CLAIMED: tuple[Rule, ...] = (
-    _rule("A", "d3", "100"),
-    _rule("A", "d4", "64 (65 in the text)"),
-    _rule("A", "d3d4", "85"),
-    _rule("B", "d3", "48"),
-    _rule("B", "d4", "76"),
-    _rule("B", "d3d4", "76"),
+    *(_rule("A", *cell) for cell in (("d3", "100"), ("d4", "64 (65 in the text)"), ("d3d4", "85"))),
+    *(_rule("B", *cell) for cell in (("d3", "48"), ("d4", "76"), ("d3d4", "76"))),
     Rule("both d3d4", (("p_A", "d3d4"), ("p_B", "d3d4")), "65"),
 )
 #: The columns of Appendix C that Table 5.1 leaves out.
@@ -71,12 +65,30 @@ def _counted(fires: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
     return f"{k}/{n}", 100.0 * k / n, 100.0 * low, 100.0 * high
 
 
+def _heads(what: str, count: str) -> tuple[str, ...]:
+    return tuple(f"{what}: {part}" for part in (count, "rate [%]", "95 % low [%]", "95 % high [%]"))
+
+
+_SOURCES = ("sheet", "simulated leak", "simulated, no leak", "simulated, drift only")
+RATES = (
+    *("rule", "printed [%]", *(head for source in _SOURCES for head in _heads(source, "fires"))),
+    "simulated leak less drift [points]",
+)
+TESTS = (
+    *("source", "chamber", "detail", "down", "up", "geometric mean change [%]"),
+    *("sign test p", "p, Holm over ten columns", "moves (p < 0.05)"),
+)
+THRESHOLDS = (
+    *("rule", "sheet: threshold from d1's scatter [%]", *_heads("sheet", "finds")),
+    *("simulated: threshold from drift only [%]", *_heads("simulated leak", "finds")),
+)
+
+
 def counts(measured: DataSheet | None, leak: DataSheet, still: DataSheet, drift: DataSheet) -> list[tuple[Cell, ...]]:
     """Count each rule of Table 5.1 on the sheet, in simulation with leak, with none, and with drift but no leak.
 
     The last rows are the rules that always and never fire.
     """
-    sheets = (measured, leak, still, drift)
     rules: dict[str, tuple[str, Callable[[DataSheet], Fires]]] = {
         **{rule.name: (rule.printed, rule.fires) for rule in (*CLAIMED, *UNCLAIMED)},
         "always fires": ("", lambda sheet: np.full(sheet.tests, True)),
@@ -84,17 +96,10 @@ def counts(measured: DataSheet | None, leak: DataSheet, still: DataSheet, drift:
     }
     rows: list[tuple[Cell, ...]] = []
     for name, (printed, fires) in rules.items():
+        sheets = (measured, leak, still, drift)
         cells = [cell for sheet in sheets for cell in _counted(None if sheet is None else fires(sheet))]
         rows.append((name, printed or None, *cells, 100.0 * float(fires(leak).mean() - fires(drift).mean())))
     return rows
-
-
-_SOURCES = ("sheet", "simulated leak", "simulated, no leak", "simulated, drift only")
-RATES = (
-    *("rule", "printed [%]"),
-    *(f"{of}: {what}" for of in _SOURCES for what in ("fires", *_COUNTED)),
-    "simulated leak less drift [points]",
-)
 
 
 def column_tests(sheet: DataSheet) -> list[tuple[Cell, ...]]:
@@ -104,20 +109,13 @@ def column_tests(sheet: DataSheet) -> list[tuple[Cell, ...]]:
     choose from.
     """
     rows = []
-    for chamber in CHAMBERS:
-        for name in QUANTITIES:
-            change = sheet.log_change(chamber, name)
-            down, up = int(np.sum(change < 0)), int(np.sum(change > 0))
-            mean = float(100 * np.expm1(change.mean()))
-            rows.append((chamber, name, down, up, mean, sign_test(down, down + up)))
+    for chamber, name in COLUMNS:
+        change = sheet.log_change(chamber, name)
+        down, up = int(np.sum(change < 0)), int(np.sum(change > 0))
+        mean = float(100 * np.expm1(change.mean()))
+        rows.append((chamber, name, down, up, mean, sign_test(down, down + up)))
     corrected = holm([row[-1] for row in rows])
     return [(*row, p, "yes" if p < 0.05 else "no") for row, p in zip(rows, corrected, strict=True)]
-
-
-COLUMNS = (
-    *("source", "chamber", "detail", "down", "up", "geometric mean change [%]"),
-    *("sign test p", "p, Holm over ten columns", "moves (p < 0.05)"),
-)
 
 
 def d1_threshold(sheet: DataSheet, chamber: str, either_side: bool = False) -> float:
@@ -140,69 +138,49 @@ def thresholds(measured: DataSheet | None, leak: DataSheet, drift: DataSheet) ->
     rows: list[tuple[Cell, ...]] = []
     for rule in (*CLAIMED[:6], *UNCLAIMED):
         ((chamber, detail),) = rule.details
-        direction = DIRECTION[chamber]
         row: list[Cell] = [rule.name]
-        for sheet, limit in (
-            (measured, None if measured is None else d1_threshold(measured, chamber)),
-            (leak, drift_threshold(drift, chamber, detail)),
-        ):
+        by_d1 = None if measured is None else d1_threshold(measured, chamber)
+        for sheet, limit in ((measured, by_d1), (leak, drift_threshold(drift, chamber, detail))):
             if sheet is None or limit is None:
                 row += [None] * 5
                 continue
-            fires = sheet.log_change(chamber, detail) * direction > limit
-            row += [100.0 * float(np.expm1(direction * limit)), *_counted(fires)]
+            fires = sheet.log_change(chamber, detail) * DIRECTION[chamber] > limit
+            row += [100.0 * float(np.expm1(DIRECTION[chamber] * limit)), *_counted(fires)]
         rows.append(tuple(row))
     return rows
 
 
-THRESHOLDS = (
-    "rule",
-    *("sheet: threshold from d1's scatter [%]", *(f"sheet: {what}" for what in ("finds", *_COUNTED))),
-    *("simulated: threshold from drift only [%]", *(f"simulated leak: {what}" for what in ("finds", *_COUNTED))),
-)
-
-
 def table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate Table 5.1 with its controls, the sign tests of every column, and the rules with a threshold."""
-    leak_runs, leak = simulated_sheet(context, "appendix-c-leak")
-    _, still = simulated_sheet(context, "appendix-c-no-leak")
-    _, drift = simulated_sheet(context, "appendix-c-drift")
-    measured, resolved = context.sheet, leak_runs.resolved
+    (leak_runs, leak), (_, still), (_, drift) = (simulated_sheet(context, of) for of in ("leak", "no-leak", "drift"))
+    measured = context.sheet
     sheets = dict(zip(_SOURCES, (measured, leak, still, drift), strict=True))
-    tests = tuple((name, *row) for name, sheet in sheets.items() if sheet is not None for row in column_tests(sheet))
+    tests = [(name, *row) for name, sheet in sheets.items() if sheet is not None for row in column_tests(sheet)]
     none = "" if measured else " No measured sheet was given."
-    notes = (
-        "A rule fires when the RMS of the second half lies on the stated side of the first. Intervals are exact "
-        f"(Clopper-Pearson) and take the tests as independent, which repeats of one condition are not.{none} The bench "
-        f"had no leak-free test, so its own false-alarm rate is unknown. {leak_runs.notes}",
-        "Two-sided exact sign tests; a low p says that the halves differ, not that a leak is the reason: the leak "
-        "always came second.",
-        "On the sheet the threshold is 1.645 times the scatter of d1's changes about zero in the same chamber: they "
-        "are the only leak-free ones; in simulation it is the 95 % point of the drift-only tests.",
-    )
-    set_for = f"The rules of Table 5.1 set for {100 * FALSE_ALARMS:g} % false alarms"
+    tables = {
+        ("", item.title, RATES): (
+            counts(measured, leak, still, drift),
+            "A rule fires when the RMS of the second half lies on the stated side of the first. Intervals are exact "
+            f"(Clopper-Pearson) and take the tests as independent, which repeats of one condition are not.{none} The "
+            "bench had no leak-free test, so its own false-alarm rate is unknown. " + leak_runs.notes,
+        ),
+        ("-columns", "Sign tests of every column of Appendix C", TESTS): (
+            tests,
+            "Two-sided exact sign tests; a low p says that the halves differ, not that a leak is the reason: the leak "
+            "always came second.",
+        ),
+        ("-thresholds", f"The rules of Table 5.1 set for {100 * FALSE_ALARMS:g} % false alarms", THRESHOLDS): (
+            thresholds(measured, leak, drift),
+            "On the sheet the threshold is 1.645 times the scatter of d1's changes about zero in the same chamber: "
+            "they are the only leak-free ones; in simulation it is the 95 % point of the drift-only tests.",
+        ),
+    }
     return tuple(
-        ThesisTable(f"{item.id}{tail}", title, heads, tuple(rows), resolved=resolved, notes=note)
-        for (tail, title, heads, rows), note in zip(
-            (
-                ("", item.title, RATES, counts(measured, leak, still, drift)),
-                ("-columns", "Sign tests of every column of Appendix C", COLUMNS, tests),
-                ("-thresholds", set_for, THRESHOLDS, thresholds(measured, leak, drift)),
-            ),
-            notes,
-            strict=True,
-        )
+        ThesisTable(f"{item.id}{tail}", title, heads, tuple(rows), resolved=leak_runs.resolved, notes=notes)
+        for (tail, title, heads), (rows, notes) in tables.items()
     )
 
 
-ITEMS: tuple[Item, ...] = (
-    Item(
-        "table-5.1",
-        5,
-        "table",
-        "Success rates of Table 5.1, counted anew, with intervals and false alarms",
-        table,
-        uses_sheet=True,
-        needs=("appendix-c-leak", "appendix-c-no-leak", "appendix-c-drift"),
-    ),
-)
+_TITLE = "Success rates of Table 5.1, counted anew, with intervals and false alarms"
+_NEEDS = ("appendix-c-leak", "appendix-c-no-leak", "appendix-c-drift")
+ITEMS: tuple[Item, ...] = (Item("table-5.1", 5, "table", _TITLE, table, uses_sheet=True, needs=_NEEDS),)

@@ -6,7 +6,8 @@ reduced at once and not kept: all of them would fill gigabytes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import itertools
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING
@@ -15,16 +16,10 @@ import numpy as np
 
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
+from sealscope.thesis.engine.context import Context, first_table
+from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, ThesisTable
-from sealscope.thesis.sheet import (
-    APPENDIX_C,
-    BENCH_RIG,
-    QUANTITIES,
-    UNITS,
-    Condition,
-    DataSheet,
-    experiment_values,
-)
+from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, QUANTITIES, UNITS, Condition, DataSheet, experiment_values
 from sealscope.units import PSI
 
 if TYPE_CHECKING:
@@ -40,8 +35,7 @@ SETTLING = 5.0
 FRICTION_DRIFT, BULK_DRIFT, NOISE_DRIFT = (0.04, 0.08), (0.03, 0.03), (0.04, 0.04)
 #: Length of the run that a leak is sized on [s]; the mean over the test itself differs from it by 0.2 % at most.
 _SIZING = 30.0
-_NO_LEAK_SEED, _DRIFT_SEED = 1000, 2000
-_DRAWS, _QUICK_DRAWS = 2, 1
+_DRIFT_SEED = 2000
 #: RMS without and with what happened at half time, by chamber and quantity.
 Pairs = Mapping[str, Mapping[str, tuple[float, ...]]]
 
@@ -138,14 +132,18 @@ def _recorded(experiment: Experiment, path: Trajectory) -> Recording:
     return record(experiment.rig, path, volts, oversampling(experiment), experiment.seed)
 
 
-def _still(group: tuple[str, float], duration: float) -> Trajectory:
-    """Simulate an operating condition without a leak."""
+def _leak_free_paths(duration: float) -> Callable[[Condition], Trajectory]:
+    """Return what simulates an operating condition without a leak, each once for this call: a path is large."""
     from sealscope.simulation.integrate import trajectory
 
-    return trajectory(_experiment(Condition(0, *group, 0.0, ""), duration), ())
+    @cache
+    def path(command: str, closed_pct: float) -> Trajectory:
+        return trajectory(_experiment(Condition(0, command, closed_pct, 0.0, ""), duration), ())
+
+    return lambda condition: path(*condition.group)
 
 
-def with_leak(quick: bool = False) -> Iterator[SimulatedTest]:
+def with_leak(half: float, quick: bool) -> Iterator[SimulatedTest]:
     """Simulate the tests as they were: the leak opens at half time.
 
     The first test of each condition is proved by halving the step, except in a quick reproduction.
@@ -154,7 +152,6 @@ def with_leak(quick: bool = False) -> Iterator[SimulatedTest]:
     from sealscope.simulation.simulate import prove, simulate_with_truth
     from sealscope.simulation.sizing import sized_leaks
 
-    half = QUICK_HALF if quick else HALF
     proved: set[tuple[str, float]] = set()
     for condition in APPENDIX_C:
         leak = f"{condition.mean_leak_lpm:g} L/min from {SETTLING:g} s"
@@ -166,44 +163,40 @@ def with_leak(quick: bool = False) -> Iterator[SimulatedTest]:
         if not quick and condition.group not in proved:
             proved.add(condition.group)
             resolved = prove(replace(experiment, allow_unresolved=True)).resolved
-        rms = detail_rms(simulated.recording, ((SETTLING, half), (half, 2 * half)))
-        ranges = _range_MPa(simulated.truth.t, simulated.truth.outputs, half)
-        yield SimulatedTest(condition, rms, simulated.truth.mean_leak_lpm, ranges, resolved, "leak opened")
+        rms, truth = detail_rms(simulated.recording, ((SETTLING, half), (half, 2 * half))), simulated.truth
+        ranges = _range_MPa(truth.t, truth.outputs, half)
+        yield SimulatedTest(condition, rms, truth.mean_leak_lpm, ranges, resolved, "leak opened")
 
 
-def without_leak(quick: bool = False) -> Iterator[SimulatedTest]:
+def without_leak(half: float, quick: bool) -> Iterator[SimulatedTest]:
     """Simulate the same tests with no leak: nothing happens at half time; the noise alone differs."""
-    still = cache(_still)  # for this call alone: a path is large
-    half = QUICK_HALF if quick else HALF
+    paths = _leak_free_paths(2 * half)
     for condition in APPENDIX_C:
-        experiment = _experiment(condition, 2 * half, seed=_NO_LEAK_SEED + condition.number)
-        path = still(condition.group, 2 * half)
+        path, experiment = paths(condition), _experiment(condition, 2 * half, seed=1000 + condition.number)
         rms = detail_rms(_recorded(experiment, path), ((SETTLING, half), (half, 2 * half)))
         yield SimulatedTest(condition, rms, 0.0, _range_MPa(path.t, path, half), None, "nothing")
 
 
-def with_drift(quick: bool = False) -> Iterator[SimulatedTest]:
+def with_drift(half: float, quick: bool) -> Iterator[SimulatedTest]:
     """Simulate the same tests with no leak on a rig that drifts.
 
-    The second half comes from a rig with other friction, bulk modulus and noise (`draw_rig_drift`), several draws of
-    each test.
+    The second half comes from a rig with other friction, bulk modulus and noise (`draw_rig_drift`), two draws of each
+    test, one where it is `quick`.
     """
     from sealscope.simulation.integrate import trajectory
 
-    still = cache(_still)
-    length = SETTLING + (QUICK_HALF if quick else HALF)
-    part = ((SETTLING, length),)
-    for draw in range(_QUICK_DRAWS if quick else _DRAWS):
-        for condition in APPENDIX_C:
-            first = _experiment(condition, length, seed=_DRIFT_SEED + 100 * draw + condition.number)
-            path, drift = still(condition.group, length), draw_rig_drift(condition.number, draw)
-            rig = first.rig.with_overrides(drift.values(first.rig), source="drifted")
-            second = replace(first, rig=rig, seed=first.seed + 50_000)
-            before = detail_rms(_recorded(first, path), part)
-            after = detail_rms(_recorded(second, trajectory(second, ())), part)
-            rms = {c: {name: (*before[c][name], *after[c][name]) for name in QUANTITIES} for c in CHAMBERS}
-            happened = f"friction x {drift.friction:.3f}, K x {drift.bulk:.3f}, noise x {drift.noise:.3f}"
-            yield SimulatedTest(condition, rms, 0.0, _range_MPa(path.t, path, length), None, happened)
+    length = SETTLING + half
+    paths, part = _leak_free_paths(length), ((SETTLING, length),)
+    for draw, condition in itertools.product(range(1 if quick else 2), APPENDIX_C):
+        first = _experiment(condition, length, seed=_DRIFT_SEED + 100 * draw + condition.number)
+        path, drift = paths(condition), draw_rig_drift(condition.number, draw)
+        rig = first.rig.with_overrides(drift.values(first.rig), source="drifted")
+        second = replace(first, rig=rig, seed=first.seed + 50_000)
+        before = detail_rms(_recorded(first, path), part)
+        after = detail_rms(_recorded(second, trajectory(second, ())), part)
+        rms = {c: {name: (*before[c][name], *after[c][name]) for name in QUANTITIES} for c in CHAMBERS}
+        happened = f"friction x {drift.friction:.3f}, K x {drift.bulk:.3f}, noise x {drift.noise:.3f}"
+        yield SimulatedTest(condition, rms, 0.0, _range_MPa(path.t, path, length), None, happened)
 
 
 #: Chamber, quantity, half and head of the RMS columns.
@@ -237,7 +230,47 @@ def column(table: ThesisTable, head: str) -> Array:
 
 def sheet_of(table: ThesisTable) -> DataSheet:
     """Read the RMS columns of a table made by `table_of` as a sheet, in the table's order of rows."""
-    columns = {(chamber, name, k): column(table, head) for chamber, name, k, head in _RMS_COLUMNS}
-    return DataSheet(
-        {c: {q: np.column_stack([columns[c, q, 0], columns[c, q, 1]]) for q in QUANTITIES} for c in CHAMBERS}
+    values = np.array([column(table, head) for *_, head in _RMS_COLUMNS]).reshape(len(CHAMBERS), len(QUANTITIES), 2, -1)
+    return DataSheet({c: {q: values[k, j].T for j, q in enumerate(QUANTITIES)} for k, c in enumerate(CHAMBERS)})
+
+
+def runs_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
+    """Tabulate the 41 tests with their leak from half time on, with nothing happening there, or with a drift."""
+    half, name = QUICK_HALF if context.quick else HALF, item.inputs["runs"]
+    simulate, notes = _RUNS[name]
+    proof = (
+        "No run is proved (quick)." if context.quick else "One test of each condition is proved by halving the step."
     )
+    parts = {"friction": FRICTION_DRIFT, "bulk": BULK_DRIFT, "noise": NOISE_DRIFT}
+    bounds = {part: f"{100 * low:g} to {100 * high:g} %" for part, (low, high) in parts.items()}
+    where = f"Rig {BENCH_RIG}, {half:g} s a half{' (quick)' if context.quick else ''}, the first 5 s left out"
+    notes = f"{where}; RMS in psi, the unit the sheet is taken to be in. {notes.format(proof=proof, **bounds)}"
+    return (table_of(list(simulate(half, context.quick)), item.id, item.title, notes),)
+
+
+_RUNS: dict[str, tuple[Callable[[float, bool], Iterator[SimulatedTest]], str]] = {
+    "leak": (with_leak, "Laminar leak of the test's own mean. {proof}"),
+    "no-leak": (without_leak, 'Nothing leaks: "leak" heads the second half.'),
+    "drift": (
+        with_drift,
+        'Nothing leaks: "leak" heads the second half, from a rig with friction moved {friction}, bulk modulus {bulk}, '
+        "noise {noise}, up or down at random. The sizes are assumed: the scatter of d1 on the thesis's own sheet is "
+        "4 %, the others were not measured.",
+    ),
+}
+
+
+def simulated_sheet(context: Context, runs: str) -> tuple[ThesisTable, DataSheet]:
+    """Return the table of the simulated tests (`leak`, `no-leak` or `drift`), and the sheet in it."""
+    table = first_table(context, f"appendix-c-{runs}")
+    return table, sheet_of(table)
+
+
+_TITLES = {
+    "leak": "The 41 tests of Appendix C simulated with their leak",
+    "no-leak": "The same 41 tests simulated with no leak",
+    "drift": "The same 41 tests simulated with no leak on a rig that drifts",
+}
+ITEMS: tuple[Item, ...] = tuple(
+    Item(f"appendix-c-{name}", 5, "case", title, runs_table, {"runs": name}) for name, title in _TITLES.items()
+)
