@@ -23,8 +23,8 @@ from sealscope.diagnosis.verdict.machine import AssumedMachine, assumed_rig
 from sealscope.errors import InputError
 from sealscope.parameters import Rig
 from sealscope.recordings.chambers import CHAMBERS, chambers_of
-from sealscope.recordings.formats.headings.preamble import stated_oil_temperature
 from sealscope.recordings.joining import start_seconds
+from sealscope.recordings.oil import oil_temperature
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
 
@@ -108,13 +108,6 @@ def _stated(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[str, Any
         return {"basis": BASES[2], "level": Level(ringing, beliefs("trend")["own"]["ringing"])}
     why = dict.fromkeys(reason for reason in (lack, lacks) if reason) or ["the pressures do not ring"]
     return {"problem": "no detector states a level: " + "; ".join(why)}
-
-
-def oil_temperature(recording: Recording) -> float | None:
-    """Return the oil's mean temperature [deg C], else what the file says beside its samples; None where neither is."""
-    if "T_oil" in recording and np.any(known := np.isfinite(recording["T_oil"])):
-        return float(recording["T_oil"][known].mean()) - 273.15
-    return stated_oil_temperature(recording.provenance)
 
 
 def scatter_of(basis: Basis, usual: float) -> DayToDay:

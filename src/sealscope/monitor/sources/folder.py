@@ -18,7 +18,7 @@ from sealscope.monitor.supervisor import DATABASE, PartAway, place_of
 from sealscope.parameters import load_rig
 from sealscope.recordings import Recording, read
 from sealscope.recordings.formats.columns import ChannelMap
-from sealscope.recordings.formats.headings.preamble import stated_oil_temperature
+from sealscope.recordings.oil import oil_temperature
 
 _log = logging.getLogger(__name__)
 #: Names of files that are still being written.
@@ -150,7 +150,6 @@ def _on_the_clock(recording: Recording, written: float) -> Recording:
     last = recording.t[np.isfinite(recording.t)]
     shift = written - float(last[-1]) if last.size else 0.0
     channels, units = dict(recording.channels), dict(recording.units)
-    celsius = stated_oil_temperature(recording.provenance)
-    if "T_oil" not in channels and celsius is not None:
+    if "T_oil" not in channels and (celsius := oil_temperature(recording)) is not None:
         channels["T_oil"], units["T_oil"] = np.full(len(recording), celsius + 273.15), "K"
     return Recording(recording.t + shift, channels, units, recording.rate)
