@@ -49,7 +49,7 @@ def timed(runs: list[Experiment], threads: int) -> tuple[float, float]:
 
 def same_run(case: Case, program: Path, step: float) -> float:
     """Rms difference [Pa] in p_A of the C++ program from the run that the batch is tested against, over 5 s."""
-    one = experiments(case, 1, 5.0, step)[0]
+    one = replace(experiments(case, 1, 5.0, step)[0], allow_unresolved=True)  # its details are not measured here
     ours = simulate_with_truth(one).truth.outputs["p_A"]
     difference = rms(theirs(program, case, step, 5.0)()[1][:, 1] - ours)
     if not difference < 1.0:

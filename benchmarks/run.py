@@ -39,8 +39,13 @@ def main() -> None:
     if chosen.quick:
         variants += ["--rounds", "1", "--runs", "8", "--duration", "20"]
     print(f"{platform.machine()}, {platform.python_implementation()} {platform.python_version()}", flush=True)
-    for words in (solvers, batch, variants):
-        subprocess.run([sys.executable, str(HERE / words[0]), *words[1:]], check=True)
+    failed = [
+        words[0]
+        for words in (solvers, batch, variants)
+        if subprocess.run([sys.executable, str(HERE / words[0]), *words[1:]], check=False).returncode
+    ]
+    if failed:
+        raise SystemExit(f"these ended in an error: {', '.join(failed)}")
 
 
 if __name__ == "__main__":

@@ -77,10 +77,10 @@ TUTORIALS = [*sorted((ROOT / "docs" / "tutorials").glob("*.md")), ROOT / "docs" 
 
 
 @pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
-def test_a_tutorial_can_be_followed_from_what_is_shown(path):
+def test_a_tutorial_shows_all_that_it_needs(path):
     """It says what to install, shows its cells, and removes only what keeps the site's build in a folder of its own."""
     text = path.read_text(encoding="utf-8")
-    needed = re.search(r"\*To follow: `pip install '?sealscope(?:\[(\w+)\])?'?`", text)
+    needed = re.search(r"\*You need: Sealscope(?: with the extra `(\w+)`)? \(\[install\]\(", text)
     assert needed
     run = "".join(cell for _, cell in cells(path))
     assert (needed[1] == "report") == ("matplotlib" in run)

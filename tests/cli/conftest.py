@@ -32,9 +32,9 @@ class Call:
     @property
     def objects(self) -> list[dict[str, Any]]:
         """Standard output read as one JSON object a line; fails on anything else."""
-        found = [json.loads(line) for line in self.out.splitlines()]
-        assert all(isinstance(one, dict) for one in found)
-        return found
+        result = [json.loads(line) for line in self.out.splitlines()]
+        assert all(isinstance(item, dict) for item in result)
+        return result
 
     def refused(self, status: int = 2) -> str:
         """The one line of complaint of a call that must end with `status`, without its prefix."""

@@ -98,7 +98,7 @@ def test_each_bad_file_among_good_ones_has_its_line(call, recordings, tmp_path, 
     files = [recordings / "healthy_1.nc", *(f"{kind}.csv" for kind in kinds), recordings / "leak.nc"]
     done = call("diagnose", *files, "--format", "jsonl")
     assert done.status == 1
-    assert [one["verdict"] for one in done.objects] == ["no leak", "leak"]
+    assert [item["verdict"] for item in done.objects] == ["no leak", "leak"]
     lines = done.err.splitlines()
     assert len(lines) == len(kinds)
     for kind, line in zip(kinds, lines, strict=True):
@@ -110,12 +110,12 @@ def diagnosed(call, path: Path, *options: str):
     """The one verdict on a file that must be readable."""
     done = call("diagnose", path, "--format", "jsonl", *options)
     assert (done.status, done.err) == (0, "")
-    (found,) = done.objects
-    return found
+    (result,) = done.objects
+    return result
 
 
-def findings(found) -> dict[str, dict]:
-    return {one["code"]: one for one in found["quality"]}
+def findings(result) -> dict[str, dict]:
+    return {item["code"]: item for item in result["quality"]}
 
 
 def test_runs_of_nan_are_named_and_what_is_whole_is_analysed(call, tmp_path):
@@ -123,22 +123,22 @@ def test_runs_of_nan_are_named_and_what_is_whole_is_analysed(call, tmp_path):
     p_A[2000:2400] = np.nan
     p_A[28_000] = np.nan
     (tmp_path / "log.csv").write_text(HEAD + rows(t, p_A, p_B))
-    found = diagnosed(call, tmp_path / "log.csv")
-    quality = findings(found)
+    result = diagnosed(call, tmp_path / "log.csv")
+    quality = findings(result)
     assert (quality["missing"]["channel"], quality["missing"]["count"]) == ("p_A", 401)
     assert quality["missing"]["first_t"] == pytest.approx(4.0)
     assert quality["gaps_bridged"]["count"] == 401
-    assert found["verdict"] != "leak"
+    assert result["verdict"] != "leak"
 
 
 def test_of_a_recording_that_is_cut_in_two_the_rest_may_hide_a_leak(call, tmp_path):
     t, p_A, p_B = pressures(30_000)
     p_A[20_000:24_000] = np.nan
     (tmp_path / "log.csv").write_text(HEAD + rows(t, p_A, p_B))
-    found = diagnosed(call, tmp_path / "log.csv")
-    assert findings(found)["part_analysed"]["count"] == 10_000
-    assert found["verdict"] == "cannot tell"
-    assert found["evidence"]["share"] == pytest.approx(2 / 3, abs=0.02)
+    result = diagnosed(call, tmp_path / "log.csv")
+    assert findings(result)["part_analysed"]["count"] == 10_000
+    assert result["verdict"] == "cannot tell"
+    assert result["evidence"]["share"] == pytest.approx(2 / 3, abs=0.02)
 
 
 @pytest.mark.parametrize("whole", [0, 1, 5, 100])
@@ -146,29 +146,29 @@ def test_hardly_any_number_between_the_nans(call, tmp_path, whole):
     t, p_A, p_B = pressures(3000)
     p_A[whole:] = np.nan
     (tmp_path / "log.csv").write_text(HEAD + rows(t, p_A, p_B))
-    found = diagnosed(call, tmp_path / "log.csv")
-    assert found["verdict"] == "cannot tell"
-    assert findings(found)["missing"]["count"] == 3000 - whole
+    result = diagnosed(call, tmp_path / "log.csv")
+    assert result["verdict"] == "cannot tell"
+    assert findings(result)["missing"]["count"] == 3000 - whole
 
 
 def test_time_that_goes_back_for_a_while_is_named(call, tmp_path):
     t, p_A, p_B = pressures(30_000)
     t[2000:2050] = t[2000:2050][::-1].copy()
     (tmp_path / "log.csv").write_text(HEAD + rows(t, p_A, p_B))
-    found = diagnosed(call, tmp_path / "log.csv")
-    quality = findings(found)
+    result = diagnosed(call, tmp_path / "log.csv")
+    quality = findings(result)
     assert quality["reversed_time"]["count"] == 49
     assert quality["part_analysed"]["count"] >= 2050
-    assert found["verdict"] in ("no leak", "cannot tell")
+    assert result["verdict"] in ("no leak", "cannot tell")
 
 
 @pytest.mark.parametrize("samples", [2, 30, 230])
 def test_a_file_of_few_samples_gets_the_verdict_that_it_is_too_short(call, tmp_path, samples):
     (tmp_path / "log.csv").write_text(HEAD + rows(*pressures(samples)))
-    found = diagnosed(call, tmp_path / "log.csv")
-    assert found["verdict"] == "cannot tell"
-    assert str(samples) in found["reason"] or "too short" in found["reason"]
-    assert found["score"] is None
+    result = diagnosed(call, tmp_path / "log.csv")
+    assert result["verdict"] == "cannot tell"
+    assert str(samples) in result["reason"] or "too short" in result["reason"]
+    assert result["score"] is None
     report = call("report", tmp_path / "log.csv", "-o", tmp_path / "page.html")
     assert report.status == 0
     assert "cannot tell" in (tmp_path / "page.html").read_text(encoding="utf-8").lower()
@@ -182,9 +182,9 @@ def test_one_column_with_a_rate_is_a_recording(call, tmp_path):
 def test_channels_that_say_nothing_about_the_piston(call, tmp_path):
     t, p_A, p_B = pressures(2000)
     (tmp_path / "log.csv").write_text(HEAD.replace("p_A", "p_1").replace("p_B", "p_2") + rows(t, p_A, p_B))
-    found = diagnosed(call, tmp_path / "log.csv")
-    assert found["verdict"] == "cannot tell"
-    assert "p_A or p_B" in found["reason"]
+    result = diagnosed(call, tmp_path / "log.csv")
+    assert result["verdict"] == "cannot tell"
+    assert "p_A or p_B" in result["reason"]
 
 
 def test_a_name_with_a_line_break_is_still_one_line(call, tmp_path):

@@ -42,9 +42,9 @@ def test_the_recording_is_a_recording_that_does_not_know_the_truth(first, folder
     recording = sealscope.read(folder / "first" / "recording.nc")
     assert recording.duration == 60.0
     assert "leak" not in str(dict(recording.provenance)).lower()
-    found = sealscope.load_machine(folder / "first" / "machine.toml").diagnose(recording)
-    assert found.verdict == "leak"
-    assert abs(found.onset_s - 30.0) <= 10.0
+    result = sealscope.load_machine(folder / "first" / "machine.toml").diagnose(recording)
+    assert result.verdict == "leak"
+    assert abs(result.onset_s - 30.0) <= 10.0
 
 
 def test_the_page_needs_nothing_from_outside(first, folder):
@@ -72,9 +72,9 @@ def test_another_seed_is_another_recording_with_the_same_verdict(first, folder, 
     other = call("demo", "-o", folder / "other", "--seed", 2)
     assert other.status == 0
     assert "recording.nc: leak" in other.out.splitlines()
-    one, two = (sealscope.read(folder / name / "recording.nc") for name in ("first", "other"))
-    assert (one["p_A"] != two["p_A"]).any()
-    assert (one["u"] == two["u"]).mean() > 0.9
+    item, two = (sealscope.read(folder / name / "recording.nc") for name in ("first", "other"))
+    assert (item["p_A"] != two["p_A"]).any()
+    assert (item["u"] == two["u"]).mean() > 0.9
 
 
 def test_a_folder_that_cannot_be_one_is_refused_before_the_work(call, untouched, tmp_path, monkeypatch):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -60,7 +60,7 @@ def test_a_recording_is_whole_or_absent(size: int, suffix: str, shell, call, rec
     if suffix == "nc" and size == 5000:
         limit = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({size}, {size}))"
         code = f"{limit}; import sys, sealscope.cli; sys.argv[0] = 'sealscope'; sealscope.cli.main()"
-        done = shell(shutil.which("python") or "python", "-c", code, *words)
+        done = shell(sys.executable, "-c", code, *words)
     else:
         with room(size):
             done = call(*words)

@@ -1,4 +1,4 @@
-"""A folder copied from a stranger holds a module of each name that a program of ours imports: none of them runs."""
+"""A folder from outside holds a module of each name that a program of ours imports: none of them runs."""
 
 from __future__ import annotations
 

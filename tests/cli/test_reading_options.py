@@ -32,10 +32,10 @@ def piped(monkeypatch):
 def test_standard_input_is_read_by_its_content(call, piped, recordings):
     file = recordings / "healthy_1.nc"
     piped(file.read_bytes())
-    (found,) = call("diagnose", "-", "--format", "jsonl").objects
+    (result,) = call("diagnose", "-", "--format", "jsonl").objects
     (known,) = call("diagnose", file, "--format", "jsonl").objects
-    assert found.pop("file") == "-"
-    assert found.items() <= known.items()
+    assert result.pop("file") == "-"
+    assert result.items() <= known.items()
     piped(LOG.encode())
     assert call("inspect", "-", *MAP).out.startswith("-: text, comma separated")
     piped(LOG.encode())
@@ -54,7 +54,7 @@ def test_a_map_is_kept_beside_the_rig_and_used_again(call, tmp_path):
     log.write_text(LOG)
     rig.write_text(RIG)
     assert "be given a map" in call("diagnose", log, "--rig", rig).refused(1)
-    assert f"map kept in {rig}" in call("inspect", log, "--rig", rig, *MAP, "--save-map").out
+    assert f"map saved in {rig}" in call("inspect", log, "--rig", rig, *MAP, "--save-map").out
     assert rig.read_text().startswith(RIG)
     assert load_rig(rig).channel_map == {"t": "Zeit[s]", "p_A": "Druck1[bar]", "p_B": "Druck2[bar]"}
     (by_rig,) = call("diagnose", log, "--rig", rig, "--format", "jsonl").objects
@@ -71,7 +71,7 @@ def test_the_map_that_names_tell_is_kept(call, tmp_path):
     log, rig = tmp_path / "log.csv", tmp_path / "press.toml"
     log.write_text("Zeit [s],PA_bar,Druck B [bar],Weg\ns,,,mm\n" + LOG.split("\n", 1)[1].replace("\n", ",0\n"))
     rig.write_text(RIG)
-    assert f"map kept in {rig}" in call("inspect", log, "--rig", rig, "--map", "auto", "--save-map").out
+    assert f"map saved in {rig}" in call("inspect", log, "--rig", rig, "--map", "auto", "--save-map").out
     assert load_rig(rig).channel_map["p_A"] == "PA_bar[bar]"
     assert load_rig(rig).channel_map["p_B"] == "Druck B [bar]"
     words = ("diagnose", log, "--format", "jsonl", "--rig")
@@ -80,7 +80,7 @@ def test_the_map_that_names_tell_is_kept(call, tmp_path):
     assert kept == auto
     own = tmp_path / "own.csv"
     assert call("convert", log, own, "--map", "auto").status == 0
-    assert "must have a map to keep" in call("inspect", own, "--rig", rig, "--map", "auto", "--save-map").refused(2)
+    assert "must have a map to save" in call("inspect", own, "--rig", rig, "--map", "auto", "--save-map").refused(2)
 
 
 def test_another_map_takes_the_place_of_the_first(tmp_path):
@@ -121,11 +121,11 @@ def test_where_no_map_can_be_kept(call, tmp_path):
 
 def test_area_displacement_and_limit_are_options(call, recordings):
     words = ("diagnose", recordings / "leak.nc", "--format", "jsonl")
-    (found,) = call(*words, "--area", "10 cm^2", "--area", "12 cm^2", "--displacement", "8 cm^3/rev", "--limit",
+    (result,) = call(*words, "--area", "10 cm^2", "--area", "12 cm^2", "--displacement", "8 cm^3/rev", "--limit",
                     "1 mL/min").objects  # fmt: skip
-    assert found["rig"]["area_m2"] == pytest.approx(11e-4)
-    assert found["rig"]["displacement_m3_per_rev"] == pytest.approx(8e-6)
-    assert found["limit"]["mL_per_min"] == pytest.approx(1.0)
+    assert result["rig"]["area_m2"] == pytest.approx(11e-4)
+    assert result["rig"]["displacement_m3_per_rev"] == pytest.approx(8e-6)
+    assert result["limit"]["mL_per_min"] == pytest.approx(1.0)
     assert "area" in call(*words, "--area", "10 bar").refused(2)
     assert "given once, or twice" in call(*words, *("--area", "1 cm^2") * 3).refused(2)
     assert "displacement" in call(*words, "--displacement", "3 m").refused(2)

@@ -17,8 +17,8 @@ SIZES = ("--stroke", "400", "--displacement", "6")
 def test_the_packaged_rigs_are_listed_with_their_titles(call):
     done = call("rigs")
     assert (done.status, done.err) == (0, "")
-    assert [line.split()[0] for line in done.out.splitlines()] == list(rig_names())
-    assert all(load_rig(name).title in done.out for name in rig_names())
+    assert [line.split()[0] for line in done.out.splitlines() if line[0] != " "] == list(rig_names())
+    assert all(load_rig(name).title in " ".join(done.out.split()) for name in rig_names())
 
 
 @pytest.mark.parametrize("areas", [("500", "500"), ("12.5 cm^2", "9.4[cm^2]"), ("700", "900")], ids="{0[0]}".format)
@@ -74,7 +74,7 @@ def test_a_file_that_exists_is_kept(call, tmp_path):
 def test_margins_of_a_loop_are_printed(call):
     done = call("rigs", "margins", "thesis-closed-loop", "--controller", "pi")
     assert (done.status, done.err) == (0, "")
-    rows = [line.split() for line in done.out.splitlines()[2:]]
+    rows = [line.split() for line in done.out.splitlines()[2:] if "damped" not in line]
     assert [float(row[0]) for row in rows] == [0.0, 0.01, 0.02, 0.05]
     assert all(float(row[1]) > 6.0 and float(row[2]) > 45.0 for row in rows)
     assert "controller must be one of pi" in call("rigs", "margins", "--controller", "pid").refused()

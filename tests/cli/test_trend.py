@@ -27,9 +27,9 @@ def days(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_folder_becomes_a_few_lines(call, days: Path) -> None:
-    told = call("trend", days, "--healthy", 3)
-    lines = told.out.splitlines()
-    assert told.status == 0 and told.err == ""
+    done = call("trend", days, "--healthy", 3)
+    lines = done.out.splitlines()
+    assert done.status == 0 and done.err == ""
     assert lines[0] == "leak since 2024-05-06: 8 recordings, 2024-05-01 to 2024-05-08"
     rows = [line.split()[0] for line in lines[1:] if line[2] != " "]
     assert rows == ["now", "healthy", "growth", "limit", "event", "next"] and max(map(len, lines)) <= 80
@@ -61,11 +61,11 @@ def test_what_sealscope_wrote_into_the_folder_is_skipped_and_dates_are_enough(ca
     assert "clock" not in once.out and "not before 0" not in once.out
 
 
-def test_a_bad_file_is_named_and_the_others_are_followed(call, days: Path, tmp_path: Path) -> None:
+def test_a_bad_file_is_named_and_the_others_are_in_the_trend(call, days: Path, tmp_path: Path) -> None:
     bad = tmp_path / "bad.csv"
     bad.write_text("nothing")
-    told = call("trend", days, bad)
-    assert told.status == 1 and "bad.csv" in told.err and told.out.startswith("leak since 2024-05-06: 8 recordings")
+    done = call("trend", days, bad)
+    assert done.status == 1 and "bad.csv" in done.err and done.out.startswith("leak since 2024-05-06: 8 recordings")
 
 
 def test_files_without_a_time_ask_for_every(call, days: Path, tmp_path: Path) -> None:
@@ -74,8 +74,8 @@ def test_files_without_a_time_ask_for_every(call, days: Path, tmp_path: Path) ->
         ss.write(own, tmp_path / f"run_{k}.nc")
     complaint = call("trend", tmp_path).refused()
     assert "--every 1d" in complaint and "run_1.nc" in complaint
-    told = call("trend", tmp_path, "--every", "1d")
-    assert told.status == 0 and "day 0 to day 2" in told.out
+    done = call("trend", tmp_path, "--every", "1d")
+    assert done.status == 0 and "day 0 to day 2" in done.out
 
 
 @pytest.mark.parametrize(
@@ -96,7 +96,7 @@ def test_wrong_options_are_refused_in_a_line(call, days: Path, words: tuple[str,
 def test_diagnose_offers_the_trend_of_days_and_of_nothing_else(call, days: Path) -> None:
     files = [days / f"day_{k}.nc" for k in (1, 2, 3)]
     assert call("diagnose", *files).err == (
-        "sealscope: these 3 files follow one another in time: `sealscope trend` shows how the leakage went\n"
+        "sealscope: these 3 files are ordered in time: `sealscope trend` shows how the leakage went\n"
     )
     assert call("diagnose", *files[:2]).err == ""
     assert call("diagnose", *files, "--format", "jsonl").err == ""

@@ -200,8 +200,8 @@ def test_faulty_data_are_drawn_and_named_not_refused(recording, make_diagnosis):
     assert "time stamps are out of order" in read.text and "samples are left out" in read.text
     line = drawn(next(c for c in chart_data(read)["charts"] if c["key"] == "p_AB-0")["series"][0])
     assert np.isnan(line).any() and not any(c["key"] == "x-0" for c in chart_data(read)["charts"])
-    one = replace(recording, t=[0.0], channels={"p_A": [3e5]}, units={"p_A": "Pa"})
-    Reader(render_page(one, make_diagnosis()))
+    item = replace(recording, t=[0.0], channels={"p_A": [3e5]}, units={"p_A": "Pa"})
+    Reader(render_page(item, make_diagnosis()))
     with pytest.raises(InputError, match="at least 1 sample"):
         render_page(recording.between(-2, -1), make_diagnosis())
 
@@ -357,14 +357,14 @@ def course(**changed):
 
 
 def test_the_leak_is_drawn_over_time_with_its_band(recording, make_diagnosis):
-    found = course()
-    page = render_page(recording, make_diagnosis(course=found))
-    chart = next(one for one in chart_data(Reader(page))["charts"] if one["key"] == "course")
+    result = course()
+    page = render_page(recording, make_diagnosis(course=result))
+    chart = next(item for item in chart_data(Reader(page))["charts"] if item["key"] == "course")
     assert (chart["unit"], chart["band"]) == ("L/min", True)
-    for series, values in zip(chart["series"], (found.lpm, found.low, found.high), strict=True):
+    for series, values in zip(chart["series"], (result.lpm, result.low, result.high), strict=True):
         assert drawn(series) == pytest.approx(values, abs=1e-6)
     (band,) = re.findall(r'<path class="interval" d="([^"]*)"', page)
-    assert len(re.findall("[ML]", band)) == 2 * found.t.size
+    assert len(re.findall("[ML]", band)) == 2 * result.t.size
     assert band.endswith("Z")
     (still,) = re.findall(r'data-chart="course".*?</svg>', page, re.DOTALL)
     assert still.index('class="interval"') < still.index('class="line a"')  # the estimate above its interval
@@ -375,7 +375,7 @@ def test_one_wide_interval_does_not_press_the_curve_flat(recording, make_diagnos
     wide = course()
     wide.low[0], wide.high[0] = -5.0, 5.0
     page = render_page(recording, make_diagnosis(course=wide))
-    chart = next(one for one in chart_data(Reader(page))["charts"] if one["key"] == "course")
+    chart = next(item for item in chart_data(Reader(page))["charts"] if item["key"] == "course")
     low, high = chart["limits"]
     assert low < -0.0005 and 0.004 < high < 0.01
     assert "95 % interval, cut at the frame" in page

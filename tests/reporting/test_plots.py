@@ -56,14 +56,14 @@ def png_size(png: bytes) -> tuple[int, int]:
 
 def test_a_figure_carries_number_units_legend_and_mark_as_text() -> None:
     svg, png = draw(figure())
-    found = texts(svg)
+    result = texts(svg)
     for words in ("t [s]", "curve 0", "curve 1", "leak opens"):
-        assert words in found
-    assert "".join(found.split()).count("pA") == 2  # symbols are set letter by letter: the y label and the caption
+        assert words in result
+    assert "".join(result.split()).count("pA") == 2  # symbols are set letter by letter: the y label and the caption
     assert ET.fromstring(svg).findtext("{http://www.w3.org/2000/svg}title") == (
         "Fig. 4.22. Pressures in the chambers, p_A and p_B"
     )
-    assert UNRESOLVED.upper() not in found
+    assert UNRESOLVED.upper() not in result
     assert png_size(png)[0] == 1440
 
 

@@ -60,15 +60,15 @@ def test_no_leak_says_how_large_one_could_be(make_diagnosis):
     assert messages.how_much(make_diagnosis(**bound)) == "none found; at most 0.0001 L/min (95 % interval)"
 
 
-def test_another_cause_is_told_with_what_to_check(make_diagnosis):
+def test_a_different_cause_is_stated_with_what_to_check(make_diagnosis):
     check = state_of("no change", "friction change").action
-    found = make_diagnosis(
+    result = make_diagnosis(
         verdict="no leak", score=1.5, onset_s=None, leak_lpm=None, cause="friction change", quality=()
     )
-    text = " ".join(diagnosis_text(found).split())
+    text = " ".join(diagnosis_text(result).split())
     assert "cause friction change" in text
     assert f"next {check}" in text
-    assert messages.headline(found) == "Friction change (no leak across the piston)"
+    assert messages.headline(result) == "Friction change (no leak across the piston)"
     leak = make_diagnosis(cause="piston leak", quality=())
     assert messages.headline(leak) == "Leak: oil bypasses the piston"
     assert messages.next_steps(leak)[0] == state_of("leak", "piston leak").action

@@ -36,18 +36,18 @@ def slow_details(x, wavelet, levels):
 @pytest.mark.parametrize(("wavelet", "levels"), [("db8", 4), ("db3", 3), ("haar", 2), ("sym5", 1)])
 def test_stationary_is_the_formula(wavelet, levels):
     x = np.random.default_rng(1).normal(size=256)
-    found = details(x, wavelet=wavelet, levels=levels, edge="periodic")
+    result = details(x, wavelet=wavelet, levels=levels, edge="periodic")
     values, approximation = slow_details(x, wavelet, levels)
-    np.testing.assert_allclose(found.values, values, atol=1e-13)
-    np.testing.assert_allclose(found.approximation, approximation, atol=1e-13)
+    np.testing.assert_allclose(result.values, values, atol=1e-13)
+    np.testing.assert_allclose(result.approximation, approximation, atol=1e-13)
 
 
 @settings(deadline=None, max_examples=40)
 @given(blocks=st.integers(8, 40), levels=st.integers(1, 4), seed=st.integers(0, 2**32 - 1))
 def test_stationary_details_and_approximation_give_the_signal_back(blocks, levels, seed):
     x = np.random.default_rng(seed).normal(size=blocks * 32) * 1e5 + 3e5
-    found = details(x, levels=levels, edge="periodic")
-    coefficients = [found.approximation, *(found[level] for level in range(levels, 0, -1))]
+    result = details(x, levels=levels, edge="periodic")
+    coefficients = [result.approximation, *(result[level] for level in range(levels, 0, -1))]
     np.testing.assert_allclose(pywt.iswt(coefficients, "db8", norm=False), x, rtol=1e-9)
 
 
@@ -55,20 +55,20 @@ def test_stationary_details_and_approximation_give_the_signal_back(blocks, level
 @given(n=st.integers(451, 900), levels=st.integers(1, 4), edge=st.sampled_from(EDGES), seed=st.integers(0, 2**32 - 1))
 def test_reconstructed_details_and_approximation_sum_up_to_the_signal(n, levels, edge, seed):
     x = np.random.default_rng(seed).normal(size=n)
-    found = details(x, levels=levels, transform="reconstructed", edge=edge)
-    np.testing.assert_allclose(found.values.sum(axis=0) + found.approximation, x, atol=1e-9)
+    result = details(x, levels=levels, transform="reconstructed", edge=edge)
+    np.testing.assert_allclose(result.values.sum(axis=0) + result.approximation, x, atol=1e-9)
 
 
 def test_white_noise_has_its_sigma_in_every_level_but_not_when_reconstructed():
     sigma, n = 1.23, 200_000
     x = np.random.default_rng(2).normal(scale=sigma, size=n)
     for transform in ("stationary", "decimated"):
-        found = details(x, transform=transform)
+        result = details(x, transform=transform)
         for level, within in zip((1, 2, 3, 4), (0.01, 0.015, 0.02, 0.03), strict=True):
-            assert rms(found[level][found.inside()]) == pytest.approx(sigma, rel=within), (transform, level)
-    found = details(x, transform="reconstructed")
-    assert rms(found[1]) == pytest.approx(sigma / np.sqrt(2), rel=0.01)
-    assert rms(found[2]) / rms(found[1]) == pytest.approx(0.71, abs=0.01)
+            assert rms(result[level][result.inside()]) == pytest.approx(sigma, rel=within), (transform, level)
+    result = details(x, transform="reconstructed")
+    assert rms(result[1]) == pytest.approx(sigma / np.sqrt(2), rel=0.01)
+    assert rms(result[2]) / rms(result[1]) == pytest.approx(0.71, abs=0.01)
 
 
 def test_each_level_has_unit_norm_exactly():
@@ -81,16 +81,16 @@ def test_each_level_has_unit_norm_exactly():
 @pytest.mark.parametrize("transform", TRANSFORMS)
 def test_the_rigs_70_hz_ringing_falls_into_two_levels(rate, levels, transform):
     t = np.arange(20_000) / rate
-    found = details(np.sin(2 * np.pi * 70.0 * t), transform=transform)
-    energy = (found.values[:, found.inside()] ** 2).mean(axis=1)
+    result = details(np.sin(2 * np.pi * 70.0 * t), transform=transform)
+    energy = (result.values[:, result.inside()] ** 2).mean(axis=1)
     assert sum(energy[level - 1] for level in levels) > 0.95 * energy.sum()
     assert energy.argmax() + 1 == levels[0]
 
 
 def test_a_slow_trend_and_the_charge_pressure_are_invisible():
     t = np.linspace(0.0, 1.0, 5000)
-    found = details(3e5 + 1e5 * t - 4e4 * t**2)
-    assert np.abs(found.values[:, found.inside()]).max() < 1e-7
+    result = details(3e5 + 1e5 * t - 4e4 * t**2)
+    assert np.abs(result.values[:, result.inside()]).max() < 1e-7
 
 
 @pytest.mark.parametrize(
@@ -102,13 +102,13 @@ def test_a_slow_trend_and_the_charge_pressure_are_invisible():
     ],
 )
 def test_where_the_energy_of_an_event_stands_in_each_level(transform, early, within):
-    found = []
+    result = []
     for at in range(700, 716):  # every phase of the deepest level
         x = np.zeros(1500)
         x[at] = 1.0
         power = details(x, transform=transform).values ** 2
-        found.append(at - power @ np.arange(1500) / power.sum(axis=1))
-    np.testing.assert_allclose(np.mean(found, axis=0), early, atol=within)
+        result.append(at - power @ np.arange(1500) / power.sum(axis=1))
+    np.testing.assert_allclose(np.mean(result, axis=0), early, atol=within)
 
 
 def test_decimated_holds_every_second_to_sixteenth_stationary_coefficient():
@@ -141,21 +141,21 @@ def test_the_edges_are_what_the_padding_touches_and_nothing_more(transform, n):
 @pytest.mark.parametrize("n", [226, 300, 511])
 def test_every_edge_and_odd_lengths_keep_the_length(edge, n):
     x = np.random.default_rng(5).normal(size=n)
-    found = details(x, edge=edge)
-    assert found.values.shape == (4, n)
-    assert found.approximation.shape == (n,)
-    assert len(found) == n
+    result = details(x, edge=edge)
+    assert result.values.shape == (4, n)
+    assert result.approximation.shape == (n,)
+    assert len(result) == n
     reference = details(np.concatenate([np.zeros(300), x, np.zeros(300)]))
-    inside = found.inside()
-    np.testing.assert_allclose(found[4][inside], reference[4][300 : 300 + n][inside], atol=1e-12)
+    inside = result.inside()
+    np.testing.assert_allclose(result[4][inside], reference[4][300 : 300 + n][inside], atol=1e-12)
 
 
 def test_product_is_the_sample_product():
-    found = details(np.random.default_rng(6).normal(size=500))
-    assert np.array_equal(found.product(3, 4), found.values[2] * found.values[3])
-    assert np.array_equal(found.product(), found[3] * found[4])
-    assert found.inside(1) == slice(7, 492)
-    assert found.inside(3, 4) == found.inside() == slice(105, 380)
+    result = details(np.random.default_rng(6).normal(size=500))
+    assert np.array_equal(result.product(3, 4), result.values[2] * result.values[3])
+    assert np.array_equal(result.product(), result[3] * result[4])
+    assert result.inside(1) == slice(7, 492)
+    assert result.inside(3, 4) == result.inside() == slice(105, 380)
 
 
 def test_counts_are_taken_as_numbers():
@@ -166,8 +166,8 @@ def test_counts_are_taken_as_numbers():
 @pytest.mark.parametrize("transform", TRANSFORMS)
 def test_the_shortest_signal_leaves_one_sample_inside(transform):
     n = shortest(transform=transform)
-    found = details(np.ones(n), transform=transform)
-    assert found.inside().stop - found.inside().start == 1
+    result = details(np.ones(n), transform=transform)
+    assert result.inside().stop - result.inside().start == 1
     with pytest.raises(
         InputError, match=f"signal must have at least {n} samples for 4 {transform} levels of db8, got 30"
     ):
@@ -196,6 +196,6 @@ def test_bad_input_is_one_clear_line():
 
 
 def test_details_carries_its_settings():
-    found = details(np.ones(300), wavelet="db4", levels=2, edge="reflect")
-    assert isinstance(found, Details)
-    assert (found.wavelet, found.levels, found.transform, found.edge) == ("db4", 2, "stationary", "reflect")
+    result = details(np.ones(300), wavelet="db4", levels=2, edge="reflect")
+    assert isinstance(result, Details)
+    assert (result.wavelet, result.levels, result.transform, result.edge) == ("db4", 2, "stationary", "reflect")

@@ -18,10 +18,10 @@ def pieces(x, cuts):
 def test_details_are_those_of_the_single_stream(wavelet, levels, actuators):
     x = 3.0 + np.random.default_rng(1).normal(size=(2, actuators, 1100))
     fleet = DetailStream((2, actuators), levels, wavelet=wavelet)
-    found = fleet.update(x)
+    result = fleet.update(x)
     for c in range(2):
         for a in range(actuators):
-            assert np.array_equal(found[c, a], DetailStream(1, levels, wavelet=wavelet).update(x[c, a]))
+            assert np.array_equal(result[c, a], DetailStream(1, levels, wavelet=wavelet).update(x[c, a]))
     single = DetailStream(1, levels, wavelet=wavelet)
     assert (fleet.delay, fleet.first, fleet.settling) == (single.delay, single.first, single.settling)
 

@@ -41,8 +41,8 @@ def split(x, cuts):
 def test_kernel_is_the_plain_loops(wavelet, levels):
     """To rounding: products and sums may be contracted to fused multiply-adds."""
     x = np.random.default_rng(1).normal(size=1500)  # longer than a buffer, so that it wraps
-    found = DetailStream(1, levels, wavelet=wavelet).update(x)
-    np.testing.assert_allclose(found, slow_stream(x, levels, wavelet), rtol=0.0, atol=2e-14)
+    result = DetailStream(1, levels, wavelet=wavelet).update(x)
+    np.testing.assert_allclose(result, slow_stream(x, levels, wavelet), rtol=0.0, atol=2e-14)
 
 
 @settings(deadline=None, max_examples=60)
@@ -81,9 +81,9 @@ def test_one_sample_at_a_time_and_empty_blocks():
 def test_channels_do_not_touch_each_other():
     x = np.random.default_rng(3).normal(size=(7, 1500))
     together = DetailStream(7)
-    found = np.concatenate([together.update(block) for block in split(x, [1, 2, 500, 501, 1200])], axis=-1)
+    result = np.concatenate([together.update(block) for block in split(x, [1, 2, 500, 501, 1200])], axis=-1)
     for channel in range(7):
-        assert np.array_equal(found[channel], DetailStream().update(x[channel]))
+        assert np.array_equal(result[channel], DetailStream().update(x[channel]))
     assert together.update(np.empty((7, 0))).shape == (7, 4, 0)
     assert DetailStream(1).update(x[:1]).shape == (1, 4, 1500)
 
@@ -138,12 +138,12 @@ def test_a_missing_sample_is_forgotten():
     holed = x.copy()
     holed[900] = np.nan
     stream = DetailStream()
-    found, whole = stream.update(holed), DetailStream().update(x)
-    spoiled = np.flatnonzero(np.isnan(found).any(axis=0))
+    result, whole = stream.update(holed), DetailStream().update(x)
+    spoiled = np.flatnonzero(np.isnan(result).any(axis=0))
     assert spoiled[0] >= 900
     assert spoiled[-1] == 900 + stream.settling
-    sound = np.r_[0:900, 900 + stream.settling + 1 : 2000]
-    assert np.array_equal(found[:, sound], whole[:, sound])
+    clean = np.r_[0:900, 900 + stream.settling + 1 : 2000]
+    assert np.array_equal(result[:, clean], whole[:, clean])
 
 
 def test_bad_calls_are_one_clear_line():

@@ -44,10 +44,10 @@ def test_stream_and_batch_have_the_same_bits(n, size, step, cuts, skip, rows, se
     x = np.random.default_rng(seed).normal(size=(*rows, n))
     stream = RmsStream(size, step, skip=skip, first=7)
     ends = [*sorted(min(cut, n) for cut in cuts), n]
-    found = [stream.update(x[..., a:b]) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
+    result = [stream.update(x[..., a:b]) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
     batch = windowed_rms(x[..., skip:], size, step, first=7)
-    assert np.array_equal(np.concatenate([part.ends for part in found]), batch.ends)
-    assert np.array_equal(np.concatenate([part.rms for part in found], axis=-1), batch.rms)
+    assert np.array_equal(np.concatenate([part.ends for part in result]), batch.ends)
+    assert np.array_equal(np.concatenate([part.rms for part in result], axis=-1), batch.rms)
 
 
 @pytest.mark.parametrize(("size", "step"), [(1000, 500), (1000, 1000), (1000, 300), (999, 500), (100, 2000)])
@@ -58,9 +58,9 @@ def test_stream_and_batch_have_the_same_bits_at_the_real_sizes(size, step):
         if block == 1 and size != 1000:
             continue
         stream = RmsStream(size, step)
-        found = [stream.update(x[:, a : a + block]) for a in range(0, 20_000, block)]
-        assert np.array_equal(np.concatenate([part.rms for part in found], axis=-1), batch.rms)
-        assert np.array_equal(np.concatenate([part.ends for part in found]), batch.ends)
+        result = [stream.update(x[:, a : a + block]) for a in range(0, 20_000, block)]
+        assert np.array_equal(np.concatenate([part.rms for part in result], axis=-1), batch.rms)
+        assert np.array_equal(np.concatenate([part.ends for part in result]), batch.ends)
 
 
 def test_a_quiet_end_after_a_violent_beginning_keeps_its_digits():
@@ -78,13 +78,13 @@ def test_a_quiet_end_after_a_violent_beginning_keeps_its_digits():
 
 def test_details_are_windowed_where_they_are_free_of_padding():
     x = np.random.default_rng(3).normal(size=6000)
-    found = details(x)
-    ends, values = windowed_rms(found)
+    result = details(x)
+    ends, values = windowed_rms(result)
     assert ends[0] == 105 + 1000
     assert values.shape == (4, ends.size)
     for level in (1, 2, 3, 4):
         for end, value in zip(ends, values[level - 1], strict=True):
-            assert value == pytest.approx(rms(found[level][end - 1000 : end]), rel=1e-13)
+            assert value == pytest.approx(rms(result[level][end - 1000 : end]), rel=1e-13)
     assert ends[-1] <= 6000 - 120
 
 
@@ -95,15 +95,15 @@ def test_the_live_chain_gives_the_windows_of_the_whole_recording(block, seed):
     stream = DetailStream()
     windows = RmsStream(skip=stream.settling, first=stream.first)
     products = RmsStream(skip=stream.settling, first=stream.first)
-    found, found_products = [], []
+    result, found_products = [], []
     for start in range(0, x.size, block):
         live = stream.update(x[start : start + block])
-        found.append(windows.update(live))
+        result.append(windows.update(live))
         found_products.append(products.update(live[2] * live[3]))
     batch = details(x)
     expected = windowed_rms(batch)
-    assert np.array_equal(np.concatenate([part.ends for part in found]), expected.ends)
-    np.testing.assert_allclose(np.concatenate([part.rms for part in found], axis=-1), expected.rms, rtol=1e-12)
+    assert np.array_equal(np.concatenate([part.ends for part in result]), expected.ends)
+    np.testing.assert_allclose(np.concatenate([part.rms for part in result], axis=-1), expected.rms, rtol=1e-12)
     inside = batch.inside(3, 4)
     expected = windowed_rms(batch.product(3, 4)[inside], first=inside.start)
     assert np.array_equal(np.concatenate([part.ends for part in found_products]), expected.ends)
@@ -120,9 +120,9 @@ def test_a_saved_stream_goes_on_with_the_same_bits(size, step):
         as_text = json.loads(json.dumps({k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in state.items()}))
         restored, again, expected = RmsStream.from_state(state), RmsStream.from_state(as_text), stream.update(x[cut:])
         for other in (restored, again):
-            found = other.update(x[cut:])
-            assert np.array_equal(found.ends, expected.ends)
-            assert np.array_equal(found.rms, expected.rms)
+            result = other.update(x[cut:])
+            assert np.array_equal(result.ends, expected.ends)
+            assert np.array_equal(result.rms, expected.rms)
     assert np.array_equal(RmsStream.from_state(RmsStream().state_dict()).update(x).rms, windowed_rms(x).rms)
 
 

@@ -1,4 +1,4 @@
-"""A stranger's folder of results: whatever is a link in it, nothing outside is written, emptied or removed."""
+"""A folder of results from outside: whatever is a link in it, nothing outside is written, emptied or removed."""
 
 from __future__ import annotations
 

@@ -59,21 +59,15 @@ for command in (
     fmu.fmu,
 ):
     app.command()(command)
-app.add_typer(campaign.campaign)
-app.add_typer(rigs.rigs)
-app.add_typer(monitoring.monitor)
-app.add_typer(plugin.plugin)
+for group in (campaign.campaign, rigs.rigs, monitoring.monitor, plugin.plugin):
+    app.add_typer(group)
+_VERBOSE = "Every method's verdict; errors log what they come from. Anywhere in a call."
 
 
 @app.callback(invoke_without_command=True)
 def _root(
     version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
-    verbose: Annotated[
-        bool,
-        typer.Option(
-            "--verbose", "-v", help="Every method's verdict; errors log what they come from. Anywhere in a call."
-        ),
-    ] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help=_VERBOSE)] = False,
 ) -> None:
     if verbose:
         import logging
@@ -88,59 +82,43 @@ def _root(
         raise typer.Exit
 
 
-def spread_baselines(arguments: Sequence[str]) -> list[str]:
-    """Give every file after `--baseline` an option of its own.
-
-    So `FILE... --baseline FILE...` works with a shell's wildcards. All words after `--baseline` up to the next option
-    belong to it; but where no other word could be a FILE, only the first one does.
-    """
-    if not arguments or arguments[0] not in ("diagnose", "report"):
-        return list(arguments)
-    takes_value = {"--format", "--map", "--rate", "--false-alarm", "--output", "-o", "--rig"}
-    takes_value |= {"--area", "--displacement", "--limit", "--fail-on"}
-    groups: list[list[str]] = []
-    plain: list[str] = []
-    index, files = 1, 0
-    while index < len(arguments):
-        word = arguments[index]
-        index += 1
-        if word == "--":
-            rest = list(arguments[index:])
-            files += len(rest)
-            plain += ["--", *rest]
-            break
-        if word == "--baseline":
-            group = []
-            while index < len(arguments) and (arguments[index] == "-" or not arguments[index].startswith("-")):
-                group.append(arguments[index])
-                index += 1
-            groups.append(group)
-        else:
-            plain.append(word)
-            if word in takes_value and index < len(arguments):
-                plain.append(arguments[index])
-                index += 1
-            elif word == "-" or not word.startswith("-"):
-                files += 1
-    if not all(groups):
-        raise InputError("--baseline must be followed by one file or more, got none")
-    options = [word for group in groups for name in (group if files else group[:1]) for word in ("--baseline", name)]
-    left = [] if files else [name for group in groups for name in group[1:]]
-    return [arguments[0], *options, *left, *plain]
-
-
 def arguments_of(words: Sequence[str]) -> list[str]:
     """Return the words of a call as the commands take them: `-v` first, an option for each baseline."""
     end = list(words).index("--") if "--" in words else len(words)
     verbose = [word for word in words[:end] if word in ("-v", "--verbose")]
-    plain = [word for word in words[:end] if word not in ("-v", "--verbose")]
-    if (
-        plain[:1] == ["monitor"]
-        and [*plain, *words[end:]][1:]
-        and plain[1:2] not in [[name] for name in monitoring.COMMANDS]
-    ):
-        plain[1:1] = ["run"]  # `sealscope monitor FILE`
-    return [*verbose[:1], *spread_baselines([*plain, *words[end:]])]
+    plain = [word for word in words[:end] if word not in ("-v", "--verbose")] + list(words[end:])
+    if plain[:1] == ["monitor"] and len(plain) > 1 and plain[1] not in monitoring.COMMANDS:
+        plain.insert(1, "run")  # `sealscope monitor FILE`
+    return [*verbose[:1], *spread_baselines(plain)]
+
+
+def spread_baselines(words: Sequence[str]) -> list[str]:
+    """Give every file after `--baseline` an option of its own, so that `FILE... --baseline FILE...` takes wildcards.
+
+    All words after `--baseline` up to the next option belong to it; but where no other word could be a FILE, only the
+    first one does.
+    """
+    if "--baseline" not in words or words[0] not in ("diagnose", "report"):
+        return list(words)
+    end = list(words).index("--") if "--" in words else len(words)
+    groups: list[list[str]] = []
+    plain: list[str] = []
+    of_group = False
+    for word in words[1:end]:
+        if word == "--baseline":
+            groups.append([])
+            of_group = True
+            continue
+        of_group = of_group and (word == "-" or not word.startswith("-"))
+        (groups[-1] if of_group else plain).append(word)
+    plain += words[end:]
+    if not all(groups):
+        raise InputError("--baseline must be followed by one file or more, got none")
+    called: Any = typer.main.get_command(app)
+    files = called.commands[words[0]].make_context(words[0], list(plain), resilient_parsing=True).params["files"]
+    options = [word for group in groups for name in (group if files else group[:1]) for word in ("--baseline", name)]
+    left = [] if files else [name for group in groups for name in group[1:]]
+    return [words[0], *options, *left, *plain]
 
 
 def main() -> None:
@@ -174,7 +152,10 @@ def main() -> None:
         status = 1
     if status == _INTERRUPTED:  # typer may have turned the interrupt into this status
         complain("interrupted")
-    _let_go_of_output()
+    try:
+        sys.stdout.flush()
+    except OSError:  # the reader of a pipe is gone: the rest goes nowhere, so that Python's own flush is silent
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(status if isinstance(status, int) else 0)
 
 
@@ -196,14 +177,3 @@ def _no_interrupt_lost() -> Iterator[None]:
         yield
     finally:
         sys.unraisablehook = usual
-
-
-def _let_go_of_output() -> None:
-    """Flush standard output.
-
-    Where nobody takes it any more, send the rest nowhere, so that Python's own flush at its end is silent.
-    """
-    try:
-        sys.stdout.flush()
-    except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

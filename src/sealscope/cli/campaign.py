@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Exit, Option, Typer, echo
 
-from sealscope.cli.options import JobsOption, complain, say_jobs
+from sealscope.cli import options as opt
 from sealscope.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,58 +19,41 @@ if TYPE_CHECKING:
     from sealscope.campaigns.plans.model import AnyPlan
     from sealscope.campaigns.results import CampaignResult
 
-campaign = typer.Typer(
+campaign = Typer(
     name="campaign",
     help="Measure what detectors find, at what false-alarm rate, over many simulated or measured records.",
     no_args_is_help=True,
 )
 
 
-def complete_plans(incomplete: str) -> list[str]:
-    """Return the names of packaged plans that begin so."""
+def _plans() -> Sequence[str]:
     from sealscope.campaigns.plans.reader import plan_names
 
-    return [name for name in plan_names() if name.startswith(incomplete)]
+    return plan_names()
 
 
 PlanArgument = Annotated[
-    str, typer.Argument(metavar="PLAN", help="Plan by name, or a TOML file.", autocompletion=complete_plans)
+    str, Argument(metavar="PLAN", help="Plan by name, or a TOML file.", autocompletion=opt.completing(_plans))
 ]
-FolderOption = Annotated[
-    Path | None,
-    typer.Option("--output", "-o", help="Folder of the campaign; by default sealscope-campaigns/NAME."),
-]
-SheetOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--sheet",
-        help="Folder with the thesis's data sheet (appendix_c_pa.csv, appendix_c_pb.csv), for plans over it; else "
-        "$SEALSCOPE_SHEET or ./data.",
-    ),
-]
-
-DataOption = Annotated[
-    Path | None, typer.Option("--data", help="Folder of the measured data, for plans over recordings or data sets.")
-]
+_FOLDER = "Folder of the campaign; by default sealscope-campaigns/NAME."
+FolderOption = Annotated[Path | None, Option("--output", "-o", help=_FOLDER)]
+_DATA = "Folder of the measured data, for plans over recordings or data sets."
+DataOption = Annotated[Path | None, Option("--data", help=_DATA)]
+_CLUSTER = "A Dask scheduler, e.g. tcp://host:8786."
+_BATCH = "Simulate side by side; for detectors of the details' RMS on both sides."
+_TRUST = "Run the controllers that the plan names (FILE.py:NAME): read them first."
 
 
 @campaign.command()
 def run(
     plan: PlanArgument,
     folder: FolderOption = None,
-    jobs: JobsOption = None,
-    cluster: Annotated[
-        str | None, typer.Option("--cluster", metavar="ADDRESS", help="A Dask scheduler, e.g. tcp://host:8786.")
-    ] = None,
-    retry: Annotated[bool, typer.Option("--retry", help="Carry failed records out again.")] = False,
-    batch: Annotated[
-        bool, typer.Option("--batch", help="Simulate side by side; for detectors of the details' RMS on both sides.")
-    ] = False,
-    trust: Annotated[
-        bool,
-        typer.Option("--trust", help="Run the controllers that the plan leads to (FILE.py:NAME): read them first."),
-    ] = False,
-    sheet: SheetOption = None,
+    jobs: opt.JobsOption = None,
+    cluster: Annotated[str | None, Option("--cluster", metavar="ADDRESS", help=_CLUSTER)] = None,
+    retry: Annotated[bool, Option("--retry", help="Carry failed records out again.")] = False,
+    batch: Annotated[bool, Option("--batch", help=_BATCH)] = False,
+    trust: Annotated[bool, Option("--trust", help=_TRUST)] = False,
+    sheet: opt.SheetOption = None,
     data: DataOption = None,
 ) -> None:
     """Carry out what is missing of a plan, then report.
@@ -84,18 +66,20 @@ def run(
 
     loaded = load_plan(plan)
     place = _folder(loaded, folder)
-    if batch and not isinstance(loaded, SimulatedPlan):
-        raise InputError(f"a plan in batches must simulate its records; run it without --batch ({loaded.place})")
-    if isinstance(loaded, SimulatedPlan):
-        say_jobs(jobs)
-        with progress_bar() as progress:
-            state = carry_out(
-                loaded, place, jobs=jobs, cluster=cluster, retry=retry, progress=progress, batch=batch, trust=trust,
-            )  # fmt: skip
-        typer.echo(_progress_text(state))
+    if not isinstance(loaded, SimulatedPlan):
+        if batch:
+            raise InputError(f"a plan in batches must simulate its records; run it without --batch ({loaded.place})")
+        _report(loaded, place, sheet, data)
+        return
+    opt.say_jobs(jobs)
+    with _progress() as progress:
+        state = carry_out(
+            loaded, place, jobs=jobs, cluster=cluster, retry=retry, progress=progress, batch=batch, trust=trust
+        )  # fmt: skip
+    echo(_progress_text(state))
     _report(loaded, place, sheet, data)
-    if isinstance(loaded, SimulatedPlan) and state.failed:
-        raise typer.Exit(1)
+    if state.failed:
+        raise Exit(1)
 
 
 @campaign.command()
@@ -106,14 +90,16 @@ def status(plan: PlanArgument, folder: FolderOption = None) -> None:
     from sealscope.campaigns.plans.reader import load_plan
 
     loaded = load_plan(plan)
-    if not isinstance(loaded, SimulatedPlan):
-        typer.echo("a campaign over measured data has nothing to wait for; report it")
-        return
-    typer.echo(_progress_text(progress_of(loaded, _folder(loaded, folder))))
+    if isinstance(loaded, SimulatedPlan):
+        echo(_progress_text(progress_of(loaded, _folder(loaded, folder))))
+    else:
+        echo("a campaign over measured data has nothing to wait for; report it")
 
 
 @campaign.command()
-def report(plan: PlanArgument, folder: FolderOption = None, sheet: SheetOption = None, data: DataOption = None) -> None:
+def report(
+    plan: PlanArgument, folder: FolderOption = None, sheet: opt.SheetOption = None, data: DataOption = None
+) -> None:
     """Judge the rows that are there; write tables and page."""
     from sealscope.campaigns.plans.reader import load_plan
 
@@ -122,7 +108,7 @@ def report(plan: PlanArgument, folder: FolderOption = None, sheet: SheetOption =
 
 
 def _folder(plan: AnyPlan, given: Path | None) -> Path:
-    """Return the campaign's folder; InputError where the default one is a link that a stranger may have left here."""
+    """Return the campaign's folder; InputError where the default one is a link that came with the folder."""
     if given is not None:
         return given
     folder = Path("sealscope-campaigns") / plan.name
@@ -139,61 +125,14 @@ def _progress_text(state: CampaignProgress) -> str:
     if state.seconds is not None:
         left = (state.records - state.done) * state.seconds
         text += f"; {state.seconds:.2f} s of one core each"
-        text += f", about {_time_text(left)} of one core left" if left else ""
+        text += f", about {opt.time_text(left)} of one core left" if left else ""
     return text
 
 
-def _time_text(seconds: float) -> str:
-    if seconds > 5400:
-        return f"{seconds / 3600:.1f} h"
-    return f"{seconds / 60:.0f} min" if seconds > 90 else f"{seconds:.0f} s"
-
-
 @contextmanager
-def progress_bar() -> Iterator[ProgressCallback]:
-    """Show records, failures and time left on standard error; without a terminal a line a minute, for the log."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield _ProgressLines()
-        return
-    columns = (
-        TextColumn("records"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"),
-        TimeRemainingColumn(), TextColumn("{task.description}"),
-    )  # fmt: skip
-    with Progress(*columns, console=console, transient=True, speed_estimate_period=120) as bar:
-        task = bar.add_task("", total=None)
-
-        def update(done: int, total: int, failures: int) -> None:
-            bar.update(task, completed=done, total=total, description=f"{failures} failed" if failures else "")
-
-        yield update
-
-
-class _ProgressLines:
-    """Progress without a terminal: a line a minute."""
-
-    def __init__(self) -> None:
-        self.began, self.last, self.first = time.monotonic(), time.monotonic(), -1
-
-    def __call__(self, done: int, total: int, failures: int) -> None:
-        now = time.monotonic()
-        self.first = done if self.first < 0 else self.first
-        if now - self.last < 60.0 or done == self.first:
-            return
-        self.last = now
-        left = (now - self.began) / (done - self.first) * (total - done)
-        failed = f", {failures} failed" if failures else ""
-        typer.echo(f"{done} of {total} records{failed}, about {_time_text(left)} left", err=True)
+def _progress() -> Iterator[ProgressCallback]:
+    with opt.counted_progress("records") as update:
+        yield lambda done, total, failures: update(done, total, f"{failures} failed" if failures else "")
 
 
 def _report(plan: AnyPlan, folder: Path, sheet: Path | None, data: Path | None) -> None:
@@ -203,11 +142,10 @@ def _report(plan: AnyPlan, folder: Path, sheet: Path | None, data: Path | None) 
     result = _result(plan, folder, sheet, data)
     files = write_result(result, folder)
     write_campaign_page(result, folder / PAGE, [path.name for path in files])
-    typer.echo(campaign_text(result))
+    echo(campaign_text(result))
     for row in result.judgement.failed[:5]:
-        complain(f"record {row.id} failed: {row.error}")
-    typer.echo(f"tables: {folder}")
-    typer.echo(f"page:   {folder / PAGE}")
+        opt.complain(f"record {row.id} failed: {row.error}")
+    echo(f"tables: {folder}\npage:   {folder / PAGE}")
 
 
 def _result(plan: AnyPlan, folder: Path, sheet: Path | None, data: Path | None) -> CampaignResult:
@@ -219,7 +157,7 @@ def _result(plan: AnyPlan, folder: Path, sheet: Path | None, data: Path | None) 
     if isinstance(plan, SimulatedPlan):
         return simulated_result(plan, folder)
     if isinstance(plan, RecordedPlan):
-        with progress_bar() as progress:
+        with _progress() as progress:
             return recorded_result(plan, needs_folder(data, "recordings"), progress)
     if plan.data == "hydraulic":
         return held_out_result(plan, hydraulic_samples(needs_folder(data, "the hydraulic data set")))

@@ -5,45 +5,47 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, echo
 
+from sealscope.cli.options import completing
 from sealscope.errors import InputError
 
 
-def complete_datasets(incomplete: str) -> list[str]:
-    """Return the names of data sets that begin with `incomplete`, for the shell's completion."""
+def _names() -> list[str]:
     from sealscope.datasets import known
 
-    return [dataset.name for dataset in known() if dataset.name.startswith(incomplete)]
+    return [dataset.name for dataset in known()]
+
+
+_NAME = "Print licence, source and files of this data set."
 
 
 def datasets(
-    name: Annotated[
-        str | None,
-        typer.Argument(help="Tell licence, source and files of this data set.", autocompletion=complete_datasets),
-    ] = None,
-    folder: Annotated[Path | None, typer.Argument(help="Check the files in this folder by their checksums.")] = None,
+    name: Annotated[str | None, Argument(help=_NAME, autocompletion=completing(_names))] = None,
+    folder: Annotated[Path | None, Argument(help="Check the files in this folder by their checksums.")] = None,
 ) -> None:
     """List the public data sets that are read from a folder that you downloaded (`ss.datasets`)."""
     from sealscope.datasets import check, known, named
+    from sealscope.recordings.formats.columns import counted
 
     if name is None:
-        width = max(len(dataset.name) for dataset in known())
         for dataset in known():
-            typer.echo(f"{dataset.name:<{width}}  {dataset.title} ({dataset.licence}; {dataset.source})")
+            echo(f"{dataset.name}\n  {dataset.title}\n  {dataset.licence}; {dataset.source}")
         return
     dataset = named(name)
     if folder is None:
-        typer.echo(f"{dataset.title}\n\n{dataset.about}\n")
-        typer.echo(f"licence   {dataset.licence}\nsource    {dataset.source}\ncitation  {dataset.citation}")
-        typer.echo(f"files     {len(dataset.checksums)} with a checksum")
+        echo(f"{dataset.title}\n\n{dataset.about}\n")
+        echo(f"licence   {dataset.licence}\nsource    {dataset.source}\ncitation  {dataset.citation}")
+        echo(f"files     {len(dataset.checksums)} with a checksum")
         return
-    found = check(dataset, folder)
-    typer.echo(
-        f"{dataset.name}: {len(found.right)} files with their checksum, {len(found.wrong)} with another, "
-        f"{len(found.missing)} not there, {len(found.unknown)} without a known one ({folder})"
+    files = check(dataset, folder)
+    echo(
+        f"{dataset.name}: {counted(len(files.right), 'file')} with the right checksum, {len(files.wrong)} with a wrong "
+        f"one,\n{len(files.missing)} missing, {len(files.unknown)} unknown ({folder})"
     )
-    if found.wrong:
-        raise InputError(f"files must have their checksums, got another of {', '.join(map(str, found.wrong.values()))}")
-    if not found.right:
+    if files.wrong:
+        raise InputError(
+            f"files must have their checksums, got a wrong one of {', '.join(map(str, files.wrong.values()))}"
+        )
+    if not files.right:
         raise InputError(f"the folder must hold files of {dataset.name}, got none: they are at {dataset.source}")

@@ -15,8 +15,7 @@ from sealscope.cli.options import (
     LimitOption,
     MapOption,
     RateOption,
-    assumed_rig,
-    channel_map_of,
+    StatedMachine,
     check_folder,
     say,
 )
@@ -69,9 +68,9 @@ def commission(
     else:
         if output.exists():
             raise InputError(f"a machine's file must be new, got {output}, which exists; --add adds recordings to it")
-        columns = channel_map_of(maps)
-        assumed = assumed_rig(rig, area, displacement)
-        machine = commissioned(files, rig=assumed, map=columns or None, rate=rate, limit=limit, name=output.stem)
+        own = StatedMachine.of(None, maps, rate, rig, area, displacement, limit)
+        columns = own.channel_map or None
+        machine = commissioned(files, rig=own.rig, map=columns, rate=rate, limit=limit, name=output.stem)
     write_machine(machine, output)
     say(f"{output}:\n{machine}")
 

@@ -8,50 +8,48 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option, Typer, echo
+
+from sealscope.cli.options import check_folder, write_text
+from sealscope.errors import InputError
 
 #: Words after `monitor` that are no file of settings.
 COMMANDS = ("init", "run", "demo", "export", "dashboard", "-h", "--help")
 
-monitor = typer.Typer(
+monitor = Typer(
     name="monitor",
     help="Watch running actuators: alarms in litres per minute. `sealscope monitor FILE` is the service.",
     no_args_is_help=True,
     rich_markup_mode="markdown",
 )
+FileOption = Annotated[Path, Option("--output", "-o", metavar="FILE", help="The file to write.")]
 
 
 @monitor.command()
 def init(
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The file to write.")] = Path(
-        "monitor.toml"
-    ),
+    output: FileOption = Path("monitor.toml"),
 ) -> None:
     """Write a commented file of settings."""
-    from sealscope.errors import InputError
     from sealscope.monitor.settings import template
-    from sealscope.storage.atomic import atomic_write
 
     if output.exists():
         raise InputError(f"a new file of settings must not exist yet, got {output}")
-    with atomic_write(output) as temporary:
-        temporary.write_text(template(), encoding="utf-8")
-    typer.echo(f"{output}: written; sealscope monitor {output}")
+    check_folder(output)
+    write_text(output, template())
+    echo(f"{output}: written; sealscope monitor {output}")
 
 
 @monitor.command()
 def run(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Settings, as `sealscope monitor init` writes them.")],
-    once: Annotated[
-        bool, typer.Option("--once", help="End when standard input and the folders hold nothing new.")
-    ] = False,
+    file: Annotated[Path, Argument(metavar="FILE", help="Settings, as `sealscope monitor init` writes them.")],
+    once: Annotated[bool, Option("--once", help="End when standard input and folders hold nothing new.")] = False,
 ) -> None:
     """Watch the actuators of FILE: blocks in, alarms as JSON lines on standard output."""
     if not logging.getLogger("sealscope").handlers:
         logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
     from sealscope.monitor.supervisor import LimitedLines
 
-    limit = LimitedLines()  # one, for all: what a stranger sends must not fill the disk
+    limit = LimitedLines()  # one, for all: messages from outside must not fill the disk
     for handler in (*logging.getLogger().handlers, *logging.getLogger("sealscope").handlers):
         handler.addFilter(limit)
     _serve(file, once=once)
@@ -59,32 +57,28 @@ def run(
 
 @monitor.command()
 def demo(
-    folder: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FOLDER", help="Where the database is kept.")
-    ] = None,
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of the page.")] = 8765,
-    speed: Annotated[float, typer.Option("--speed", min=0.1, max=1000.0, help="Times real time.")] = 20.0,
+    folder: Annotated[Path | None, Option("--output", "-o", metavar="FOLDER", help="Folder of the database.")] = None,
+    port: Annotated[int, Option(min=0, max=65535, help="Port of the page.")] = 8765,
+    speed: Annotated[float, Option(min=0.1, max=1000.0, help="Times real time.")] = 20.0,
 ) -> None:
     """Watch three simulated actuators at 20 times real time; one begins to leak after two minutes of theirs."""
     import tempfile
 
     from sealscope.live_simulation import DEMO
-    from sealscope.storage.atomic import atomic_write
     from sealscope.storage.folders import make_folder
 
     with tempfile.TemporaryDirectory() as temporary:
         place = Path(temporary) if folder is None else folder
         make_folder(place)
         file = place / "demo.toml"
-        with atomic_write(file) as written:
-            written.write_text(DEMO.format(port=port, speed=speed), encoding="utf-8")
+        write_text(file, DEMO.format(port=port, speed=speed))
         _serve(file)
 
 
 @monitor.command()
 def export(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Settings of the monitor.")],
-    folder: Annotated[Path, typer.Option("--output", "-o", metavar="FOLDER", help="Where the tables are written.")],
+    file: Annotated[Path, Argument(metavar="FILE", help="Settings of the monitor.")],
+    folder: Annotated[Path, Option("--output", "-o", metavar="FOLDER", help="Where the tables are written.")],
 ) -> None:
     """Write what persons said of alarms as labelled data: alarms.csv and estimates.csv."""
     from sealscope.monitor.memory.export import export_labels
@@ -95,24 +89,21 @@ def export(
     store = MonitorStore(read_settings(file).database)
     make_folder(folder)
     alarms, estimates = export_labels(store, folder)
-    typer.echo(f"{folder}: {alarms} alarms, {estimates} estimates")
+    echo(f"{folder}: {alarms} alarms, {estimates} estimates")
 
 
 @monitor.command()
 def dashboard(
-    file: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The file to write.")] = Path(
-        "grafana.json"
-    ),
+    file: FileOption = Path("grafana.json"),
 ) -> None:
     """Write a dashboard that Grafana imports, for the metrics of the page's /metrics."""
     import json
 
     from sealscope.monitor.outputs.grafana import dashboard as grafana
-    from sealscope.storage.atomic import atomic_write
 
-    with atomic_write(file) as temporary:
-        temporary.write_text(json.dumps(grafana(), indent=1) + "\n", encoding="utf-8")
-    typer.echo(f"{file}: written")
+    check_folder(file)
+    write_text(file, json.dumps(grafana(), indent=1) + "\n")
+    echo(f"{file}: written")
 
 
 def _serve(file: Path, *, once: bool = False) -> None:
@@ -124,10 +115,10 @@ def _serve(file: Path, *, once: bool = False) -> None:
     if any(actuator.simulate is not None for actuator in settings.actuator):
         from sealscope.live_simulation import simulated_sources
 
-        sources = simulated_sources(settings, lambda text: typer.echo(text, err=True))
+        sources = simulated_sources(settings, lambda text: echo(text, err=True))
     service = Service(settings, once=once, sources=sources)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: service.stop())
     if service.page is not None:
-        typer.echo(f"page: {service.page.address}", err=True)
+        echo(f"page: {service.page.address}", err=True)
     service.run()

@@ -1,160 +1,230 @@
-"""Options that several commands share, and the progress line."""
+"""Options that several commands share, and what commands do alike."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from textwrap import fill
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-import typer
+from typer import Context, Option, echo
 
-from sealscope.errors import InputError, SealscopeError
+from sealscope.errors import InputError, SealscopeError, UnreadableFile
 
 if TYPE_CHECKING:
+    from sealscope.diagnosis.commissioned.machine import CommissionedMachine
+    from sealscope.diagnosis.verdict.diagnosis import Diagnosis
     from sealscope.parameters import Rig
+    from sealscope.recordings import Recording
     from sealscope.recordings.formats.columns import ChannelMap
     from sealscope.simulation.simulate import Progress
 
-
 T = TypeVar("T")
-#: Exit status where a verdict is one of those that `--fail-on` names.
+#: Exit status where a verdict is one of those that `--fail-on` names; verdicts; levels of severity, the worst last.
 FAILED_ON = 3
+VERDICTS, LEVELS = ("leak", "no leak", "cannot tell"), ("follow", "plan", "repair")
+#: Stands for standard input.
+STANDARD_INPUT = Path("-")
 _log = logging.getLogger(__name__)
 
 
-def complete_rigs(incomplete: str) -> list[str]:
-    """Names of packaged rigs that begin so."""
+def completing(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
+    """Return a shell's completion from these names."""
+
+    def complete(incomplete: str) -> list[str]:
+        return [name for name in names() if name.startswith(incomplete)]
+
+    return complete
+
+
+def _rig_names() -> Sequence[str]:
     from sealscope.parameters import rig_names
 
-    return [name for name in rig_names() if name.startswith(incomplete)]
+    return rig_names()
 
 
-def complete_overrides(incomplete: str) -> list[str]:
-    """Names of parameters that begin so, whole or as a symbol that only one has, ready for a value."""
+def _overrides() -> list[str]:
+    """Return names of parameters, whole or as a symbol that only one has, ready for a value."""
     from sealscope.parameters import declared_names
 
     names = declared_names()
     symbols = [name.rpartition(".")[2] for name in names]
-    unique = [symbol for symbol in symbols if symbols.count(symbol) == 1]
-    return [f"{name}=" for name in (*names, *unique) if name.startswith(incomplete)]
+    return [f"{name}=" for name in (*names, *(symbol for symbol in symbols if symbols.count(symbol) == 1))]
 
 
-RigOption = Annotated[
-    str, typer.Option("--rig", help="Rig by name, or the path of a rig's TOML file.", autocompletion=complete_rigs)
-]
+complete_rigs = completing(_rig_names)
+RigOption = Annotated[str, Option("--rig", help="Rig by name, or its TOML file.", autocompletion=complete_rigs)]
 AssumeOption = Annotated[
     str | None,
-    typer.Option(
+    Option(
         "--rig",
         metavar="NAME|FILE",
-        help="What the detectors may assume of the machine: a rig by name, or a TOML file; by default the thesis's.",
+        help="What is assumed of the machine: a rig by name, or a TOML file; by default the thesis's.",
         autocompletion=complete_rigs,
     ),
 ]
-AreaOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--area",
-        metavar="AREA[unit]",
-        help="Area of the piston, e.g. '633 mm^2', which L/min rests on; twice for sides A and B.",
-    ),
-]
-DisplacementOption = Annotated[
-    str | None,
-    typer.Option(
-        "--displacement",
-        metavar="VOLUME[unit]",
-        help="Displacement of the pump, e.g. '4.9 cm^3/rev', which L/min rests on where no area is stated.",
-    ),
-]
-LimitOption = Annotated[
-    str | None,
-    typer.Option(
-        "--limit",
-        metavar="LEAK[unit]",
-        help="Leak from which the machine is to be repaired: a flow, '5 mL/min', or a speed of creep. "
-        "[default: 8 mm/min]",
-    ),
-]
+_AREA = "Area of the piston, '633 mm^2', which L/min rests on; twice for sides A and B."
+AreaOption = Annotated[list[str] | None, Option("--area", metavar="AREA[unit]", help=_AREA)]
+_DISPLACEMENT = "Displacement of the pump, '4.9 cm^3/rev', which L/min rests on where no area is stated."
+DisplacementOption = Annotated[str | None, Option("--displacement", metavar="VOLUME[unit]", help=_DISPLACEMENT)]
+_LIMIT = "Leak to be repaired: a flow, '5 mL/min', or a speed of creep. [default: 8 mm/min]"
+LimitOption = Annotated[str | None, Option("--limit", metavar="LEAK[unit]", help=_LIMIT)]
+_SET = "Override a parameter; repeat."
 SetOption = Annotated[
     list[str] | None,
-    typer.Option(
-        "--set", metavar="NAME=VALUE[unit]", help="Override a parameter; repeat.", autocompletion=complete_overrides
-    ),
+    Option("--set", metavar="NAME=VALUE[unit]", help=_SET, autocompletion=completing(_overrides)),
 ]
 MapOption = Annotated[
     list[str] | None,
-    typer.Option(
+    Option(
         "--map",
         metavar="CHANNEL=COLUMN",
-        help="Take a channel from a foreign column, with its unit if neither the file nor the name has one: "
-        "p_A=PG_1[psi], x=#4[mm], or from a formula of columns: 'p_A=ch2*0.0625-0.625 bar'; repeat. `auto`: what the "
-        "columns' names tell, also beside others.",
+        help="Take a channel from a column, with its unit if neither the file nor the name has one: p_A=PG_1[psi], "
+        "x=#4[mm], or from a formula of columns: 'p_A=ch2*0.0625-0.625 bar'; repeat. `auto`: by the columns' names, "
+        "also beside others.",
     ),
 ]
-RateOption = Annotated[float | None, typer.Option("--rate", help="Sampling rate [Hz] of files without a time column.")]
-JoinOption = Annotated[
-    bool, typer.Option("--join", help="The files are parts of a single run: join them by their clocks.")
+RateOption = Annotated[float | None, Option("--rate", help="Sampling rate [Hz] of files without a time column.")]
+JoinOption = Annotated[bool, Option("--join", help="The files are parts of a single run: join them by their clocks.")]
+_BASELINE = "Leak-free recordings of the same machine."
+BaselineOption = Annotated[list[Path] | None, Option("--baseline", metavar="FILE...", help=_BASELINE)]
+_MACHINE = "The machine's file, by `sealscope commission`; it states map, rig, limit and healthy recordings."
+MachineOption = Annotated[Path | None, Option("--machine", metavar="FILE", help=_MACHINE)]
+FalseAlarmOption = Annotated[float, Option("--false-alarm", help="Probability of `leak` on a leak-free recording.")]
+SeedOption = Annotated[int, Option("--seed", help="Seed of the instruments' noise.")]
+_JOBS = "Processes; by default one a core, two a core at most."
+JobsOption = Annotated[int | None, Option("--jobs", "-j", help=_JOBS)]
+FailOnOption = Annotated[
+    list[str] | None,
+    Option("--fail-on", help="End with status 3 on this verdict; repeat.", autocompletion=completing(lambda: VERDICTS)),
 ]
-BaselineOption = Annotated[
-    list[Path] | None, typer.Option("--baseline", metavar="FILE...", help="Leak-free recordings of the same machine.")
-]
-MachineOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--machine",
-        metavar="FILE",
-        help="The machine's file, by `sealscope commission`: map, rig, limit and healthy recordings are its.",
-    ),
-]
-FalseAlarmOption = Annotated[
-    float, typer.Option("--false-alarm", help="Probability of `leak` on a leak-free recording.")
-]
-SeedOption = Annotated[int, typer.Option("--seed", help="Seed of the instruments' noise.")]
+_SHEET = "Folder with the thesis's data sheet (appendix_c_pa.csv, appendix_c_pb.csv); else $SEALSCOPE_SHEET or ./data."
+SheetOption = Annotated[Path | None, Option("--sheet", help=_SHEET)]
 
 
-JobsOption = Annotated[
-    int | None, typer.Option("--jobs", "-j", help="Processes; by default one a core, two a core at most.")
-]
+@dataclass(frozen=True)
+class StatedMachine:
+    """What a call states of the machine: by its file (`known`), or how to read its files, its rig and repair limit."""
+
+    known: CommissionedMachine | None = None
+    channel_map: ChannelMap = field(default_factory=dict)
+    rate: float | None = None
+    rig: Rig | None = None
+    limit: str | None = None
+
+    @classmethod
+    def of(
+        cls,
+        machine: Path | None,
+        maps: Sequence[str] | None,
+        rate: float | None,
+        rig: str | None = None,
+        area: Sequence[str] | None = None,
+        displacement: str | None = None,
+        limit: str | None = None,
+        baseline: Sequence[Path] | None = None,
+    ) -> StatedMachine:
+        """Return what the options state; InputError where it cannot be, or stands beside `--machine` and differs."""
+        from sealscope.diagnosis.verdict.severity import RepairLimit
+        from sealscope.recordings.formats.columns import check_call
+
+        if machine is not None:
+            from sealscope.diagnosis.commissioned.machine_file import load_machine
+
+            beside = {"--baseline": baseline, "--map": maps, "--rate": rate, "--rig": rig}
+            beside |= {"--area": area, "--displacement": displacement, "--limit": limit}
+            for name, value in beside.items():
+                if value:
+                    raise InputError(f"{name} must not stand beside --machine, whose file states it")
+            known = load_machine(machine)
+            return cls(known, rig=known.rig, limit=known.limit)
+        stated = cls(None, channel_map_of(maps), rate, _assumed_rig(rig, area, displacement), limit)
+        check_call(stated.channel_map, rate)
+        check_call(stated._map_of_rig, rate)
+        RepairLimit.of(limit)
+        return stated
+
+    @property
+    def _map_of_rig(self) -> ChannelMap:
+        """The map that the rig's file keeps; a `--map` stands in its place."""
+        return {} if self.rig is None or self.channel_map else self.rig.channel_map
+
+    @property
+    def maps(self) -> bool:
+        """Whether any map is stated."""
+        return bool(self.channel_map or self._map_of_rig)
+
+    def read(self, file: Path) -> Recording:
+        """Read a file, standard input for `-`; the rig's map is for files that have its columns."""
+        if self.known is not None:
+            return self.known.read(file)
+        if file.is_dir():
+            ways = "name its files, or follow a machine by `sealscope trend`"
+            raise UnreadableFile(f"a recording must be a file, got a folder: {ways} ({file})")
+        if file != STANDARD_INPUT:
+            return self._read(file)
+        with TemporaryDirectory() as folder:
+            copied = Path(folder) / "standard input"
+            with copied.open("wb") as copy:
+                shutil.copyfileobj(sys.stdin.buffer, copy)
+            try:
+                return self._read(copied)
+            except UnreadableFile as error:
+                raise UnreadableFile(str(error).replace(str(copied), copied.name)) from error
+
+    def _read(self, file: Path) -> Recording:
+        from sealscope.recordings import read
+
+        if not self._map_of_rig:
+            return read(file, map=self.channel_map or None, rate=self.rate)
+        try:
+            return read(file, map=self._map_of_rig, rate=self.rate)
+        except UnreadableFile as unmapped:
+            try:
+                return read(file, rate=self.rate)
+            except UnreadableFile:
+                raise unmapped from None
+
+    def read_all(self, files: Sequence[Path], joined: bool = False) -> Iterator[tuple[Path, Recording | None]]:
+        """Yield each file and its recording, None with a line on standard error where it cannot be read.
+
+        `joined`: the first file and the recording of all files joined instead, None where one is bad.
+        """
+        recordings = ((file, attempt(file, partial(self.read, file))) for file in files)
+        if not joined:
+            yield from recordings
+            return
+        from sealscope.recordings import join
+
+        parts = [recording for _, recording in recordings]
+        whole = [part for part in parts if part is not None]
+        yield files[0], join(whole, names=[file.name for file in files]) if len(whole) == len(files) else None
+
+    def diagnose(
+        self, recording: Recording, baseline: Sequence[Recording], file: Path, false_alarm: float, quick: bool
+    ) -> Diagnosis:
+        """Diagnose a recording of this machine."""
+        from dataclasses import replace
+
+        from sealscope.diagnosis.diagnose import diagnose
+
+        if self.known is not None:
+            own = self.known.diagnose(recording, false_alarm_probability=false_alarm, quick=quick)
+            return replace(own, file=str(file))
+        stated: dict[str, Any] = {"rig": self.rig, "limit": self.limit, "quick": quick, "file": file}
+        return diagnose(recording, baseline, false_alarm_probability=false_alarm, **stated)
 
 
-def say_jobs(jobs: int | None) -> None:
-    """Say so on standard error where fewer processes are started than `--jobs` asks for."""
-    from sealscope.campaigns.execution.workers import process_count
-
-    if jobs is not None and jobs > (most := process_count(jobs)):
-        complain(f"--jobs {jobs}: {most} processes are started, two a core")
-
-
-@contextmanager
-def progress() -> Iterator[Progress]:
-    """Return a progress line on standard error, gone when done; silent where nobody looks."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-    console = Console(stderr=True)
-    if not console.is_terminal:  # a disabled bar prints an empty line in some versions of the library
-        yield lambda task, share: None
-        return
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
-        tasks: dict[str, Any] = {}
-
-        def update(task: str, share: float) -> None:
-            if task not in tasks:
-                tasks[task] = bar.add_task(task, total=1.0)
-            bar.update(tasks[task], completed=share)
-
-        yield update
-
-
-def assumed_rig(name: str | None, area: Sequence[str] | None = None, displacement: str | None = None) -> Rig | None:
-    """Return the rig of `--rig` that detectors may assume, with what `--area` and `--displacement` state.
-
-    None where none of them is given.
-    """
+def _assumed_rig(name: str | None, area: Sequence[str] | None, displacement: str | None) -> Rig | None:
+    """Return the rig of `--rig` with what `--area` and `--displacement` state; None where none of them is given."""
     from sealscope.diagnosis.verdict.machine import unstated
     from sealscope.parameters import load_rig
     from sealscope.units import parse_quantity
@@ -173,17 +243,6 @@ def assumed_rig(name: str | None, area: Sequence[str] | None = None, displacemen
     return (rig or unstated()).with_overrides(stated, source="set by the call (--area, --displacement)")
 
 
-def refuse_beside_machine(*options: object) -> None:
-    """Raise InputError where what a machine's file states is stated by the call, too.
-
-    `options`: those of --baseline, --map, --rate, --rig, --area, --displacement and --limit.
-    """
-    names = ("--baseline", "--map", "--rate", "--rig", "--area", "--displacement", "--limit")
-    for name, value in zip(names, options, strict=True):
-        if value:
-            raise InputError(f"{name} must not stand beside --machine, whose file states it")
-
-
 def rig_with(name: str, overrides: Sequence[str] | None) -> Rig:
     """Return the rig of that name or file with the values of `--set`."""
     from sealscope.parameters import load_rig, parse_overrides
@@ -199,14 +258,22 @@ def channel_map_of(options: Sequence[str] | None) -> ChannelMap:
 
     columns: dict[str, str] = {}
     for option in options or ():
-        if option == "auto":
-            columns[REST] = option
-            continue
-        channel, column = split_map_option(option)
-        if channel in columns:
+        channel, column = (REST, option) if option == "auto" else split_map_option(option)
+        if channel in columns and channel != REST:
             raise InputError(f"--map {channel} must be given once, got {columns[channel]} and {column}")
         columns[channel] = column
     return "auto" if set(columns) == {REST} else columns
+
+
+def check_fail_on(words: Sequence[str] | None, known: Sequence[str]) -> None:
+    """Raise InputError where `--fail-on` names no verdict, and no level where there are levels."""
+    if wrong := [word for word in words or () if word not in known]:
+        raise InputError(f"--fail-on must be {', '.join(known[:-1])} or {known[-1]}, got {wrong[0]!r}")
+
+
+def verbose(context: Context) -> bool:
+    """Return whether the call has `-v`."""
+    return bool(context.find_root().params.get("verbose"))
 
 
 def printable(text: str, kept: str = "") -> str:
@@ -216,12 +283,18 @@ def printable(text: str, kept: str = "") -> str:
 
 def say(text: str) -> None:
     """Print lines on standard output."""
-    typer.echo(printable(text, "\n"))
+    echo(printable(text, "\n"))
+
+
+def say_wrapped(text: str, head: str = "") -> None:
+    """Print a paragraph on standard output, beside `head`; its lines are as wide as words allow, 80 columns."""
+    indent = " " * (len(head) or 2)
+    say(fill(text, 80, initial_indent=head, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False))
 
 
 def complain(message: object) -> None:
     """Print one line on standard error."""
-    typer.echo(f"sealscope: {printable(str(message))}", err=True)
+    echo(f"sealscope: {printable(str(message))}", err=True)
 
 
 def attempt(file: Path, work: Callable[[], T]) -> T | None:
@@ -245,3 +318,87 @@ def check_folder(file: Path) -> None:
     from sealscope.storage.atomic import remove_temporaries
 
     remove_temporaries(file.parent, file.name)
+
+
+def write_text(file: Path, text: str) -> None:
+    """Write a text whole or not at all."""
+    from sealscope.storage.atomic import atomic_write
+
+    with atomic_write(file) as temporary:
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace", newline="\n")  # a file's name
+
+
+def say_jobs(jobs: int | None) -> None:
+    """Say so on standard error where fewer processes are started than `--jobs` asks for."""
+    from sealscope.campaigns.execution.workers import process_count
+
+    if jobs is not None and jobs > (most := process_count(jobs)):
+        complain(f"--jobs {jobs}: {most} processes are started, two a core")
+
+
+@contextmanager
+def progress() -> Iterator[Progress]:
+    """Return a progress line a task on standard error, gone when done; silent without a terminal."""
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with _bar(*columns) as bar:
+        tasks: dict[str, Any] = {}
+
+        def update(task: str, share: float) -> None:
+            if bar is None:
+                return
+            if task not in tasks:
+                tasks[task] = bar.add_task(task, total=1.0)
+            bar.update(tasks[task], completed=share)
+
+        yield update
+
+
+@contextmanager
+def counted_progress(noun: str) -> Iterator[Callable[[int, int, str], None]]:
+    """Show on standard error how many of `noun` are done, the time left and a note.
+
+    Without a terminal a line a minute, for the log.
+    """
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (TextColumn(noun), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"))
+    with _bar(*columns, TimeRemainingColumn(), TextColumn("{task.description}")) as bar:
+        task = None if bar is None else bar.add_task("", total=None)
+        began = said = time.monotonic()
+        first: int | None = None
+
+        def update(done: int, total: int, note: str) -> None:
+            nonlocal said, first
+            if bar is not None:
+                bar.update(task, completed=done, total=total, description=note)
+                return
+            now, first = time.monotonic(), done if first is None else first
+            if now - said >= 60.0 and done > first:
+                said, left = now, (now - began) / (done - first) * (total - done)
+                note = f", {note}" if note else ""
+                echo(f"{done} of {total} {noun}{note}, about {time_text(left)} left", err=True)
+
+        yield update
+
+
+@contextmanager
+def _bar(*columns: Any) -> Iterator[Any]:
+    """Return a bar on standard error, None without a terminal: a disabled bar may print an empty line."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield None
+        return
+    with Progress(*columns, console=console, transient=True, speed_estimate_period=120) as bar:
+        yield bar
+
+
+def time_text(seconds: float) -> str:
+    """Return a time as hours, minutes or seconds."""
+    if seconds > 5400:
+        return f"{seconds / 3600:.1f} h"
+    return f"{seconds / 60:.0f} min" if seconds > 90 else f"{seconds:.0f} s"

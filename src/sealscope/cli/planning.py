@@ -3,38 +3,26 @@
 from __future__ import annotations
 
 import json
-from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Literal
 
-import typer
+from typer import Option, echo
 
-from sealscope.cli.options import MachineOption, RigOption, SetOption, progress, rig_with
+from sealscope.cli import options as opt
+from sealscope.errors import InputError
 
-
-class PlanFormat(StrEnum):
-    """How a plan is printed."""
-
-    text = "text"
-    json = "json"
+_FIND = "Leak to be found, under the usual duty: '0.005 L/min'."
 
 
 def plan(
-    rig: RigOption = "thesis",
-    machine: MachineOption = None,
-    find: Annotated[
-        str | None,
-        typer.Option("--find", metavar="FLOW", help="Leak to be found, under the usual duty: '0.005 L/min'."),
-    ] = None,
-    command: Annotated[str, typer.Option("--command", help="Command of the machine's usual duty.")] = "3 sin(4t)",
-    load: Annotated[str, typer.Option("--load", help="Load of the usual duty: '500 N'.")] = "",
-    false_alarm: Annotated[
-        float, typer.Option("--false-alarm", help="Probability of an alarm on a leak-free recording.")
-    ] = 0.01,
-    detection: Annotated[
-        float, typer.Option("--detection", help="Probability with which the leak is to be found.")
-    ] = 0.9,
-    overrides: SetOption = None,
-    output: Annotated[PlanFormat, typer.Option("--format", help="Text, or one JSON object.")] = PlanFormat.text,
+    rig: opt.RigOption = "thesis",
+    machine: opt.MachineOption = None,
+    find: Annotated[str | None, Option(metavar="FLOW", help=_FIND)] = None,
+    command: Annotated[str, Option(help="Command of the machine's usual duty.")] = "3 sin(4t)",
+    load: Annotated[str, Option(help="Load of the usual duty: '500 N'.")] = "",
+    false_alarm: opt.FalseAlarmOption = 0.01,
+    detection: Annotated[float, Option(help="Probability with which the leak is to be found.")] = 0.9,
+    overrides: opt.SetOption = None,
+    output: Annotated[Literal["text", "json"], Option("--format", help="Text, or one JSON object.")] = "text",
 ) -> None:
     """Plan the recording that finds a leak: command, load and duration, and whether it tells piston from pump.
 
@@ -43,7 +31,6 @@ def plan(
     from sealscope.campaigns.smallest import PlannedDuty, plan_recording
     from sealscope.diagnosis.commissioned.machine_file import load_machine
     from sealscope.diagnosis.diagnose import check_probability
-    from sealscope.errors import InputError
     from sealscope.units import parse_quantity
 
     check_probability(false_alarm)
@@ -52,19 +39,12 @@ def plan(
     wanted = None if find is None else parse_quantity(find, "m^3/s", name="--find")
     if wanted is not None and not wanted > 0.0:
         raise InputError(f"--find must be a flow > 0, got {find}")
-    known = rig_with(rig, overrides)
-    if machine is not None:
-        stated = load_machine(machine).rig
-        if stated is None or overrides:
-            raise InputError(f"--machine must state a rig for a plan, without --set ({machine})")
-        known = stated
-    with progress() as update:
+    known = opt.rig_with(rig, overrides) if machine is None else load_machine(machine).rig
+    if known is None or (machine is not None and overrides):
+        raise InputError(f"--machine must state a rig for a plan, without --set ({machine})")
+    with opt.progress() as update:
         planned = plan_recording(
-            known,
-            wanted,
-            usual=PlannedDuty(command, load),
-            false_alarm=false_alarm,
-            detection=detection,
+            known, wanted, usual=PlannedDuty(command, load), false_alarm=false_alarm, detection=detection,
             progress=update,
-        )
-    typer.echo(json.dumps(planned.as_dict(), allow_nan=False) if output is PlanFormat.json else planned.text())
+        )  # fmt: skip
+    echo(json.dumps(planned.as_dict(), allow_nan=False) if output == "json" else planned.text())

@@ -180,9 +180,9 @@ def rms_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart
     return charts
 
 
+#: The leak over the recording, and the groups of charts in their order on the page.
 COURSE = "course"
-
-
+GROUPS = (COURSE, "rms", "channels", "details")
 #: The repair limit is drawn inside the frame up to this many times what else is shown.
 _LEVEL_SHOWN = 4.0
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
+from sealscope.recordings.formats.columns import counted
 from sealscope.reporting import messages, template
 
 #: Verdicts as an index orders them.
@@ -15,7 +16,7 @@ _ORDER = ("leak", "cannot tell", "no leak")
 
 
 def severity(diagnosis: Diagnosis) -> tuple[int, float, float, str]:
-    """Return what pages are ordered by: leaks by their size, then what cannot be told, then by what is passed."""
+    """Return what pages are ordered by: leaks by their size, then `cannot tell`, then by the total leakage."""
     own = diagnosis.severity
     size = 0.0 if own is None or own.of_limit is None else own.of_limit[0]
     flow = diagnosis.passage.lpm if diagnosis.passage is not None else None
@@ -35,12 +36,12 @@ def write_index(path: str | os.PathLike[str], pages: Sequence[tuple[Path, Diagno
             "verdict": diagnosis.verdict,
             "summary": diagnosis.summary,
             "since": messages.since(diagnosis),
-            "how_much": messages.how_much(diagnosis) or messages.passes_in_short(diagnosis),
+            "how_much": messages.how_much(diagnosis) or messages.leakage_in_short(diagnosis),
             "cause": messages.cause(diagnosis) if diagnosis.verdict == "leak" else None,
             "action": messages.what_to_do(diagnosis),
         }
         for page, diagnosis in ordered
     ]
     return template.write(
-        path, template.render("index.html.j2", title=f"{len(pages)} recordings: {summary}", rows=rows)
+        path, template.render("index.html.j2", title=f"{counted(len(pages), 'recording')}: {summary}", rows=rows)
     )

@@ -1,21 +1,35 @@
-"""Sentences on a diagnosis for page and terminal, and the terminal text."""
+"""Sentences on a diagnosis for page and terminal: `messages.toml` holds the words, this file chooses and fills in."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import tomllib
 from datetime import UTC, datetime
+from functools import cache
+from importlib import resources
 from math import floor, isfinite, isnan, log10
 from pathlib import PurePath
 from textwrap import fill, shorten
+from typing import Any
 
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LEAKS
 from sealscope.diagnosis.verdict.machine import AssumedMachine
-from sealscope.diagnosis.verdict.severity import Level
-from sealscope.recordings.formats.columns import listed
-from sealscope.recordings.quality import Finding
+from sealscope.recordings.formats.columns import counted, listed
 
 ABSENT = "–"
+#: Width of a line in a terminal.
+WIDTH = 80
+
+
+@cache
+def _texts() -> dict[str, dict[str, str]]:
+    return tomllib.loads((resources.files("sealscope.reporting") / "messages.toml").read_text(encoding="utf-8"))
+
+
+def _say(name: str, **values: Any) -> str:
+    """Return the text `section.key` with its values."""
+    section, _, key = name.partition(".")
+    return _texts()[section][key].format(**values)
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -45,26 +59,18 @@ def clock(seconds: float | None) -> str:
     return f"{text} ({sign}{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d})"
 
 
-#: A summary as a sentence; that of another cause is one.
-_SENTENCES: Mapping[str, str] = {
-    "leak": "Leak: oil bypasses the piston",
-    "no leak": "No leak found across the piston",
-    "cannot tell": "Cannot tell whether oil bypasses the piston",
-}
-
-
 def headline(diagnosis: Diagnosis) -> str:
     """Return the verdict as the heading of page and card: the summary of the terminal and of JSON, as a sentence."""
-    summary = diagnosis.summary
+    key = diagnosis.summary
     if diagnosis.verdict == "leak" and diagnosis.cause == "piston or pump leak":
-        return "Leak: oil bypasses the piston, or the pump"
-    if summary == "no leak" and not diagnosis.known_healthy:  # one from the start would be hidden
-        return "No leak began within this recording"
-    return _SENTENCES.get(summary, summary[0].upper() + summary[1:])
+        key = diagnosis.cause
+    elif key == "no leak" and not diagnosis.known_healthy:  # one from the start would be hidden
+        key = "none began"
+    return _texts()["headline"].get(key, key[0].upper() + key[1:])
 
 
 def cause(diagnosis: Diagnosis) -> str | None:
-    """Return what the change is attributed to; None where there is none, or it cannot be told."""
+    """Return what the change is attributed to; None where there is none, or it is not certain."""
     if diagnosis.cause in LEAKS and diagnosis.verdict != "leak":
         return None
     return diagnosis.cause
@@ -81,58 +87,46 @@ def since(diagnosis: Diagnosis) -> str | None:
     if diagnosis.verdict != "leak":
         return None
     if diagnosis.onset_s is None:
-        return "not within this recording: as a whole it was compared with leak-free ones"
-    text = clock(diagnosis.onset_s)
-    if diagnosis.onset_interval_s is not None:
-        low, high = diagnosis.onset_interval_s
-        text += f", between {clock(low)} and {clock(high)}"
-    return text
+        return _say("since.whole")
+    if diagnosis.onset_interval_s is None:
+        return clock(diagnosis.onset_s)
+    low, high = map(clock, diagnosis.onset_interval_s)
+    return _say("since.interval", onset=clock(diagnosis.onset_s), low=low, high=high)
 
 
 def how_much(diagnosis: Diagnosis) -> str | None:
     """Return how much oil leaks [L/min], or at most could where no leak was found; None where nothing is known."""
-    interval = diagnosis.leak_interval_lpm
-    if diagnosis.verdict != "leak" and diagnosis.bound_lpm is not None:
-        return f"none above {number(diagnosis.bound_lpm, 2)} L/min (95 % bound)"
-    if diagnosis.verdict == "no leak" and diagnosis.leak_lpm is not None and interval is not None and interval[1] > 0:
-        return f"none found; at most {number(interval[1], 2)} L/min (95 % interval)"
+    interval, leak = diagnosis.leak_interval_lpm, diagnosis.leak_lpm
     if diagnosis.verdict != "leak":
+        if diagnosis.bound_lpm is not None:
+            return _say("how_much.bound", bound=number(diagnosis.bound_lpm, 2))
+        if diagnosis.verdict == "no leak" and leak is not None and interval is not None and interval[1] > 0:
+            return _say("how_much.at_most", high=number(interval[1], 2))
         return None
-    if diagnosis.leak_lpm is None:
+    if leak is None:
         own = diagnosis.severity
         share = "" if own is None or own.pump_share is None else f"{_of_the_pump(own.pump_share[0])}; "
         return share + _why_no_flow(diagnosis)
-    text = f"{number(diagnosis.leak_lpm)} L/min"
-    if interval is not None:
-        text += f", between {number(interval[0])} and {number(interval[1])} L/min"
-    return text
+    if interval is None:
+        return f"{number(leak)} L/min"
+    return _say("how_much.interval", leak=number(leak), low=number(interval[0]), high=number(interval[1]))
 
 
 def _of_the_pump(share: float) -> str:
-    return f"{number(100.0 * share, 2)} % of the pump's flow in this duty"
+    return f"{_percent(share)} of the pump's flow in this duty"
 
 
 def _why_no_flow(diagnosis: Diagnosis) -> str:
     """Return why a leak has no L/min, and what would state it."""
-    ratio = diagnosis.measured_ratio
+    ratio, machine = diagnosis.measured_ratio, diagnosis.machine
     if "leak_lpm" not in diagnosis.refuses:
         small = diagnosis.passage is not None and diagnosis.passage.lpm is not None
-        return f"L/min not stated: {'it is too small for that' if small else 'the channels do not allow it'}"
-    if diagnosis.machine is not None and not diagnosis.machine.stated:
-        ask = "state --rig, or the piston's --area" if ratio is not None else "state --rig"
-        return f"L/min not stated: the size of the machine is not known; {ask}"
-    if diagnosis.machine is None or ratio is None:
-        return "not stated: see the reason"
-    return (
-        f"L/min not stated: displacement over area measures {number(ratio[0])} times that of rig "
-        f"{diagnosis.machine.rig}: check the rig and the units of x and theta"
-    )
-
-
-def _how_much_by_what(diagnosis: Diagnosis) -> str | None:
-    """Return how much oil leaks, with what the figure rests on."""
-    text, basis = how_much(diagnosis), rests_on(diagnosis)
-    return text if text is None or basis is None or diagnosis.leak_lpm is None else f"{text}; {basis}"
+        return _say(f"how_much.{'too_small' if small else 'channels'}")
+    if machine is not None and not machine.stated:
+        return _say(f"how_much.{'machine' if ratio is None else 'machine_or_area'}")
+    if machine is None or ratio is None:
+        return _say("how_much.reason")
+    return _say("how_much.ratio", ratio=number(ratio[0]), rig=machine.rig)
 
 
 def rests_on(diagnosis: Diagnosis) -> str | None:
@@ -142,44 +136,32 @@ def rests_on(diagnosis: Diagnosis) -> str | None:
 
 def machine_text(machine: AssumedMachine) -> str:
     """Return area and displacement that a flow rests on, and who stated them."""
-    area = f"{number(1e6 * machine.area)} mm²"
-    displacement = f"{number(1e6 * machine.displacement)} cm³/rev"
     if machine.stated_by == "recording":
-        return f"piston {area} and pump {displacement} by the recording's own rig, {machine.rig}"
-    if machine.stated:
-        by = f"by rig {machine.rig}, as stated" if machine.stated_by == "call" else "as stated"
-        return f"piston {area} and pump {displacement} {by}"
-    if machine.area_stated:
-        return f"piston {area} as stated"
-    if machine.displacement_stated:
-        return f"pump {displacement} as stated"
-    return f"assumed, for no rig was stated: piston {area} and pump {displacement} of rig {machine.rig}"
-
-
-#: What a level of severity means.
-_LEVELS: Mapping[Level, str] = {"repair": "over the limit: ", "plan": "", "follow": "well within: "}
-
-
-def _between_shares(low: float, high: float) -> str:
-    """Return a range of shares in per cent, from ten on as multiples."""
-    if high >= 10.0:
-        return f"{number(low, 2)} to {number(high, 2)} times"
-    return f"{number(100.0 * low, 2)} to {number(100.0 * high, 2)} % of"
+        key = "recording"
+    elif machine.stated:
+        key = "call" if machine.stated_by == "call" else "stated"
+    else:
+        key = "area" if machine.area_stated else "displacement" if machine.displacement_stated else "assumed"
+    area, displacement = f"{number(1e6 * machine.area)} mm²", f"{number(1e6 * machine.displacement)} cm³/rev"
+    return _say(f"machine.{key}", area=area, displacement=displacement, rig=machine.rig)
 
 
 def how_bad(diagnosis: Diagnosis) -> str | None:
     """Return the leak against the repair limit, else beside the pump's flow; None where neither is known."""
-    own = diagnosis.severity
+    own, limit = diagnosis.severity, diagnosis.limit
     if own is None:
         return None
     if own.level is not None and own.of_limit is not None:
-        by = "" if diagnosis.limit.stated else ", the default"
-        against = _between_shares(*own.of_limit[1:])
-        return f"{_LEVELS[own.level]}{against} the repair limit ({diagnosis.limit}{by})"
-    share = _pump_share(diagnosis)
-    if diagnosis.limit.stated:
-        return f"not compared with the limit of {diagnosis.limit}, which needs the machine's area (--area)"
-    return share
+        low, high = own.of_limit[1:]
+        share = f"{_span(low, high)} times" if high >= 10.0 else f"{_span(100.0 * low, 100.0 * high)} % of"
+        return _say(f"how_bad.{own.level}", share=share, limit=f"{limit}{'' if limit.stated else ', the default'}")
+    return _say("how_bad.no_area", limit=limit) if limit.stated else _pump_share(diagnosis)
+
+
+def _span(low: float, high: float) -> str:
+    """Return a range with two digits; a single number where its ends are the same."""
+    ends = number(low, 2), number(high, 2)
+    return ends[0] if ends[0] == ends[1] else " to ".join(ends)
 
 
 def other_sizes(diagnosis: Diagnosis) -> str | None:
@@ -202,50 +184,42 @@ def _pump_share(diagnosis: Diagnosis) -> str | None:
     return _of_the_pump(own.pump_share[0]) if known else None  # type: ignore[union-attr, index]
 
 
-def passes(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
-    """Return what pump and piston together pass, and what of it would have shown; None where it is not known.
+def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
+    """Return the leakage of pump and piston together, and which step would have been found; None where not known.
 
     `basis`: with what L/min rests on.
     """
     own = diagnosis.passage
     if own is None:
         return None
-    pressure = f"at {number(own.pressure / 1e6, 2)} MPa"
+    pressure, findable = f"{number(own.pressure / 1e6, 2)} MPa", f"{number(own.findable_lpm, 2)} L/min"
     if own.lpm is None or own.interval_lpm is None:
-        text = "not measured"
-        if own.pump_share is not None:
-            text = f"pump and piston together {_percent(own.pump_share)} of the pump's flow {pressure}"
-        if own.findable_share is not None:
-            text += f"; the smallest step that would have been found is {_percent(own.findable_share)}"
-            text += "" if own.pump_share is not None else " of the pump's flow"
-            text += "" if own.findable_lpm is None else f", {number(own.findable_lpm, 2)} L/min"
-        return text
+        known = own.pump_share is not None
+        key = "share" if known else "not_measured"
+        text = _say(f"leakage.{key}", share=_percent(own.pump_share), pressure=pressure)
+        if own.findable_share is None:
+            return text
+        size = _percent(own.findable_share) + ("" if known else " of the pump's flow")
+        return text + _say("leakage.findable", size=size if own.findable_lpm is None else f"{size}, {findable}")
     low, high = own.interval_lpm
-    if not high > 0.0:
-        text = f"pump and piston together less than this recording measures, {pressure}"
-    elif not low > 0.0:
-        text = f"pump and piston together at most {number(high, 2)} L/min {pressure}"
-    else:
-        text = f"pump and piston together {number(own.lpm, 2)} L/min, between {number(low, 2)} and {number(high, 2)}, "
-        text += pressure
+    key = "none" if not high > 0.0 else "at_most" if not low > 0.0 else "interval"
+    figures = {"lpm": number(own.lpm, 2), "low": number(low, 2), "high": number(high, 2)}
+    text = _say(f"leakage.{key}", pressure=pressure, **figures)
     if basis and diagnosis.verdict != "leak" and (machine := rests_on(diagnosis)) is not None:
         text += f" ({machine})"
-    if own.healthy_lpm is not None:
-        text += f"; a healthy machine at most {number(own.healthy_lpm, 2)} L/min"
-    if own.findable_lpm is not None:
-        text += f"; the smallest step that would have been found is {number(own.findable_lpm, 2)} L/min"
-    return text
+    text += "" if own.healthy_lpm is None else _say("leakage.healthy", lpm=number(own.healthy_lpm, 2))
+    return text + ("" if own.findable_lpm is None else _say("leakage.findable", size=findable))
 
 
-def passes_in_short(diagnosis: Diagnosis) -> str | None:
-    """Return what pump and piston together pass, in a few words; None where it is not known or there is a leak."""
+def leakage_in_short(diagnosis: Diagnosis) -> str | None:
+    """Return the leakage of pump and piston in a few words; None where it is not known or there is a leak."""
     own = diagnosis.passage
     if own is None or diagnosis.verdict == "leak":
         return None
     if own.lpm is None or own.interval_lpm is None:
-        return None if own.pump_share is None else f"passes {_percent(own.pump_share)} of the pump's flow"
+        return None if own.pump_share is None else f"in all {_percent(own.pump_share)} of the pump's flow"
     low, high = own.interval_lpm
-    return f"passes {number(own.lpm, 2)} L/min" if low > 0.0 else f"passes at most {number(high, 2)} L/min"
+    return f"in all {number(own.lpm, 2)} L/min" if low > 0.0 else f"in all at most {number(high, 2)} L/min"
 
 
 def states_flow(diagnosis: Diagnosis) -> bool:
@@ -260,18 +234,18 @@ def _percent(share: float | None) -> str:
 def how_sure(diagnosis: Diagnosis) -> str:
     """Return how many healthy recordings look like this, the score against its threshold, and what that means."""
     if diagnosis.score is None or diagnosis.threshold is None:
-        return "no score was formed"
-    said = _odds(diagnosis)
-    odds = "" if said is None else f"{said}; "
+        return _say("how_sure.no_score")
+    odds, other = _odds(diagnosis), cause(diagnosis)
+    odds = "" if odds is None else f"{odds}; "
     relation = "over" if diagnosis.score > diagnosis.threshold else "not over"
-    other = cause(diagnosis)
     if diagnosis.verdict != "leak" and other is not None and diagnosis.alarmed:
-        odds = f"that something changed: {odds}"
-        relation = f"for {other}, over"
-    text = f"score {number(diagnosis.score)}, {relation} the threshold of {number(diagnosis.threshold)}"
+        odds, relation = f"that something changed: {odds}", f"for {other}, over"
     judge = diagnosis.methods[0].detector if diagnosis.methods else ""
-    by = f" of {judge}" if judge else ""
-    return f"{odds}{text}{by}; {false_alarms(diagnosis)}"
+    return _say(
+        "how_sure.score", odds=odds, score=number(diagnosis.score), relation=relation,
+        threshold=number(diagnosis.threshold), judge=f" of {judge}" if judge else "",
+        false_alarms=false_alarms(diagnosis),
+    )  # fmt: skip
 
 
 def in_short(diagnosis: Diagnosis) -> str:
@@ -290,78 +264,41 @@ def _odds(diagnosis: Diagnosis) -> str | None:
 def false_alarms(diagnosis: Diagnosis) -> str:
     """Return what the threshold was set for."""
     p = diagnosis.false_alarm_probability
-    if 0 < p < 1:
-        every = 1 / p
-        shown = f"{round(every)}" if every >= 10 else number(every)
-        share = f"{number(100 * p)} % (1 in {shown})"
-        return f"the threshold is set so that {share} of leak-free recordings raise a false alarm"
-    return f"the threshold is set for a false-alarm probability of {number(p)}"
-
-
-def _fault(finding: Finding) -> str:
-    name = finding.code.replace("_", " ")
-    return f"{name} ({finding.channel})" if finding.channel else name
-
-
-def _after_that(diagnosis: Diagnosis) -> str:
-    """Return what to do about a leak that is confirmed, by its severity."""
-    own = diagnosis.severity
-    level = None if own is None else own.level
-    if level == "repair":
-        return (
-            f"If it is confirmed, change the seal, or the pump, now: the leak is over the repair limit of "
-            f"{diagnosis.limit}."
-        )
-    if level == "follow":
-        return (
-            f"If it is confirmed, follow it in every recording; it is under half of the repair limit of "
-            f"{diagnosis.limit}, and nothing is urgent."
-        )
-    return "If it is confirmed, plan the change of the piston seal and follow the leak in every recording until then."
+    if not 0 < p < 1:
+        return _say("how_sure.probability", probability=number(p))
+    every = f"{round(1 / p)}" if 1 / p >= 10 else number(1 / p)
+    return _say("how_sure.share", share=f"{number(100 * p)} % (1 in {every})")
 
 
 def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
     """Return what to check next, most useful first."""
-    trouble = [finding for finding in diagnosis.quality if finding.severity != "note"]
-    faults = ", ".join(dict.fromkeys(_fault(finding) for finding in trouble))
-    repeat = "Repeat the recording with the same command and oil temperature: a worn seal shows again."
-    plan = _after_that(diagnosis)
-    if diagnosis.cause is not None and (diagnosis.verdict == "leak") == (diagnosis.cause in LEAKS):
-        steps = [diagnosis.next_check, repeat, plan]
-        if diagnosis.verdict != "leak":
-            steps[1:] = ["Record again under the same command when that is settled: a leak may hide behind it."]
-        if trouble:
-            steps.insert(0, f"Rule out a fault of the data first: {faults}.")
+    level = None if diagnosis.severity is None else diagnosis.severity.level
+    confirmed = _say(f"once_confirmed.{level or 'plan'}", limit=diagnosis.limit)
+    named = diagnosis.cause is not None and (diagnosis.verdict == "leak") == (diagnosis.cause in LEAKS)
+    if named and diagnosis.verdict == "leak":
+        steps = [diagnosis.next_check, _say("next.repeat"), confirmed]
+    elif named:
+        steps = [diagnosis.next_check, _say("next.resolved")]
     elif diagnosis.verdict == "leak":
-        steps = [
-            repeat,
-            "Make sure that the bypass needle valve is shut. The pressures cannot tell it from the piston seal.",
-            "Hold the piston against a load with the motor at rest and watch x: creep confirms the leak.",
-            plan,
-        ]
-        if trouble:
-            steps.insert(0, f"Rule out a fault of the data first: {faults}.")
+        steps = [*map(_say, ("next.repeat", "next.bypass", "next.creep")), confirmed]
     elif diagnosis.verdict == "no leak":
-        steps = [
-            diagnosis.next_check,
-            "A leak too small to lift the score over its threshold stays unseen; a longer recording sees smaller ones.",
-        ]
-        if trouble:
-            steps.insert(0, f"Judge with care, the data have faults: {faults}.")
+        steps = [diagnosis.next_check, _say("next.longer")]
     else:
-        steps = ["Remove the cause named above and record again; a verdict was not forced out of these data."]
-        if trouble:
-            steps.append(f"Findings on the data: {faults}.")
-        steps.append("Record p_A and p_B at 500 Hz or more for some minutes under one command, or give a baseline.")
+        steps = [_say("next.cause"), _say("next.record")]
+    trouble = [finding for finding in diagnosis.quality if finding.severity != "note"]
+    if trouble:
+        names = [f"{own.code.replace('_', ' ')}{f' ({own.channel})' if own.channel else ''}" for own in trouble]
+        key = "rule_out" if named or diagnosis.verdict == "leak" else "care"
+        key, place = ("findings", 1) if not named and diagnosis.verdict == "cannot tell" else (key, 0)
+        steps.insert(place, _say(f"next.{key}", faults=", ".join(dict.fromkeys(names))))
     return tuple(steps)
 
 
 def quality_summary(diagnosis: Diagnosis) -> str:
     """Return how many findings there are, and the worst severity among them."""
-    count = len(diagnosis.quality)
     severities = {finding.severity for finding in diagnosis.quality}
     worst = next((f" ({severity})" for severity in ("fatal", "warning") if severity in severities), "")
-    return f"{count} finding{'s' if count != 1 else ''}{worst},"
+    return f"{counted(len(diagnosis.quality), 'finding')}{worst}"
 
 
 def raw_counts(diagnosis: Diagnosis) -> str | None:
@@ -372,71 +309,71 @@ def raw_counts(diagnosis: Diagnosis) -> str | None:
 
 def not_used(diagnosis: Diagnosis) -> str | None:
     """Return which recorded pressures, positions and speeds no channel is made of; None where all are."""
-    return f"{listed(diagnosis.unused)}: recorded, and taken for no channel" if diagnosis.unused else None
+    return f"{listed(diagnosis.unused)}: recorded, and used for no channel" if diagnosis.unused else None
 
 
-def short_text(diagnosis: Diagnosis, *, width: int = 80) -> str:
+def short_text(diagnosis: Diagnosis, *, width: int = WIDTH) -> str:
     """Return the verdict, its figures and the next step as plain text of about five lines; `width`: columns [1]."""
+    untold = diagnosis.verdict == "cannot tell"
     sure = in_short(diagnosis) if diagnosis.odds or diagnosis.score is not None else None
     rows = [
-        ("since", since(diagnosis)),
-        ("how much", _how_much_by_what(diagnosis)),
-        ("how bad", how_bad(diagnosis)),
-        ("passes", passes(diagnosis) if diagnosis.verdict == "no leak" else None),
+        *_figures(diagnosis),
+        ("leakage", total_leakage(diagnosis) if diagnosis.verdict == "no leak" else None),
         ("cause", cause(diagnosis)),
-        ("how sure", sure if diagnosis.verdict != "cannot tell" else None),
-        ("reason", diagnosis.reason if diagnosis.verdict == "cannot tell" else None),
-        ("data", quality_summary(diagnosis).rstrip(",") if diagnosis.quality else None),
+        ("reason", diagnosis.reason) if untold else ("how sure", sure),
+        ("data", quality_summary(diagnosis) if diagnosis.quality else None),
         ("units", raw_counts(diagnosis)),
         ("not used", not_used(diagnosis)),
         ("next", next_steps(diagnosis)[0]),
     ]
-    lines = [_row(label, text, width) for label, text in rows if text]
-    return "\n".join((f"{_printable(diagnosis.file)}: {diagnosis.summary}", *lines))
+    return _lines(diagnosis, rows, width)
 
 
-def diagnosis_text(diagnosis: Diagnosis, *, width: int = 80) -> str:
+def diagnosis_text(diagnosis: Diagnosis, *, width: int = WIDTH) -> str:
     """Return the verdict and its figures as plain text, with every method and finding.
 
     `width`: columns [1]. Without colours, and without control characters that a file name or header could bring.
     """
-    lines = [f"{_printable(diagnosis.file)}: {diagnosis.summary}"]
-    rows = [
+    rows: list[tuple[str, str | None]] = [
         ("state", state(diagnosis)),
-        ("since", since(diagnosis)),
-        ("how much", _how_much_by_what(diagnosis)),
-        ("how bad", how_bad(diagnosis)),
+        *_figures(diagnosis),
         ("which is", other_sizes(diagnosis)),
-        ("passes", passes(diagnosis)),
+        ("leakage", total_leakage(diagnosis)),
         ("cause", cause(diagnosis)),
         ("how sure", how_sure(diagnosis)),
-        ("reason", diagnosis.reason or None),
+        ("reason", diagnosis.reason),
         ("not used", not_used(diagnosis)),
     ]
-    lines += [_row(label, text, width) for label, text in rows if text]
     for method in diagnosis.methods:
         odds = "" if method.odds is None else f"{method.odds}; "
-        figures = f"{method.summary} ({odds}score {number(method.score)}, threshold {number(method.threshold)})"
-        if method.score is None and method.reason:
-            figures = f"{method.summary} ({method.reason})"
-        lines.append(_row("method", f"{method.detector}: {figures}", width))
-    lines += [_row(finding.severity, finding.text, width) for finding in diagnosis.quality]
-    lines += [_row("next" if i == 0 else "", step, width) for i, step in enumerate(next_steps(diagnosis)[:2])]
-    return "\n".join(lines)
+        figures = f"{odds}score {number(method.score)}, threshold {number(method.threshold)}"
+        figures = method.reason if method.score is None and method.reason else figures
+        rows.append(("method", f"{method.detector}: {method.summary} ({figures})"))
+    rows += [(finding.severity, finding.text) for finding in diagnosis.quality]
+    rows += [("" if k else "next", step) for k, step in enumerate(next_steps(diagnosis)[:2])]
+    return _lines(diagnosis, rows, width)
+
+
+def _figures(diagnosis: Diagnosis) -> list[tuple[str, str | None]]:
+    size, basis = how_much(diagnosis), rests_on(diagnosis)
+    if size is not None and basis is not None and diagnosis.leak_lpm is not None:
+        size = f"{size}; {basis}"
+    return [("since", since(diagnosis)), ("how much", size), ("how bad", how_bad(diagnosis))]
+
+
+def _lines(diagnosis: Diagnosis, rows: list[tuple[str, str | None]], width: int) -> str:
+    """Return a line with the verdict, and a paragraph for each row that has a text."""
+    blank = " " * 12
+    texts = [
+        fill(_printable(text), width, initial_indent=f"  {label:<10}", subsequent_indent=blank, break_on_hyphens=False)
+        for label, text in rows
+        if text
+    ]
+    return "\n".join((f"{_printable(diagnosis.file)}: {diagnosis.summary}", *texts))
 
 
 def _printable(text: str) -> str:
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
-
-
-def _row(label: str, text: str, width: int) -> str:
-    return fill(
-        _printable(text), width, initial_indent=f"  {label:<10}", subsequent_indent=" " * 12, break_on_hyphens=False
-    )
-
-
-#: Width of a line of a table in a terminal.
-WIDTH = 80
 
 
 def flow(diagnosis: Diagnosis) -> str:
@@ -450,7 +387,7 @@ def flow(diagnosis: Diagnosis) -> str:
 
 
 def what_to_do(diagnosis: Diagnosis) -> str:
-    """Return the first thing to do, where nothing can be told its reason."""
+    """Return the first thing to do; the reason where there is no verdict."""
     return diagnosis.reason if diagnosis.verdict == "cannot tell" else next_steps(diagnosis)[0]
 
 
@@ -460,9 +397,9 @@ def table_line(diagnosis: Diagnosis, start_s: float | None = None) -> str:
     `start_s`: when the recording began [s since 1970].
     """
     file = PurePath(diagnosis.file).name
-    file = file if len(file) <= 28 else f"{file[:13]}..{file[-13:]}"
+    file = file if len(file) <= 22 else f"{file[:10]}..{file[-10:]}"
     date = "" if start_s is None else datetime.fromtimestamp(start_s, UTC).date().isoformat()
-    line = f"{file:<28}  {date:<10}  {diagnosis.verdict:<11}  {flow(diagnosis)}"
+    line = f"{file:<22} {date:<10} {diagnosis.verdict:<11} {flow(diagnosis)}"
     if diagnosis.verdict == "no leak":
         return line
     return f"{line}\n    {shorten(what_to_do(diagnosis), WIDTH - 4)}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -183,20 +184,16 @@ def render_page(
     )
 
 
-def _areas(circuit: Circuit) -> str:
-    at_A, at_B = circuit.values["A_A"], circuit.values["A_B"]
-    return at_A if at_A == at_B else f"{at_A} at A and {at_B} at B"
-
-
 def _machine(circuit: Circuit, rig: Rig | None) -> list[tuple[str, str]]:
     """Return what the rig says of the machine, as the page shows it beside the drawing."""
     if rig is None:
         return []
     values = circuit.values
+    areas = values["A_A"] if values["A_A"] == values["A_B"] else f"{values['A_A']} at A and {values['A_B']} at B"
     throttles = f"closed {values['closed_A']} at A, {values['closed_B']} at B" if circuit.throttles else "none"
     return [
         ("Rig", rig.title or rig.name),
-        ("Cylinder", f"{circuit.cylinder}, area {_areas(circuit)}, stroke {values['L']}"),
+        ("Cylinder", f"{circuit.cylinder}, area {areas}, stroke {values['L']}"),
         ("Pump", f"displacement {values['q_b']}"),
         ("Throttles", throttles),
     ]
@@ -221,37 +218,25 @@ def _evidence(
     shown: list[charts.Chart],
     marks: list[Mark],
 ) -> dict[str, Any]:
+    """Return charts by group, what is marked on them, the spans that the buttons show, and how samples are drawn."""
     base, span = drawn.base, drawn.data["span"]
     onset, _ = charts.onset_within(diagnosis, span)
-    fine = base.fine
-
-    def base_t(sample: int) -> float:
-        return float(sample / recording.rate if base.by_sample else recording.t[sample])
-
-    first, last = base_t(fine.start), base_t(fine.stop - 1)
-    if base.width == 1:
-        decimation = "Every sample is drawn."
-    else:
-        decimation = (
-            f"Of each {base.width} samples in turn ({1000 * base.width / recording.rate:.3g} ms) the least and the "
-            f"greatest are drawn, so every peak is kept; from {first:.1f} s to {last:.1f} s every sample is drawn. "
-            "Values are rounded to 1/65 534 of their range. The verdict and all numbers rest on every sample."
-        )
-    if base.by_sample:
-        decimation += " The time stamps are out of order: time is drawn as the sample's number over the rate."
+    t = np.arange(len(recording)) / recording.rate if base.by_sample else recording.t
+    first, last = float(t[base.fine.start]), float(t[base.fine.stop - 1])
 
     def around(seconds: float) -> tuple[float, float] | None:
         return None if onset is None else (max(span[0], onset - seconds), min(span[1], onset + seconds))
 
-    groups = {group: [c for c in shown if c.group == group] for group in (charts.COURSE, "rms", "channels", "details")}
     return {
-        "groups": groups,
+        "groups": {group: [own for own in shown if own.group == group] for group in charts.GROUPS},
         "still": drawn.still,
         "events": charts.events(diagnosis, span, marks),
         "span": span,
         "around": around(20.0),
         "close": (first, last) if base.width > 1 else around(2.0),
-        "decimation": decimation,
+        "base": base,
+        "bucket_ms": f"{1000 * base.width / recording.rate:.3g}",
+        "fine": (first, last),
         "window": features.WINDOW,
         "step": features.STEP,
     }
@@ -260,39 +245,16 @@ def _evidence(
 def _changes(
     recording: Recording, diagnosis: Diagnosis, chambers: list[features.ChamberDetails], pressure_unit: str
 ) -> dict[str, Any]:
+    """Return the RMS of each detail in both parts in the unit shown, and the end of the scale of their changes [%]."""
     parts = features.parts_to_compare(diagnosis, recording)
-    rows: list[dict[str, Any]] = []
+    rows = []
     for change in features.changes(recording, chambers, parts):
         unit, size = charts.detail_unit(recording.units[change.channel], change.name, pressure_unit)
-        percent = change.percent
-        rows.append(
-            {
-                "channel": change.channel,
-                "label": charts.label_of(change.name),
-                "unit": unit,
-                "before": None if change.before is None else change.before / size,
-                "after": None if change.after is None else change.after / size,
-                "percent": percent,
-                "percent_text": _signed_percent(percent),
-            }
-        )
-    limit = max([10.0, *(abs(row["percent"]) for row in rows if row["percent"] is not None)])
-    limit = min(100.0, float(np.ceil(limit / 10) * 10))
-    for row in rows:
-        row["bar"] = _bar(row["percent"], limit)
-    return {"changes": rows, "bar_limit": f"{limit:g}", "parts": parts}
-
-
-def _signed_percent(percent: float | None) -> str:
-    return messages.ABSENT if percent is None else f"{round(percent, 1) + 0.0:+.1f} %".replace("-", "−")
-
-
-def _bar(percent: float | None, limit: float) -> dict[str, str] | None:
-    if percent is None:
-        return None
-    half = 50 * min(1.0, abs(percent) / limit)
-    down = percent < 0
-    return {"way": "down" if down else "up", "left": f"{50 - half if down else 50:.1f}", "width": f"{half:.1f}"}
+        before, after = (None if value is None else value / size for value in (change.before, change.after))
+        label = charts.label_of(change.name)
+        rows.append((change.channel, label, unit, before, after, change.percent))
+    largest = max([10.0, *(abs(row[-1]) for row in rows if row[-1] is not None)])
+    return {"changes": rows, "bar_limit": min(100.0, 10.0 * ceil(largest / 10.0)), "parts": parts}
 
 
 def _summary(recording: Recording, name: str, pressure_unit: str) -> dict[str, Any]:

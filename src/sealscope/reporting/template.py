@@ -38,7 +38,7 @@ def _environment() -> jinja2.Environment:
 
 
 def render(template: str, **context: Any) -> str:
-    """Return a template of this room filled in; beside `context` it sees `version` and `page_css`.
+    """Return a template of this package filled in; beside `context` it sees `version` and `page_css`.
 
     Control characters that a file's name or description brought are replaced.
     """
@@ -48,7 +48,7 @@ def render(template: str, **context: Any) -> str:
 
 
 def packaged(name: str) -> Markup:
-    """Return a file of this room that goes into a page as it is."""
+    """Return a file of this package that goes into a page as it is."""
     from markupsafe import Markup
 
     return Markup((resources.files("sealscope.reporting") / name).read_text(encoding="utf-8"))
@@ -70,7 +70,7 @@ def script_json(value: Any) -> Markup:
 
 
 def check_page(path: str | os.PathLike[str], *, card: bool = True) -> Path:
-    """Return the path of a page to write, `card`: or of its picture; raises InputError for another kind of file."""
+    """Return the path of a page to write, `card`: or of its picture; raises InputError for a wrong kind of file."""
     suffixes = _SUFFIXES if card else _SUFFIXES[:-1]
     if Path(path).suffix.lower() not in suffixes:
         raise InputError(f"a page must be a file {', '.join(suffixes)}, got {os.fspath(path)}")

@@ -113,7 +113,7 @@ class DetailStream:
         Parameters
         ----------
         block : array_like
-            Samples (channels, n), or (n,) of a single signal; n may be 0. A missing sample (NaN) spoils its own signal
+            Samples (channels, n), or (n,) of a single signal; n may be 0. A missing sample (NaN) affects its own signal
             alone, for `settling` columns after it.
         out : ndarray, optional
             C-contiguous doubles to write into, in the shape of what is returned. For a block of C-contiguous doubles
@@ -127,7 +127,7 @@ class DetailStream:
         Raises
         ------
         InputError
-            For a block or an `out` of another shape.
+            For a block or an `out` of a wrong shape.
         """
         from sealscope.signals.kernels import advance_details
 
@@ -176,7 +176,7 @@ class DetailStream:
         return ThreadPoolExecutor(len(self._shares))
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that the stream knows: settings, samples seen, and the `history` to filter with."""
+        """Return all that the stream knows: settings, number of samples, and the `history` to filter with."""
         history = self._buffers[:, :, :, self._fill - self._history : self._fill]
         return {
             "channels": self.channels,
@@ -199,7 +199,7 @@ class DetailStream:
 
     @classmethod
     def from_state(cls, state: dict[str, Any], *, threads: int = 1) -> DetailStream:
-        """Return the stream that `state_dict` described, bit for bit; raises InputError for another state."""
+        """Return the stream that `state_dict` described, bit for bit; raises InputError for a wrong state."""
         channels, levels, wavelet = (saved_part(state, name, "detail stream") for name in _SETTINGS)
         stream = cls(
             tuple(channels) if isinstance(channels, list) else channels, levels, wavelet=wavelet, threads=threads

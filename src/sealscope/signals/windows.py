@@ -173,7 +173,7 @@ class RmsStream:
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> RmsStream:
-        """Return the stream that `state_dict` described; raises InputError for another state."""
+        """Return the stream that `state_dict` described; raises InputError for a wrong state."""
         what = "RMS stream"
         size, step = (saved_part(state, name, what) for name in ("size", "step"))
         stream = cls(size, step, skip=saved_count(state, "skip", what))

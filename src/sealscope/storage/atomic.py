@@ -78,7 +78,7 @@ def remove_temporaries(folder: Path, target: str | None = None) -> None:
     """Remove the temporary files in `folder` whose process was killed, those of the file `target` or of all.
 
     A process of this machine that is gone has left its files for good; those of another machine are given up after a
-    day. Links to folders are not followed.
+    day. Links to folders are not resolved.
     """
     for path in folder.glob(".*.part") if target is not None else folder.rglob(".*.part"):
         name = _TEMPORARY.fullmatch(path.name)

@@ -19,7 +19,7 @@ def make_folder(folder: Path) -> None:
 
 
 def inner_folder(folder: Path, *names: str) -> Path:
-    """Create the folders `names`, each in the one before it, within `folder`, which may come from a stranger.
+    """Create the folders `names`, each in the one before it, within `folder`, which may come from outside.
 
     Returns the last of them. Raises InputError where one cannot be created, or is a link to a folder elsewhere.
     """
@@ -36,7 +36,7 @@ def inner_folder(folder: Path, *names: str) -> Path:
 def locked(file: Path, busy: str | None) -> Iterator[None]:
     """Hold the lock `file` of a folder of results while the block runs; the process's end releases it, too.
 
-    `busy`: message of the InputError that is raised where another process holds it; None to wait for its end. The file
+    `busy`: message of the InputError that is raised where a second process holds it; None to wait for its end. The file
     is created where it is absent, and never emptied. Raises InputError for a link in its place.
     """
     from filelock import FileLock, Timeout

@@ -52,8 +52,8 @@ def open_regular(path: str | os.PathLike[str], what: str) -> BinaryIO:
 def open_inner(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+"] = "rb") -> BinaryIO:
     """Open a file of a folder of results: `rb` to read, `ab+` to append to it, and to create it first if need be.
 
-    The folder may come from a stranger. Raises InputError for a link, for anything else that is no regular file and,
-    to write, for a file with another name beside this one (a hard link); OSError where it cannot be opened.
+    The folder may come from outside. Raises InputError for a link, for anything else that is no regular file and,
+    to write, for a file with a second name (a hard link); OSError where it cannot be opened.
     """
     if Path(path).is_symlink():
         raise InputError(f"{what} must be a file, got a link ({path})")

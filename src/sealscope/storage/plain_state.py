@@ -52,7 +52,7 @@ def array_of(value: Any, name: str) -> NDArray[np.float64]:
 
 
 def part_of(state: Any, name: str, kind: type | tuple[type, ...]) -> Any:
-    """Return the part `name` of a saved state; raises InputError where it is missing or of another kind."""
+    """Return the part `name` of a saved state; raises InputError where it is missing or of a wrong kind."""
     if not isinstance(state, Mapping) or name not in state:
         raise InputError(f"saved state must have {name!r}, got {type(state).__name__} without")
     value = state[name]

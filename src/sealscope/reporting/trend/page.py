@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 from sealscope.diagnosis.trend.trend import Trend
+from sealscope.recordings.formats.columns import counted
 from sealscope.reporting import messages, template
 from sealscope.reporting.trend import text
 from sealscope.reporting.trend.chart import SIZES, chart_of
@@ -25,7 +26,7 @@ def render_trend_page(trend: Trend, *, title: str = "") -> str:
         trend=trend,
         text=text,
         title=title or "Trend of a machine",
-        subtitle=f"{count} recording{'' if count == 1 else 's'}{span}",
+        subtitle=f"{counted(count, 'recording')}{span}",
         n=messages.number,
         charts=[(size, chart) for size in SIZES if (chart := chart_of(trend, size)) is not None],
     )

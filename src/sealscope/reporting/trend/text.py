@@ -13,6 +13,7 @@ from sealscope.diagnosis.inference.onset import Interval
 from sealscope.diagnosis.trend.reading import DAY, TrendPoint
 from sealscope.diagnosis.trend.trend import Trend
 from sealscope.diagnosis.trend.wear import MONTH
+from sealscope.recordings.formats.columns import counted
 from sealscope.reporting.messages import machine_text, number
 
 #: Times are shown to the minute where all recordings lie within so many days.
@@ -64,7 +65,7 @@ def headline(trend: Trend) -> str:
     if trend.verdict == "no leak" and trend.repairs:  # what was before is over
         onset = f" since {moment(trend, trend.repairs[-1].day)}, when the level fell"
     span = f", {moment(trend, trend.points[0].day)} to {moment(trend, trend.points[-1].day)}" if count else ""
-    return f"{trend.verdict}{onset}: {count} recording{'' if count == 1 else 's'}{span}"
+    return f"{trend.verdict}{onset}: {counted(count, 'recording')}{span}"
 
 
 def sentence(trend: Trend) -> str:
@@ -76,7 +77,7 @@ def sentence(trend: Trend) -> str:
     if trend.verdict == "leak" and wear is not None and trend.alarm is not None:
         return "The leakage grows" if wear.step is None else "The leakage stepped up"
     if trend.alarm is not None:
-        return "The ringing of the pressures changed; a leak cannot be told from other causes"
+        return "The ringing of the pressures changed; a leak cannot be separated from other causes"
     return "Cannot tell"
 
 
@@ -189,7 +190,7 @@ def trend_text(trend: Trend, *, whole: bool = False) -> str:
         rows.append(("reason", trend.reason))
     rows.append(("next", trend.next_check))
     lines = [fill(text, 80, initial_indent=f"  {name:<8}", subsequent_indent=10 * " ") for name, text in rows if text]
-    return "\n".join([headline(trend), *lines])
+    return "\n".join([fill(headline(trend), 80, subsequent_indent="  "), *lines])
 
 
 def trend_csv(trend: Trend) -> str:
