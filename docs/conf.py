@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import json
 import os
 import re
 from importlib import import_module
@@ -25,7 +26,7 @@ extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 html_theme = "furo"
 html_title = f"Sealscope {release}"
 html_static_path: list[str] = []
-exclude_patterns = ["examples", "_build", "**.ipynb_checkpoints"]
+exclude_patterns = ["reference/generated/speed.md", "examples", "_build", "**.ipynb_checkpoints"]
 
 # no page needs a network: formulas are text, and the search is a file
 myst_enable_extensions = ["deflist"]
@@ -50,7 +51,7 @@ _OUTSIDE += "|pair|floats|two floats"  # `pair of floats`
 _OUTSIDE += r"|shape .*|(?:pandas|xarray|pathlib|matplotlib)\..*"
 nitpick_ignore_regex = [("py:class", f"(?:{_OUTSIDE})"), ("py:obj", "True|False")]
 
-os.environ.setdefault("COLUMNS", "84")  # of what commands print in the tutorials
+os.environ.setdefault("COLUMNS", "80")  # of what commands print in the tutorials
 _GENERATED = Path(__file__).parent / "reference" / "generated"
 
 
@@ -155,9 +156,27 @@ def parameters() -> str:
     return "\n".join(lines) + "\n"
 
 
+def speed() -> str:
+    """Return the times of the simulator beside programs in C++, from what `benchmarks/run.py` measured last."""
+    results = Path(__file__).parents[1] / "benchmarks" / "results"
+    solvers, batch = (
+        json.loads((results / f"{name}.json").read_text(encoding="utf-8")) for name in ("solvers", "batch")
+    )
+    lines = ["| 180 s of | milliseconds a run | of the time of C++ |", "| --- | --- | --- |"]
+    for case, figures in solvers["figures"].items():
+        for peer, (ratio, *_) in figures["promised"].items():
+            seconds = figures["solvers"]["ours, step chosen by error"]["seconds"][0]
+            lines.append(f"| one run, {case} | {1e3 * seconds:.0f} | {100 * ratio:.0f} % of {peer} |")
+    for case, figures in batch["figures"]["cases"].items():
+        ours, ratio = figures["ours"][0], figures["ratio"][0]
+        lines.append(f"| 256 runs, {case} | {1e3 * ours:.1f} of a core | {100 * ratio:.0f} % |")
+    return "\n".join([*lines, "", f"Measured {solvers['measured']} on {solvers['machine']}."]) + "\n"
+
+
 def _write(_app: object) -> None:
     _GENERATED.mkdir(exist_ok=True)
     pages = {"cli": command_line(), "api": public_names(), "types": type_reference(), "parameters": parameters()}
+    pages["speed"] = speed()
     for name, text in pages.items():
         (_GENERATED / f"{name}.md").write_text(text, encoding="utf-8")
 
