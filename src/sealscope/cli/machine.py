@@ -59,6 +59,10 @@ def commission(
         raise InputError("--since must stand with --add, for a machine that is known")
     check_folder(output)
     if add:
+        stated = {"--rig": rig, "--area": area, "--displacement": displacement, "--map": maps, "--rate": rate}
+        for name, value in {**stated, "--limit": limit}.items():
+            if value:
+                raise InputError(f"{name} must not stand beside --add: the machine's file states it")
         machine = load_machine(output)
         for path in recordings_in(files):
             machine = machine.with_healthy(machine.read(path), file=path.name, checksum=checksum_of(path))

@@ -54,10 +54,12 @@ def plan(
         raise InputError(f"--find must be a flow > 0, got {find}")
     known = rig_with(rig, overrides)
     if machine is not None:
-        stated = load_machine(machine).rig
-        if stated is None or overrides:
-            raise InputError(f"--machine must state a rig for a plan, without --set ({machine})")
-        known = stated
+        commissioned = load_machine(machine)
+        if commissioned.rig is None or not commissioned.rig.states("cylinder.M_eq") or overrides:
+            smallest = commissioned.summary.smallest
+            shown = "" if smallest is None else f"; another recording like the healthy ones shows {smallest}"
+            raise InputError(f"a plan simulates a machine: commission it by --rig, without --set ({machine}){shown}")
+        known = commissioned.rig
     with progress() as update:
         planned = plan_recording(
             known,

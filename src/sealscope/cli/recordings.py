@@ -104,8 +104,7 @@ class _Reading:
         """Read a file, standard input for `-`; the rig's map is for files that have its columns."""
         if file.is_dir():
             raise UnreadableFile(
-                f"a recording must be a file, got a folder: name its files, or follow a machine by `sealscope trend` "
-                f"({file})"
+                f"a recording must be a file, got a folder: name its files, or state its machine by --machine ({file})"
             )
         if file != STANDARD_INPUT:
             return self._read(file)
@@ -119,17 +118,13 @@ class _Reading:
                 raise UnreadableFile(str(error).replace(str(kept), kept.name)) from error
 
     def _read(self, file: Path) -> Recording:
-        from sealscope.recordings import read
-
         if not self.beside_rig:
+            from sealscope.recordings import read
+
             return read(file, map=self.channel_map or None, rate=self.rate)
-        try:
-            return read(file, map=self.beside_rig, rate=self.rate)
-        except UnreadableFile as unmapped:
-            try:
-                return read(file, rate=self.rate)
-            except UnreadableFile:
-                raise unmapped from None
+        from sealscope.diagnosis.commissioned.machine import read_of_machine
+
+        return read_of_machine(file, self.beside_rig, self.rate)
 
 
 def _check_standard_input(files: Iterable[Path]) -> bool:

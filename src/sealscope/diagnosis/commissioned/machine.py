@@ -6,10 +6,12 @@ import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sealscope.calls import checked_call
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.inspection import inspected
 from sealscope.diagnosis.learnt import Learnt, Lesson
@@ -78,15 +80,7 @@ class CommissionedMachine:
 
     def read(self, path: str | os.PathLike[str]) -> Recording:
         """Read a log of the machine by its map; a recording of Sealscope's own is read as it is."""
-        if not self.channel_map:
-            return read(path, rate=self.rate)
-        try:
-            return read(path, map=self.channel_map, rate=self.rate)
-        except UnreadableFile as unmapped:
-            try:
-                return read(path, rate=self.rate)
-            except UnreadableFile:
-                raise unmapped from None
+        return read_of_machine(path, self.channel_map, self.rate)
 
     def diagnose(
         self,
@@ -141,7 +135,8 @@ class CommissionedMachine:
         """
         left = tuple(own for own in self.healthy if own.start_s is not None and own.start_s >= start_s)
         if not left:
-            raise InputError(f"a machine must keep a healthy recording, got none of {start_s:g} s since 1970 or later")
+            date = datetime.fromtimestamp(start_s, UTC).isoformat(" ", "minutes")
+            raise InputError(f"a machine must keep a healthy recording, got none of {date} or later")
         return replace(self, healthy=left, about={own.digest: self.about.get(own.digest, {}) for own in left})
 
     def known_rig(self, recording: Recording) -> Rig:
@@ -157,11 +152,31 @@ class CommissionedMachine:
         return self.summary.text(self.healthy, self.rig, self.about)
 
 
+def read_of_machine(path: str | os.PathLike[str], channel_map: ChannelMap, rate: float | None) -> Recording:
+    """Read a log by the map of its machine, or as it is where it has not the map's columns.
+
+    Raises UnreadableFile with what is wrong by the map, where neither can be read.
+    """
+    if not channel_map:
+        return read(path, rate=rate)
+    try:
+        return read(path, map=channel_map, rate=rate)
+    except UnreadableFile as unmapped:
+        try:
+            return read(path, rate=rate)
+        except UnreadableFile:
+            raise unmapped from None
+
+
 def recordings_in(paths: Iterable[str | os.PathLike[str]] | str | os.PathLike[str]) -> list[Path]:
     """Return the files of recordings that a path, several, or a folder name; InputError where there is none."""
-    named = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
+    try:
+        named = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
+        given = [Path(path) for path in named]
+    except TypeError:
+        raise InputError(f"recordings must be a folder's path or paths of files, got {paths!r:.60}") from None
     files: list[Path] = []
-    for path in map(Path, named):
+    for path in given:
         if path.is_dir():
             inside = sorted(own for own in path.iterdir() if own.is_file() and not own.name.startswith("."))
             files += [own for own in inside if own.suffix.lower() not in NO_RECORDINGS and not _is_written(own)]
@@ -214,6 +229,7 @@ def learn(recording: Recording, rig: Rig, file: str, checksum: str = "") -> tupl
     return Learnt(file, inspection.digest, units, part.rate, recording.duration, start, lessons), about
 
 
+@checked_call
 def commission(
     paths: Iterable[str | os.PathLike[str]] | str | os.PathLike[str],
     *,
