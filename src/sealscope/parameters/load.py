@@ -19,7 +19,7 @@ _PACKAGED = Path(__file__).parent / "rigs"
 _DEEPEST = 8
 _MAP = "[map]"
 #: Tables that the file of a commissioned machine has beside its rig.
-OF_MACHINES = ("machine", "learnt", "healthy")
+OF_MACHINES = ("machine", "learnt", "healthy", "alarms")
 
 
 def rig_names() -> tuple[str, ...]:
