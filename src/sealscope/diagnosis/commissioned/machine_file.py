@@ -37,6 +37,7 @@ _HEAD = """\
 # edited; [learnt] is written anew with each change; [[healthy]] is what diagnoses compare with.
 """
 _HEALTHY = {"file": str, "digest": str, "rate": float, "seconds": float, "units": dict, "lessons": dict}
+_ABOUT = {"sha256": str, "pressure_bar": float, "oil_degC": float, "noise": dict, "wrong": list}
 #: What a lesson of each built-in method holds: its entries, numbers of which by their count of dimensions.
 _LESSONS: Mapping[str, Mapping[str, Any]] = {
     "volume balance": {"terms": list, "scale": 0, "sums": 3, "flow": 0, "pressure": 0},
@@ -151,10 +152,10 @@ def _tables(tree: Mapping[str, Any], prefix: tuple[str, ...] = ()) -> Iterator[s
 
 
 def _stands_apart(value: Any, within: bool) -> bool:
-    """Whether a value is a table of its own, or a list of them; within a table, one of figures alone is a line."""
+    """Whether a value is a table of its own, or the list of them that all others are in; figures alone are a line."""
     if isinstance(value, Mapping):
         return not within or not all(isinstance(own, str | float | int) for own in value.values()) or not value
-    return isinstance(value, list) and bool(value) and isinstance(value[0], Mapping)
+    return isinstance(value, list) and not within
 
 
 def _key(key: str) -> str:
@@ -223,8 +224,8 @@ def load_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
         raise InputError(f"healthy must hold a recording, got none ({place})")
     healthy = tuple(_healthy(row, f"healthy[{k}] of {place}") for k, row in enumerate(rows))
     about = {
-        own.digest: _part(row, "about", dict, place) if "about" in row else {}
-        for own, row in zip(healthy, rows, strict=True)
+        own.digest: _about(row, f"healthy[{k}] of {place}")
+        for k, (own, row) in enumerate(zip(healthy, rows, strict=True))
     }
     rig = {name: table for name, table in tree.items() if name not in OF_MACHINES and name != "map"}
     known = Rig.from_dict(rig, place=place) if rig else None
@@ -259,6 +260,18 @@ def _healthy(row: Any, place: str) -> Learnt:
     lessons = {name: _lesson(name, values["lessons"], place) for name in values["lessons"]}
     units, rate, seconds = values["units"], values["rate"], values["seconds"]
     return Learnt(values["file"], values["digest"], units, rate, seconds, start_s, lessons)
+
+
+def _about(row: Mapping[str, Any], place: str) -> dict[str, Any]:
+    """Return what people read of a healthy recording."""
+    about = _part({"about": {}, **row}, "about", dict, place)
+    for name in _ABOUT.keys() & about.keys():
+        _part(about, name, _ABOUT[name], place)
+    for name in about.get("noise", {}):
+        _part(about["noise"], name, float, place)
+    if not all(isinstance(text, str) for text in about.get("wrong", ())):
+        raise InputError(f"wrong must hold texts, got {about['wrong']!r:.60} ({place})")
+    return about
 
 
 def _moment(row: Mapping[str, Any], name: str, place: str) -> float:
