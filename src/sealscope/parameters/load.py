@@ -120,7 +120,7 @@ def _collect(
     if "machine" in tree:
         tree = {name: table for name, table in tree.items() if name not in OF_MACHINES}
         if not set(tree) - {"map"}:
-            raise InputError(f"a machine's file must state sizes to be a rig, got none: commission it with an area ({place})")
+            raise InputError(f"a machine's file must state an area to be a rig, got none: commission it anew ({place})")
     head = tree.pop("rig", {})
     if not isinstance(head, dict):
         raise InputError(f"rig must be a table, got {head!r} ({place})")
