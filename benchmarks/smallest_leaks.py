@@ -5,8 +5,8 @@
 
 Simulated, the leak opens at mid-record, laminar, at the predicted conductance times a factor; `diagnose`'s volume
 balance judges all channels at a false-alarm probability of 1 %. Predicted is what 90 % of records show. FILE: logs of a
-real machine, as for `real_eha.py`, all of one set-up: each run is judged by the file of a machine that was commissioned
-on the others, with leaks put into it; the size that it shows is looked for by bisection.
+real machine, as for `real_eha.py`, all of one set-up and of two days or more: each run is judged by the file of a machine that was commissioned
+on those of the other days, with leaks put into it; the size that it shows is looked for by bisection.
 """
 
 from __future__ import annotations
@@ -53,8 +53,11 @@ def real(files: Sequence[str]) -> None:
     stated = {"cylinder.A_A": AREAS[0], "cylinder.A_B": AREAS[1], "pump.q_b": DISPLACEMENT}
     whole = ss.commission(files, rig=load_rig("single-rod-eha").with_overrides(stated), map=MAP)
     predicted, sizes = [], []
+    days = {own.file: (own.start_s or 0.0) // 86_400.0 for own in whole.healthy}
+    files = [file for file in files if Path(file).name in days]
     for file in files:
-        machine = replace(whole, healthy=tuple(own for own in whole.healthy if own.file != Path(file).name))
+        day = days[Path(file).name]
+        machine = replace(whole, healthy=tuple(own for own in whole.healthy if days[own.file] != day))
         predicted.append(machine.summary.smallest.lpm)
         sizes.append(shown(machine, machine.read(file), LARGEST * predicted[-1]))
     level, size = np.median(predicted), np.quantile(sizes, 0.9, method="inverted_cdf")

@@ -264,7 +264,7 @@ def _healthy(row: Any, place: str) -> Learnt:
 
 def _about(row: Mapping[str, Any], place: str) -> dict[str, Any]:
     """Return what people read of a healthy recording."""
-    about = _part({"about": {}, **row}, "about", dict, place)
+    about: dict[str, Any] = _part({"about": {}, **row}, "about", dict, place)
     for name in _ABOUT.keys() & about.keys():
         _part(about, name, _ABOUT[name], place)
     for name in about.get("noise", {}):
