@@ -5,8 +5,9 @@
 
 Simulated, the leak opens at mid-record, laminar, at the predicted conductance times a factor; `diagnose`'s volume
 balance judges all channels at a false-alarm probability of 1 %. Predicted is what 90 % of records show. FILE: logs of a
-real machine, as for `real_eha.py`, all of one set-up and of two days or more: each run is judged by the file of a machine that was commissioned
-on those of the other days, with leaks put into it; the size that it shows is looked for by bisection.
+real machine, as for `real_eha.py`, all of one set-up and of two days or more: each run is judged by the file of a
+machine that was commissioned on those of the other days, with leaks put into it; the size that it shows is looked for
+by bisection.
 """
 
 from __future__ import annotations
