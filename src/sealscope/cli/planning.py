@@ -55,10 +55,12 @@ def plan(
     known = rig_with(rig, overrides)
     if machine is not None:
         commissioned = load_machine(machine)
-        if commissioned.rig is None or not commissioned.rig.states("cylinder.M_eq") or overrides:
+        if overrides:
+            raise InputError(f"--set must not stand beside --machine, whose file states the rig ({machine})")
+        if commissioned.rig is None or not commissioned.rig.states("cylinder.M_eq"):
             smallest = commissioned.summary.smallest
             shown = "" if smallest is None else f"; another recording like the healthy ones shows {smallest}"
-            raise InputError(f"a plan simulates a machine: commission it by --rig, without --set ({machine}){shown}")
+            raise InputError(f"a plan simulates a machine: commission it by --rig ({machine}){shown}")
         known = commissioned.rig
     with progress() as update:
         planned = plan_recording(
