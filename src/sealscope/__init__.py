@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sealscope import datasets
+    from sealscope.diagnosis.commissioned.estimator import LeakDetector as LeakDetector
     from sealscope.diagnosis.commissioned.machine import CommissionedMachine, commission
     from sealscope.diagnosis.commissioned.machine_file import load_machine, write_machine
     from sealscope.diagnosis.diagnose import diagnose
@@ -37,6 +38,7 @@ _HOMES = {
     "Recording": "recordings.recording",
     "Rig": "parameters",
     "CommissionedMachine": "diagnosis.commissioned.machine",
+    "LeakDetector": "diagnosis.commissioned.estimator",  # in no `import *`: it needs the extra `learn`
     "RmsStream": "signals.windows",
     "SequentialBalance": "diagnosis.inference.live.stream",
     "Trend": "diagnosis.trend.trend",

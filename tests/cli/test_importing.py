@@ -20,6 +20,7 @@ HEAVY = {
     "h5py",
     "h5netcdf",
     "pyarrow",
+    "sklearn",
 }
 SHOW = "import json, sys; print(json.dumps(sorted({name.split('.')[0] for name in sys.modules})))"
 

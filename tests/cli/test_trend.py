@@ -73,7 +73,7 @@ def test_files_without_a_time_ask_for_every(call, days: Path, tmp_path: Path) ->
         own = replace(ss.read(days / f"day_{k}.nc"), provenance={})
         ss.write(own, tmp_path / f"run_{k}.nc")
     complaint = call("trend", tmp_path).refused()
-    assert "--every 1d" in complaint and "run_1.nc" in complaint
+    assert "every (such as 1d)" in complaint and "run_1.nc" in complaint
     done = call("trend", tmp_path, "--every", "1d")
     assert done.status == 0 and "day 0 to day 2" in done.out
 
@@ -109,4 +109,7 @@ def test_a_machine_s_file_states_rig_and_limit(call, days: Path, tmp_path: Path)
     stated = call("trend", days, "--machine", file)
     assert stated.status == 0 and stated.out == call("trend", days, "--rig", "thesis", "--limit", "3 mL/min").out
     assert "--limit must not stand beside" in call("trend", days, "--machine", file, "--limit", "5 mL/min").refused()
-    assert "--machine must state a rig" in call("plan", "--machine", file, "--set", "pump.G_pump=1e-13").refused()
+    assert (
+        "--set must not stand beside --machine"
+        in call("plan", "--machine", file, "--set", "pump.G_pump=1e-13").refused()
+    )

@@ -285,7 +285,7 @@ def test_a_clock_set_back_is_named() -> None:
 
 def test_files_without_a_time_are_refused_or_spaced() -> None:
     days = [replace(own, start=None) for own in life(12)]
-    with pytest.raises(InputError, match=r"got none of day_0\.csv.*--every 1d"):
+    with pytest.raises(InputError, match=r"got none of day_0\.csv.*every \(such as 1d\)"):
         trend_of(days)
     trend = trend_of(days[::-1], every=DAY)
     assert [point.file for point in trend.points] == [f"day_{k}.csv" for k in range(12)]

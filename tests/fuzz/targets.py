@@ -11,6 +11,7 @@ import os
 import random
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from sealscope.campaigns.execution.run import run
 from sealscope.campaigns.plans.model import RecordedPlan, SimulatedPlan
 from sealscope.campaigns.plans.reader import load_plan, plan_names
 from sealscope.campaigns.results import simulated_result, write_result
+from sealscope.diagnosis.commissioned.machine import JudgedAlarm
 from sealscope.errors import SealscopeError
 from sealscope.parameters import load_rig, parse_overrides, rig_names
 from sealscope.recordings import split_map_option
@@ -182,6 +184,40 @@ def rigs(folder: Path) -> Use:
         Experiment.of(rig=rig, duration=1.0)
 
     return _toml([*whole, small, small], read, folder)
+
+
+def machines(folder: Path) -> Use:
+    """Files of a commissioned machine, changed, or links to folders and pipes; one that is taken judges a recording."""
+    healthy, path = folder / "healthy", folder / "given.toml"
+    healthy.mkdir()
+    for seed in (1, 2, 3):
+        sealscope.write(sealscope.simulate(duration="6 s", seed=seed), healthy / f"run{seed}.nc")
+    whole = sealscope.commission(healthy, rig="thesis", limit="5 mL/min")
+    alarms = (JudgedAlarm("press 1-1", "valid", 1.7e9, 1.69e9, 0.002), JudgedAlarm("press 1-2", "invalid", 1e9, 1e9))
+    bare = replace(whole, rig=None, channel_map={"p_A": "PG_1[bar]"}, alarms=alarms)
+    texts = [sealscope.write_machine(own, folder / "whole.toml").read_text() for own in (whole, bare)]
+    judged = sealscope.simulate(duration="6 s", seed=4)
+
+    def read() -> None:
+        machine = sealscope.load_machine(path)
+        machine.diagnose(judged, quick=True)
+        str(machine)
+        again = sealscope.load_machine(sealscope.write_machine(machine, folder / "again.toml"))
+        assert [own.digest for own in again.healthy] == [own.digest for own in machine.healthy]
+
+    def use(draw: random.Random) -> bool:
+        path.unlink(missing_ok=True)
+        match draw.randrange(20):
+            case 0:
+                path.symlink_to(draw.choice((healthy, path)))
+            case 1:
+                os.mkfifo(path)
+            case _:
+                path.write_bytes(changed_toml(draw.choice(texts), draw))
+        with np.errstate(all="ignore"):
+            return taken(read)
+
+    return use
 
 
 def profiles(folder: Path) -> Use:
@@ -343,6 +379,7 @@ def kept(folder: Path) -> Use:
 TARGETS: dict[str, Callable[[Path], Use]] = {
     "options": options,
     "rigs": rigs,
+    "machines": machines,
     "profiles": profiles,
     "plans": plans,
     "campaign folders": campaigns,

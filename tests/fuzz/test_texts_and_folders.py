@@ -11,10 +11,26 @@ from .messages import MESSAGES
 from .runs import MOST_MEMORY, attack, peak_memory
 from .targets import TARGETS
 
-FEW = {"options": 300, "rigs": 60, "profiles": 120, "plans": 30, "campaign folders": 15, "kept files": 60}
-FEW |= {"monitor messages": 400, "Sparkplug messages": 400}
-MANY = {"options": 6000, "rigs": 2000, "profiles": 1500, "plans": 1000, "campaign folders": 500, "kept files": 1500}
-MANY |= {"monitor messages": 50_000, "Sparkplug messages": 50_000}
+FEW = {
+    "options": 300,
+    "rigs": 60,
+    "machines": 40,
+    "profiles": 120,
+    "plans": 30,
+    "campaign folders": 15,
+    "kept files": 60,
+}
+FEW |= {"machines": 60, "monitor messages": 400, "Sparkplug messages": 400}
+MANY = {
+    "options": 6000,
+    "rigs": 2000,
+    "machines": 2000,
+    "profiles": 1500,
+    "plans": 1000,
+    "campaign folders": 500,
+    "kept files": 1500,
+}
+MANY |= {"machines": 3000, "monitor messages": 50_000, "Sparkplug messages": 50_000}
 
 
 def some(kind: str, folder: Path, seeds: range, capfd: pytest.CaptureFixture[str]) -> None:

@@ -233,11 +233,12 @@ def test_the_page_in_a_browser(service: Service, tmp_path: Path):
                 assert view.locator("img").count() == 0
                 assert view.evaluate("document.documentElement.scrollWidth") <= width
                 assert view.locator("#chart canvas").count() == 1
-                # what is wrong, how much, and what to do stand in the first screen of a wide page
+                # what is wrong, how much, its limit and what to do stand in the first screen
                 assert view.locator("#fleet .badge").all_text_contents() == ["Mmaintenance required", "Ngood"]
                 line = view.text_content("#state") or ""
                 assert "maintenance required" in line and "L/min since" in line and "hold a load" in line
-                for part in ("#fleet", "#overall", *(() if width == 400 else ("#state", "#chart"))):
+                assert "limit 0.0005 L/min" in line
+                for part in ("#fleet", "#overall", "#state", *(() if width == 400 else ("#chart",))):
                     box = view.locator(part).bounding_box()
                     assert box is not None and box["y"] + box["height"] <= 900
                 image = view.screenshot(path=tmp_path / f"monitor-{width}.png")

@@ -83,7 +83,7 @@ def test_what_two_columns_could_be_is_not_guessed() -> None:
 def test_the_error_prints_the_map_and_auto_takes_it(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     path.write_text("Zeit [s];Druck A [bar];PB_bar\n0;1;2\n0,002;2;3\n0,004;1;2\n")
-    with pytest.raises(UnreadableFile, match=r"--map auto would read --map 'p_A=Druck A \[bar\]' --map 'p_B=PB_bar\["):
+    with pytest.raises(UnreadableFile, match=r"map auto would read p_A=Druck A \[bar\], p_B=PB_bar\["):
         read(path)
     recording = read(path, map="auto")
     assert recording["p_B"].tolist() == [2e5, 3e5, 2e5]

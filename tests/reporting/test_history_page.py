@@ -110,6 +110,10 @@ def test_in_a_browser(history, tmp_path, width, scheme):
         shown.locator('[data-chart="over-p_A"] .u-over').hover()
         assert shown.locator('figure:has([data-chart="over-p_A"]) output').all_inner_texts()[1].endswith("bar")
         assert errors == []
+        shown.evaluate("scrollTo(0, 0)")
+        for text in ("Leak: oil bypasses the piston", "0.008 L/min", "repair limit", "What to do"):
+            box = shown.get_by_text(text).locator("visible=true").first.bounding_box()
+            assert box is not None and box["y"] >= 0.0 and box["y"] + box["height"] <= 900.0, text
         assert shown.evaluate("document.documentElement.scrollWidth") <= width
         assert (
             shown.evaluate(

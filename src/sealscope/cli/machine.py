@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
@@ -48,7 +49,7 @@ def commission(
 
     `diagnose`, `trend`, `report` and `monitor` take the file by --machine.
     """
-    from sealscope.diagnosis.commissioned.machine import checksum_of, recordings_in
+    from sealscope.diagnosis.commissioned.machine import JudgedAlarm, checksum_of, recordings_in
     from sealscope.diagnosis.commissioned.machine import commission as commissioned
     from sealscope.diagnosis.commissioned.machine_file import load_machine, write_machine
 
@@ -58,13 +59,18 @@ def commission(
         raise InputError("--since must stand with --add, for a machine that is known")
     check_folder(output)
     if add:
+        stated = {"--rig": rig, "--area": area, "--displacement": displacement, "--map": maps, "--rate": rate}
+        for name, value in {**stated, "--limit": limit}.items():
+            if value:
+                raise InputError(f"{name} must not stand beside --add: the machine's file states it")
         machine = load_machine(output)
+        if since is not None:
+            repair = JudgedAlarm("", "repaired", _date(since), _date(since))
+            machine = replace(machine, alarms=(*machine.alarms, repair))
         for path in recordings_in(files):
             machine = machine.with_healthy(machine.read(path), file=path.name, checksum=checksum_of(path))
         if since is not None:
             machine = machine.since(_date(since))
-        backup = output.with_suffix(".toml.bak")
-        backup.write_bytes(output.read_bytes())
     else:
         if output.exists():
             raise InputError(f"a machine's file must be new, got {output}, which exists; --add adds recordings to it")

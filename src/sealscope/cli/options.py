@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from textwrap import fill
@@ -21,7 +20,6 @@ from sealscope.errors import InputError, SealscopeError, UnreadableFile
 
 if TYPE_CHECKING:
     from sealscope.diagnosis.commissioned.machine import CommissionedMachine
-    from sealscope.diagnosis.verdict.diagnosis import Diagnosis
     from sealscope.parameters import Rig
     from sealscope.recordings import Recording
     from sealscope.recordings.formats.columns import ChannelMap
@@ -167,7 +165,7 @@ class StatedMachine:
         if self.known is not None:
             return self.known.read(file)
         if file.is_dir():
-            ways = "name its files, or follow a machine by `sealscope trend`"
+            ways = "name its files, or state its machine by --machine"
             raise UnreadableFile(f"a recording must be a file, got a folder: {ways} ({file})")
         if file != STANDARD_INPUT:
             return self._read(file)
@@ -181,17 +179,13 @@ class StatedMachine:
                 raise UnreadableFile(str(error).replace(str(copied), copied.name)) from error
 
     def _read(self, file: Path) -> Recording:
-        from sealscope.recordings import read
-
         if not self._map_of_rig:
+            from sealscope.recordings import read
+
             return read(file, map=self.channel_map or None, rate=self.rate)
-        try:
-            return read(file, map=self._map_of_rig, rate=self.rate)
-        except UnreadableFile as unmapped:
-            try:
-                return read(file, rate=self.rate)
-            except UnreadableFile:
-                raise unmapped from None
+        from sealscope.diagnosis.commissioned.machine import read_of_machine
+
+        return read_of_machine(file, self._map_of_rig, self.rate)
 
     def read_all(self, files: Sequence[Path], joined: bool = False) -> Iterator[tuple[Path, Recording | None]]:
         """Yield each file and its recording, None with a line on standard error where it cannot be read.

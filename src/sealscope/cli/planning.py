@@ -39,9 +39,16 @@ def plan(
     wanted = None if find is None else parse_quantity(find, "m^3/s", name="--find")
     if wanted is not None and not wanted > 0.0:
         raise InputError(f"--find must be a flow > 0, got {find}")
-    known = opt.rig_with(rig, overrides) if machine is None else load_machine(machine).rig
-    if known is None or (machine is not None and overrides):
-        raise InputError(f"--machine must state a rig for a plan, without --set ({machine})")
+    known = opt.rig_with(rig, overrides)
+    if machine is not None:
+        commissioned = load_machine(machine)
+        if overrides:
+            raise InputError(f"--set must not stand beside --machine, whose file states the rig ({machine})")
+        if commissioned.rig is None or not commissioned.rig.states("cylinder.M_eq"):
+            smallest = commissioned.summary.smallest
+            shown = "" if smallest is None else f"; another recording like the healthy ones shows {smallest}"
+            raise InputError(f"a plan simulates a machine: commission it by --rig ({machine}){shown}")
+        known = commissioned.rig
     with opt.progress() as update:
         planned = plan_recording(
             known, wanted, usual=PlannedDuty(command, load), false_alarm=false_alarm, detection=detection,

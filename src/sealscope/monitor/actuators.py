@@ -10,7 +10,7 @@ import time
 import zlib
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from sqlalchemy.exc import IntegrityError
 from sealscope.diagnosis.verdict.states import LEAKING, state_of
 from sealscope.errors import InputError
 from sealscope.monitor.alarms import Alarm, AlarmJudge
+from sealscope.monitor.memory.machine_files import pass_on
 from sealscope.monitor.memory.sharing import Share
 from sealscope.monitor.memory.store import KEPT_IDENTITIES, PENDING_BLOCKS, PENDING_BYTES, MonitorStore, StoredRows
 from sealscope.monitor.settings import ActuatorSettings
@@ -33,11 +34,17 @@ _log = logging.getLogger(__name__)
 _LONGEST_TEXT = 2000
 #: How long blocks of others' actuators are kept, in leases: until a takeover, with time to spare.
 _KEPT_LEASES = 4.0
+#: How long the samples of an alarm are kept [s].
+_KEPT_S = 120.0
 
 
 @dataclass
 class _Actuator:
-    """What is in memory of an actuator; `judged_s`: end of the last block that was judged [s]."""
+    """What is in memory of an actuator.
+
+    `judged_s`: end of the last block that was judged [s]; `kept`: the last samples while there is an alarm, which a
+    machine's file may be taught.
+    """
 
     settings: ActuatorSettings
     watch: Watch
@@ -49,6 +56,7 @@ class _Actuator:
     shown: dict[str, Any] | None = None
     oil_celsius: float | None = None
     judged_s: float | None = None
+    kept: list[Recording] = field(default_factory=list)
 
     def judged(self, samples: Recording, follows: bool) -> tuple[list[BlockEstimate], list[tuple[Alarm, str, float]]]:
         """Return the estimates of samples, and what happened to alarms: the same whenever it is gone through."""
@@ -66,7 +74,19 @@ class _Actuator:
                 self.judged_s = estimate.t
             if change is not None:
                 happened.append((*change, estimate.t))
+        self._keep(samples, follows)
         return estimates, happened
+
+    def _keep(self, samples: Recording, follows: bool) -> None:
+        """Keep the samples of the last `_KEPT_S` of an alarm."""
+        alike = self.kept and (self.kept[0].units, self.kept[0].rate) == (samples.units, samples.rate)
+        if self.judge.alarm is None or not (follows and alike):
+            self.kept = []
+        if self.judge.alarm is not None and len(samples):
+            most = round(_KEPT_S * samples.rate)
+            self.kept.append(samples.samples(slice(-most, None)))
+            while sum(map(len, self.kept[1:])) > most:
+                del self.kept[0]
 
     def state(self) -> dict[str, Any]:
         """Return all that a checkpoint keeps, as plain values."""
@@ -338,7 +358,8 @@ class WatchedActuators:
         """Keep what a person says of an actuator's alarm, in one transaction.
 
         `mark`: one of `MARKS`; ``invalid``, for the reason `text`, takes the leak back, ``repaired`` begins a new
-        baseline as well; ``shelved`` announces nothing for `hours`. Raises InputError where there is no such alarm.
+        baseline as well; ``shelved`` announces nothing for `hours`. The file of a commissioned machine learns of the
+        mark (`pass_on`), and an event says what it made of it. Raises InputError where there is no such alarm.
         """
         if len(text) > _LONGEST_TEXT or len(by_whom) > 80:
             raise InputError(f"a comment must have at most {_LONGEST_TEXT} characters, a name 80")
@@ -352,7 +373,7 @@ class WatchedActuators:
             if name not in self.held:
                 raise InputError(f"{name} is watched by another monitor; mark its alarm on that one's page")
             actuator, rows = self._actuator(name), StoredRows()
-            at = actuator.last.t if actuator.last is not None else 0.0
+            at, kept = actuator.last.t if actuator.last is not None else 0.0, list(actuator.kept)
             alarm = actuator.judge.marked(mark, at, until=at + hours * 3600.0, reason=text)
             try:
                 if mark == "invalid":
@@ -366,6 +387,12 @@ class WatchedActuators:
             except BaseException:  # the next one begins at the last transaction
                 self._actuators.pop(name, None)
                 raise
+        if done := pass_on(self.settings[name].rig, alarm, mark, kept):  # takes a second, and holds nothing up
+            rows = StoredRows()
+            rows.add_alarm(alarm, "comment", at, "Sealscope", done)
+            rows.alarms.clear()  # it may have changed meanwhile
+            with self.store.writing() as connection:
+                self.store.keep_rows(connection, rows)
         self._tell()
         return alarm
 

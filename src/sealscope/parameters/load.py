@@ -19,7 +19,7 @@ _PACKAGED = Path(__file__).parent / "rigs"
 _DEEPEST = 8
 _MAP = "[map]"
 #: Tables that the file of a commissioned machine has beside its rig.
-OF_MACHINES = ("machine", "learnt", "healthy")
+OF_MACHINES = ("machine", "learnt", "healthy", "alarms")
 
 
 def rig_names() -> tuple[str, ...]:
@@ -119,6 +119,8 @@ def _collect(
     tree = read_toml(path, "a rig file", place)
     if "machine" in tree:
         tree = {name: table for name, table in tree.items() if name not in OF_MACHINES}
+        if not set(tree) - {"map"}:
+            raise InputError(f"a machine's file must state an area to be a rig, got none: commission it anew ({place})")
     head = tree.pop("rig", {})
     if not isinstance(head, dict):
         raise InputError(f"rig must be a table, got {head!r} ({place})")

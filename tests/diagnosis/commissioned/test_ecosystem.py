@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import pickle
+import traceback
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from sklearn.base import clone
+from sklearn.utils.estimator_checks import check_estimator
 
 import sealscope as ss
-from sealscope.diagnosis.commissioned.estimator import LeakDetector
-from sealscope.errors import InputError
 
 
 @pytest.fixture(scope="module")
@@ -20,24 +22,51 @@ def leaking(tmp_path_factory):
 
 
 def test_the_estimator_learns_and_predicts(folder, leaking):
-    detector = LeakDetector(rig="thesis").fit(sorted(folder.iterdir()))
-    new = leaking.with_name("new.nc")
+    """Order, subsets, copies and a pickle change nothing; a second fit forgets the first."""
+    healthy, new = sorted(folder.iterdir()), leaking.with_name("new.nc")
     ss.write(ss.simulate(command="3 sin(4t)", duration="20 s", seed=44), new)
-    assert detector.predict([new, leaking]).tolist() == [1, -1]
-    above, below = detector.decision_function([new, leaking])
-    assert above > 0 > below
-    assert (
-        LeakDetector(**detector.get_params()).set_params(false_alarm_probability=0.05).get_params()["rig"] == "thesis"
-    )
-    unfitted = LeakDetector()
-    with pytest.raises(InputError, match="must be fitted"):
-        unfitted.predict([new])
+    detector = ss.LeakDetector(rig="thesis")
+    assert detector.fit([new]) is detector
+    margins = detector.fit(healthy).decision_function([new, leaking])
+    assert margins[0] > 0 > margins[1]
+    assert np.greater(*detector.score_samples([new, leaking]))
+    assert detector.predict([leaking, new]).tolist() == [-1, 1]
+    twin = pickle.loads(pickle.dumps(detector))
+    np.testing.assert_array_equal([twin.decision_function([path])[0] for path in (new, leaking)], margins)
+    assert clone(detector).set_params(rate=500.0).get_params()["rig"] == "thesis"
 
 
-def test_the_estimator_is_cloned(folder):
-    base = pytest.importorskip("sklearn.base", reason="scikit-learn is not installed")
-    copy = base.clone(LeakDetector(rig="thesis", false_alarm_probability=0.02))
-    assert copy.get_params()["false_alarm_probability"] == 0.02
+#: Checks of scikit-learn that need no matrix.
+APPLICABLE = {
+    "check_estimator_cloneable",
+    "check_estimator_tags_renamed",
+    "check_valid_tag_types",
+    "check_estimator_repr",
+    "check_no_attributes_set_in_init",
+    "check_estimators_unfitted",
+    "check_do_not_raise_errors_in_init_or_set_params",
+    "check_mixin_order",
+    "check_parameters_default_constructible",
+    "check_get_params_invariance",
+    "check_set_params",
+}
+
+
+def test_the_estimator_passes_the_checks_of_scikit_learn_that_apply():
+    """The others feed a matrix of numbers in place of files, and are refused by one line."""
+
+    class OfMatrices(ss.LeakDetector):
+        def __sklearn_tags__(self):
+            tags = super().__sklearn_tags__()
+            tags.input_tags.two_d_array, tags.input_tags.one_d_array = True, False
+            return tags
+
+    results = check_estimator(OfMatrices(), on_fail=None, on_skip=None)
+    assert {own["check_name"] for own in results if own["status"] == "passed"} >= APPLICABLE
+    for own in results:
+        if own["status"] == "failed":
+            text = "".join(traceback.format_exception(own["exception"]))
+            assert "recordings must be a folder's path or paths of files" in text or "sparse data" in text
 
 
 def test_a_diagnosis_is_a_row_of_a_table(machine, leaking):

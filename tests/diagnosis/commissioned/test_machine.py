@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
+import random
+import signal
+from dataclasses import replace
+from itertools import cycle
+from multiprocessing import get_context
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,6 +16,7 @@ from hypothesis import strategies as st
 
 import sealscope as ss
 from sealscope.errors import InputError
+from sealscope.storage.atomic import remove_temporaries
 
 
 def figures(diagnosis: ss.Diagnosis) -> tuple:
@@ -109,6 +117,34 @@ def test_the_map_of_raw_counts_goes_with_the_machine(folder, tmp_path):
     ss.write_machine(machine, tmp_path / "counts.toml")
     again = ss.load_machine(tmp_path / "counts.toml").read(log)
     np.testing.assert_allclose(again["p_A"], recording["p_A"], rtol=1e-9, atol=1.0)
+
+
+def write_for_ever(machines: list[ss.CommissionedMachine], path: Path) -> None:
+    for machine in cycle(machines):
+        ss.write_machine(machine, path)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="kills as POSIX does")
+def test_a_file_is_whole_whenever_its_writer_is_killed(machine, folder, tmp_path):
+    """Of 30 kills each leaves one of the two machines, and so does each file that was kept."""
+    path = tmp_path / "actuator7.toml"
+    machines = [machine, replace(machine, name="other", healthy=machine.healthy[:2])]
+    for own in machines:
+        ss.write_machine(own, path)
+    draw, known = random.Random(7), {(own.name, len(own.healthy)) for own in machines}
+    for _ in range(30):
+        writer = get_context("fork").Process(target=write_for_ever, args=(machines, path))
+        writer.start()
+        writer.join(draw.uniform(0.0, 0.08))
+        assert writer.is_alive()
+        writer.kill()
+        writer.join()
+        for file in (path, path.with_suffix(".toml.bak")):
+            left = ss.load_machine(file)
+            assert (left.name, len(left.healthy)) in known
+    assert any(tmp_path.glob(".*.part"))  # it was killed while it wrote, too
+    remove_temporaries(tmp_path)
+    assert sorted(own.name for own in tmp_path.iterdir()) == ["actuator7.toml", "actuator7.toml.bak"]
 
 
 HOSTILE = {

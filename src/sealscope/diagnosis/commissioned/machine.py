@@ -6,10 +6,12 @@ import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+from sealscope.calls import checked_call
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.inspection import inspected
 from sealscope.diagnosis.learnt import Learnt, Lesson
@@ -28,6 +30,30 @@ if TYPE_CHECKING:
 NO_RECORDINGS = frozenset({".toml", ".html", ".htm", ".pdf", ".png", ".svg", ".md", ".jsonl", ".part", ".bak"})
 #: How a trend, or a verdict, that was written beside the recordings begins.
 _WRITTEN = re.compile(rb'\s*\{\s*"(verdict|file)":|file,time[, ]')
+
+
+class JudgedAlarm(NamedTuple):
+    """What a person said of an alarm of the monitor.
+
+    `alarm`: its name, "" for a repair without one; `mark`: "valid", "invalid" or "repaired", said at `date_s`; of a
+    leak since `onset_s` [s since 1970]; `leak_lpm` [L/min] and `reason`, where they are known.
+    """
+
+    alarm: str
+    mark: str
+    date_s: float
+    onset_s: float
+    leak_lpm: float | None = None
+    reason: str = ""
+
+    def __str__(self) -> str:
+        leak = "" if self.leak_lpm is None else f", {self.leak_lpm:.2g} L/min"
+        since = "" if self.mark == "invalid" else f", since {_date(self.onset_s)}{leak}"
+        return f"{self.alarm} {self.mark} {_date(self.date_s)}{since}{self.reason and f' ({self.reason})'}".strip()
+
+
+def _date(moment: float) -> str:
+    return datetime.fromtimestamp(moment, UTC).isoformat(" ", "minutes").removesuffix("+00:00")
 
 
 @dataclass(frozen=True)
@@ -52,6 +78,8 @@ class CommissionedMachine:
         Of each healthy recording, by its digest, what people read: checksum of the file, pressure, oil, noise.
     left_out : tuple of str, optional
         Recordings that could not be used, each with the reason.
+    alarms : tuple of JudgedAlarm, optional
+        What persons said of the monitor's alarms, and repairs.
 
     Examples
     --------
@@ -68,6 +96,7 @@ class CommissionedMachine:
     limit: str | None = None
     about: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     left_out: tuple[str, ...] = ()
+    alarms: tuple[JudgedAlarm, ...] = ()
 
     @cached_property
     def summary(self) -> Summary:
@@ -78,15 +107,7 @@ class CommissionedMachine:
 
     def read(self, path: str | os.PathLike[str]) -> Recording:
         """Read a log of the machine by its map; a recording of Sealscope's own is read as it is."""
-        if not self.channel_map:
-            return read(path, rate=self.rate)
-        try:
-            return read(path, map=self.channel_map, rate=self.rate)
-        except UnreadableFile as unmapped:
-            try:
-                return read(path, rate=self.rate)
-            except UnreadableFile:
-                raise unmapped from None
+        return read_of_machine(path, self.channel_map, self.rate)
 
     def diagnose(
         self,
@@ -122,7 +143,8 @@ class CommissionedMachine:
     def with_healthy(self, recording: Recording, *, file: str = "recording", checksum: str = "") -> CommissionedMachine:
         """Return the machine with one more healthy recording.
 
-        Raises InputError where it is judged leaking, or is known already, or cannot be trusted.
+        Raises InputError where it is judged leaking, or a person found a leak then, or it is known already, or cannot
+        be trusted.
         """
         digest = inspected(recording).digest
         known = next((own for own in self.healthy if own.digest == digest), None)
@@ -130,9 +152,18 @@ class CommissionedMachine:
             raise InputError(f"a healthy recording must be new, got the samples of {known.file} ({file})")
         if self.healthy and (found := self.diagnose(recording)).verdict == "leak":
             raise InputError(f"a healthy recording must not leak, got one that does: {found.reason} ({file})")
+        start_s = start_seconds(recording, file)
+        if start_s is not None and (leak := self._leak_at(start_s)) is not None:
+            raise InputError(f"a healthy recording must be of a time without a leak, got {leak} ({file})")
         learnt, about = learn(recording, self.known_rig(recording), file, checksum)
         healthy = sorted((*self.healthy, learnt), key=lambda own: (own.start_s or 0.0, own.file))
         return replace(self, healthy=tuple(healthy), about={**self.about, digest: about})
+
+    def _leak_at(self, moment: float) -> JudgedAlarm | None:
+        """Return the alarm of a leak that a person found, and that was not repaired at a moment [s since 1970]."""
+        repairs = [own.date_s for own in self.alarms if own.mark == "repaired"]
+        leaks = (own for own in self.alarms if own.mark != "invalid" and own.onset_s <= moment)
+        return next((own for own in leaks if not any(own.onset_s <= at <= moment for at in repairs)), None)
 
     def since(self, start_s: float) -> CommissionedMachine:
         """Return the machine without the recordings of before a repair, `start_s` [s since 1970].
@@ -141,8 +172,10 @@ class CommissionedMachine:
         """
         left = tuple(own for own in self.healthy if own.start_s is not None and own.start_s >= start_s)
         if not left:
-            raise InputError(f"a machine must keep a healthy recording, got none of {start_s:g} s since 1970 or later")
-        return replace(self, healthy=left, about={own.digest: self.about.get(own.digest, {}) for own in left})
+            raise InputError(f"a machine must keep a healthy recording, got none of {_date(start_s)} or later")
+        alarms = tuple(own for own in self.alarms if own.onset_s >= start_s)
+        about = {own.digest: self.about.get(own.digest, {}) for own in left}
+        return replace(self, healthy=left, about=about, alarms=alarms)
 
     def known_rig(self, recording: Recording) -> Rig:
         """Return the rig that detectors assume."""
@@ -154,14 +187,35 @@ class CommissionedMachine:
         return f"<CommissionedMachine {self.name}: {counted(len(self.healthy), 'healthy recording')}>"
 
     def __str__(self) -> str:
-        return self.summary.text(self.healthy, self.rig, self.about)
+        alarms = [f"  {'alarm':<14}{own}" for own in self.alarms]
+        return "\n".join([self.summary.text(self.healthy, self.rig, self.about), *alarms])
+
+
+def read_of_machine(path: str | os.PathLike[str], channel_map: ChannelMap, rate: float | None) -> Recording:
+    """Read a log by the map of its machine, or as it is where it has not the map's columns.
+
+    Raises UnreadableFile with what is wrong by the map, where neither can be read.
+    """
+    if not channel_map:
+        return read(path, rate=rate)
+    try:
+        return read(path, map=channel_map, rate=rate)
+    except UnreadableFile as unmapped:
+        try:
+            return read(path, rate=rate)
+        except UnreadableFile:
+            raise unmapped from None
 
 
 def recordings_in(paths: Iterable[str | os.PathLike[str]] | str | os.PathLike[str]) -> list[Path]:
     """Return the files of recordings that a path, several, or a folder name; InputError where there is none."""
-    named = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
+    try:
+        named = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
+        given = [Path(path) for path in named]
+    except TypeError:
+        raise InputError(f"recordings must be a folder's path or paths of files, got {paths!r:.60}") from None
     files: list[Path] = []
-    for path in map(Path, named):
+    for path in given:
         if path.is_dir():
             inside = sorted(own for own in path.iterdir() if own.is_file() and not own.name.startswith("."))
             files += [own for own in inside if own.suffix.lower() not in NO_RECORDINGS and not _is_written(own)]
@@ -214,6 +268,7 @@ def learn(recording: Recording, rig: Rig, file: str, checksum: str = "") -> tupl
     return Learnt(file, inspection.digest, units, part.rate, recording.duration, start, lessons), about
 
 
+@checked_call
 def commission(
     paths: Iterable[str | os.PathLike[str]] | str | os.PathLike[str],
     *,

@@ -2,7 +2,7 @@
 
 It is a rig's file, too: `[rig]`, `[motor]` and so on state what is known of it, `[map]` its channels. Beside them
 `[machine]` names it, `[learnt]` is what its healthy recordings say, for people to read, and each `[[healthy]]` is a
-recording: the checksum of its file, and what it has taught each method.
+recording: the checksum of its file, and what it has taught each method. `[[alarms]]` is what persons said of alarms.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.commissioned.machine import CommissionedMachine
+from sealscope.diagnosis.commissioned.machine import CommissionedMachine, JudgedAlarm
 from sealscope.diagnosis.learnt import Learnt
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
@@ -30,11 +30,14 @@ from sealscope.storage.toml_file import read_toml
 
 #: Version of the file's format, and the largest file read [bytes]: some 10 kB a recording.
 FORMAT, LARGEST = 1, 50_000_000
+#: What persons say of alarms.
+MARKS = ("valid", "invalid", "repaired")
 _HEAD = """\
 # A machine commissioned by Sealscope: what its healthy recordings have taught. [machine], [map] and [rig] may be
 # edited; [learnt] is written anew with each change; [[healthy]] is what diagnoses compare with.
 """
 _HEALTHY = {"file": str, "digest": str, "rate": float, "seconds": float, "units": dict, "lessons": dict}
+_ABOUT = {"sha256": str, "pressure_bar": float, "oil_degC": float, "noise": dict, "wrong": list}
 #: What a lesson of each built-in method holds: its entries, numbers of which by their count of dimensions.
 _LESSONS: Mapping[str, Mapping[str, Any]] = {
     "volume balance": {"terms": list, "scale": 0, "sums": 3, "flow": 0, "pressure": 0},
@@ -45,14 +48,14 @@ _LESSONS: Mapping[str, Mapping[str, Any]] = {
 
 @checked_call
 def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) -> Path:
-    """Write a machine's file: whole under its name, or not at all.
+    """Write a machine's file: whole under its name, or not at all; one that is there is kept, as `.toml.bak`.
 
     Parameters
     ----------
     machine : CommissionedMachine
         What `sealscope.commission` returns.
     path : str or path-like
-        The file, ending in .toml; one that is there is replaced.
+        The file, ending in .toml.
 
     Returns
     -------
@@ -79,6 +82,9 @@ def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) ->
     if target.suffix.lower() != ".toml":
         raise InputError(f"a machine's file must end in .toml, got {target}")
     text = _HEAD + "\n".join(_tables(_tree(machine))) + "\n"
+    if target.is_file():
+        with atomic_write(target.with_suffix(".toml.bak")) as temporary:
+            temporary.write_bytes(target.read_bytes())
     with atomic_write(target) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return target
@@ -102,6 +108,12 @@ def _tree(machine: CommissionedMachine) -> dict[str, Any]:
         learnt["smallest_leak"] = _known(summary.smallest)
     learnt["terms"] = {name: _known(term) for name, term in summary.terms.items()}
     tree["healthy"] = [_row(own, machine.about.get(own.digest, {})) for own in machine.healthy]
+    if machine.alarms:
+        tree["alarms"] = [
+            {"alarm": own.alarm, "mark": own.mark, "date": _stamp(own.date_s), "onset": _stamp(own.onset_s)}
+            | {name: value for name in ("leak_lpm", "reason") if (value := getattr(own, name))}
+            for own in machine.alarms
+        ]
     return tree
 
 
@@ -109,8 +121,12 @@ def _known(values: Any) -> dict[str, Any]:
     return {name: value for name, value in values._asdict().items() if value is not None}
 
 
+def _stamp(moment: float) -> str:
+    return datetime.fromtimestamp(moment, UTC).isoformat()
+
+
 def _row(own: Learnt, about: Mapping[str, Any]) -> dict[str, Any]:
-    start = {} if own.start_s is None else {"start": datetime.fromtimestamp(own.start_s, UTC).isoformat()}
+    start = {} if own.start_s is None else {"start": _stamp(own.start_s)}
     plain = {"file": own.file, "digest": own.digest, "rate": own.rate, "seconds": own.seconds}
     lessons = {
         name: {key: value for key, value in lesson.items() if value is not None} for name, lesson in own.lessons.items()
@@ -136,10 +152,10 @@ def _tables(tree: Mapping[str, Any], prefix: tuple[str, ...] = ()) -> Iterator[s
 
 
 def _stands_apart(value: Any, within: bool) -> bool:
-    """Whether a value is a table of its own, or a list of them; within a table, one of figures alone is a line."""
+    """Whether a value is a table of its own, or the list of them that all others are in; figures alone are a line."""
     if isinstance(value, Mapping):
         return not within or not all(isinstance(own, str | float | int) for own in value.values()) or not value
-    return isinstance(value, list) and bool(value) and isinstance(value[0], Mapping)
+    return isinstance(value, list) and not within
 
 
 def _key(key: str) -> str:
@@ -208,12 +224,16 @@ def load_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
         raise InputError(f"healthy must hold a recording, got none ({place})")
     healthy = tuple(_healthy(row, f"healthy[{k}] of {place}") for k, row in enumerate(rows))
     about = {
-        own.digest: _part(row, "about", dict, place) if "about" in row else {}
-        for own, row in zip(healthy, rows, strict=True)
+        own.digest: _about(row, f"healthy[{k}] of {place}")
+        for k, (own, row) in enumerate(zip(healthy, rows, strict=True))
     }
     rig = {name: table for name, table in tree.items() if name not in OF_MACHINES and name != "map"}
     known = Rig.from_dict(rig, place=place) if rig else None
-    return CommissionedMachine(name, healthy, known, channel_map, rate, limit, about)
+    alarms = tuple(
+        _alarm(row, f"alarms[{k}] of {place}")
+        for k, row in enumerate(_part(tree, "alarms", list, place) if "alarms" in tree else ())
+    )
+    return CommissionedMachine(name, healthy, known, channel_map, rate, limit, about, alarms=alarms)
 
 
 def _part(tree: Mapping[str, Any], name: str, kind: type, place: str) -> Any:
@@ -236,13 +256,41 @@ def _healthy(row: Any, place: str) -> Learnt:
             raise InputError(f"{name} must be > 0, got {values[name]:g} ({place})")
     if not all(isinstance(unit, str) for unit in values["units"].values()):
         raise InputError(f"units must be texts, got {values['units']!r:.60} ({place})")
-    try:
-        start_s = datetime.fromisoformat(row["start"]).timestamp() if "start" in row else None
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(f"start must be a time as ISO 8601 writes it, got {row['start']!r:.60} ({place})") from None
+    start_s = _moment(row, "start", place) if "start" in row else None
     lessons = {name: _lesson(name, values["lessons"], place) for name in values["lessons"]}
     units, rate, seconds = values["units"], values["rate"], values["seconds"]
     return Learnt(values["file"], values["digest"], units, rate, seconds, start_s, lessons)
+
+
+def _about(row: Mapping[str, Any], place: str) -> dict[str, Any]:
+    """Return what people read of a healthy recording."""
+    about: dict[str, Any] = _part({"about": {}, **row}, "about", dict, place)
+    for name in _ABOUT.keys() & about.keys():
+        _part(about, name, _ABOUT[name], place)
+    for name in about.get("noise", {}):
+        _part(about["noise"], name, float, place)
+    if not all(isinstance(text, str) for text in about.get("wrong", ())):
+        raise InputError(f"wrong must hold texts, got {about['wrong']!r:.60} ({place})")
+    return about
+
+
+def _moment(row: Mapping[str, Any], name: str, place: str) -> float:
+    try:
+        return datetime.fromisoformat(row[name]).timestamp()
+    except (KeyError, TypeError, ValueError, OverflowError):
+        got = repr(row.get(name))
+        raise InputError(f"{name} must be a time as ISO 8601 writes it, got {got:.60} ({place})") from None
+
+
+def _alarm(row: Any, place: str) -> JudgedAlarm:
+    """Return what a person said of an alarm."""
+    if not isinstance(row, dict):
+        raise InputError(f"an alarm must be a table, got {row!r:.60} ({place})")
+    texts = {name: _part({"reason": "", **row}, name, str, place) for name in ("alarm", "mark", "reason")}
+    if texts["mark"] not in MARKS:
+        raise InputError(f"mark must be one of {', '.join(MARKS)}, got {texts['mark']!r:.60} ({place})")
+    leak = _part(row, "leak_lpm", float, place) if "leak_lpm" in row else None
+    return JudgedAlarm(**texts, date_s=_moment(row, "date", place), onset_s=_moment(row, "onset", place), leak_lpm=leak)
 
 
 def _lesson(name: str, lessons: Mapping[str, Any], place: str) -> dict[str, Any]:

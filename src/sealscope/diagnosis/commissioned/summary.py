@@ -112,7 +112,7 @@ def _stated(rig: Rig | None) -> str:
         parts.append(f"piston {' and '.join(areas)} mm^2")
     if rig is not None and rig.states("pump.q_b"):
         parts.append(f"pump {1e6 * rig.pump.q_b:.3g} cm^3/rev")
-    return ", ".join(parts) or "size not stated: --rig, --area or --displacement states L/min"
+    return ", ".join(parts) or "size not stated: L/min needs a rig, an area or a displacement"
 
 
 def _flow(healthy: Learnt) -> dict[str, float]:
@@ -221,7 +221,7 @@ def _smallest(balance: VolumeBalance, lessons: Sequence[Mapping[str, Any]], chan
 
 
 def _smallest_text(smallest: Smallest) -> str:
-    return f"the next recording shows {smallest} ({POWER:.0%} of the time)"
+    return f"the next recording shows {smallest} ({100.0 * POWER:g} % of the time)"
 
 
 def _half_text(smallest: Smallest, count: int, dated: bool) -> str:

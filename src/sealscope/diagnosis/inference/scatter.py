@@ -193,7 +193,7 @@ def student(value: float, apart: Sequence[float] | Array, believed: float) -> Ri
     `believed`: what is believed of the scatter beforehand.
     """
     beliefs, count = priors()["scatter"], len(apart)
-    squares = beliefs["freedom"].value * believed**2
+    squares = beliefs["freedom"].value * believed * believed
     freedom = beliefs["freedom"].value + count - 1
     if count > 1:
         squares += float(np.sum(np.square(apart))) * ((count - 1) / count) ** 2

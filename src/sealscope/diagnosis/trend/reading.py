@@ -169,7 +169,7 @@ def timeline(readings: Sequence[LeakReading], every: float | None = None) -> Tim
     if unknown := [reading.file for reading in readings if reading.start is None]:
         raise InputError(
             f"the time of every recording must be known, got none of {_names(unknown)}: put the date into the names "
-            "(press_20240531.csv, press_20240531_0730.csv), or give --every 1d where they were made at equal "
+            "(press_20240531.csv, press_20240531_0730.csv), or give every (such as 1d) where they were made at equal "
             "intervals, in the order of their names"
         )
     ordered = sorted(readings, key=lambda reading: (reading.start or 0.0, natural(reading.file)))

@@ -226,9 +226,10 @@ function showLife(life) {
   const state = now.state;
   const since = state.since_s === null ? "" : ` since ${clock(state.since_s)}`;
   const size = state.condition.startsWith("leak") ? ` ${flow(now.leak_lpm, now.leak_interval_lpm)}` : "";
+  const limit = life.limit_lpm ? `; limit ${litres(life.limit_lpm)} L/min` : "";
   byId("state").replaceChildren(
     badge(state),
-    element("strong", "", ` ${state.condition}${size}${since}`),
+    element("strong", "", ` ${state.condition}${size}${since}${limit}`),
     element("span", "action", `${state.cause ? `Cause: ${state.cause}. ` : ""}${state.action}`),
   );
   byId("now").textContent =

@@ -134,6 +134,8 @@ class _Pages:
         seconds = float(span) * 3600.0 if _HOURS.fullmatch(span) else None
         life: dict[str, Any] = {"name": name, "summary": summary, "machine": self._machines[name]}
         life |= {"course": self._store.course(name, seconds=seconds), "events": self._store.last_events(name)}
+        settings = self._actuators.settings[name]
+        life["limit_lpm"] = settings.error_lpm or settings.warning_lpm or None
         return JSONResponse({**life, "alarms": self._store.alarms(actuator=name)[:50]})
 
     async def mark(self, request: Request) -> Response:

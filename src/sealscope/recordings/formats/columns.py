@@ -324,7 +324,7 @@ class _Choice:
             guess = map_options(proposed_map(self.labels))
             raise UnreadableFile(
                 f"a recording must have a channel ({', '.join(CHANNEL_UNITS)}) or be given a map such as p_A=COLUMN, "
-                f"got columns {self.have} ({self.place})" + (f"; --map auto would read {guess}" if guess else "")
+                f"got columns {self.have} ({self.place})" + (f"; map auto would read {guess}" if guess else "")
             )
         if rate is None and self.time is None:
             if stated_rate is None:
@@ -372,7 +372,7 @@ def choose_columns(
         time = time_label = None
     if left:
         guesses = {name: column for name, column in proposed_map(labels).items() if name not in {*channels, "t"}}
-        hint = f"; --map auto would also read {map_options(guesses)}" if guesses else ""
+        hint = f"; map auto would also read {map_options(guesses)}" if guesses else ""
         notes.append(f"{UNUSED}: {listed((label.whole for label in left), 40)}{hint}")
     if time is None:
         date = None

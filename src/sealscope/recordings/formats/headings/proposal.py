@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shlex
 import unicodedata
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -73,8 +72,8 @@ def proposed_map(labels: Sequence[Label]) -> dict[str, str]:
 
 
 def map_options(channel_map: Mapping[str, str]) -> str:
-    """Return the `--map` options of a map, ready for a shell."""
-    return " ".join(f"--map {shlex.quote(f'{channel}={column}')}" for channel, column in channel_map.items())
+    """Return a map in words."""
+    return ", ".join(f"{channel}={column}" for channel, column in channel_map.items())
 
 
 def is_time(label: Label) -> bool:

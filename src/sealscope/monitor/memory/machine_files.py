@@ -1,0 +1,62 @@
+"""What persons say of alarms, in the file of the commissioned machine that an actuator's `rig` is."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+from sealscope.diagnosis.commissioned.machine import JudgedAlarm
+from sealscope.diagnosis.commissioned.machine_file import LARGEST, MARKS, load_machine, write_machine
+from sealscope.errors import SealscopeError
+from sealscope.monitor.alarms import Alarm
+from sealscope.recordings.joining import join
+from sealscope.recordings.recording import Recording
+from sealscope.storage.toml_file import read_toml
+
+#: Clocks of samples beyond it are seconds since 1970.
+_DATED = 1e8
+_writing = threading.Lock()
+
+
+def pass_on(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording]) -> str:
+    """Write into a machine's file what a person said of an alarm, and return in one line what was done.
+
+    An `invalid` alarm's `samples`, the last ones before the mark, are taught as healthy; the machine's file refuses
+    those that it judges leaking. From the onset of a `valid` one on no recording is, until a repair. "" where `mark` is
+    another one, or `rig` no machine's file.
+    """
+    path = Path(rig)
+    if mark not in MARKS or path.suffix.lower() != ".toml":
+        return ""
+    try:
+        if "machine" not in read_toml(path, "a machine's file", rig, LARGEST):
+            return ""
+        with _writing:
+            shift = 0.0 if alarm.onset_s > _DATED else time.time() - alarm.updated_s
+            leak = None if mark == "invalid" else alarm.leak_lpm
+            said = JudgedAlarm(alarm.id, mark, time.time(), alarm.onset_s + shift, leak, alarm.reason)
+            machine = load_machine(path)
+            done = "written down"
+            if mark == "invalid":
+                try:
+                    machine = machine.with_healthy(_recording(samples, shift), file=alarm.id)
+                    done = "taught as healthy"
+                except SealscopeError as error:
+                    done = f"not taught: {error}"
+            write_machine(replace(machine, alarms=(*machine.alarms, said)), path)
+    except (SealscopeError, ValueError, OverflowError, OSError) as error:
+        done = f"not written: {error}"
+    return f"{path.name}: {done}"
+
+
+def _recording(samples: Sequence[Recording], shift: float) -> Recording:
+    """Return samples as one recording that begins at 0 s of a date, their clock and `shift` [s since 1970]."""
+    if not samples:
+        raise SealscopeError("no samples of the alarm are kept")
+    whole = join(samples) if len(samples) > 1 else samples[0]
+    start = datetime.fromtimestamp(float(whole.t[0]) + shift, UTC).replace(tzinfo=None)
+    return replace(whole, t=whole.t - whole.t[0], provenance={"start": start.isoformat(timespec="milliseconds")})

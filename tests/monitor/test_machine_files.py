@@ -1,0 +1,117 @@
+"""What a person says of an alarm reaches the file of the commissioned machine."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+import sealscope as ss
+from sealscope.errors import InputError
+from sealscope.monitor.actuators import WatchedActuators
+from sealscope.monitor.service import Service
+
+from ..diagnosis.balance_machine import machine, step
+from .plant import lines_of, served, settings_in
+
+NAME = "press 1"
+
+
+def worn(G: float) -> ss.Recording:
+    """A machine that passes more from second 100 on, one day in November 2023."""
+    recording = machine(1, G=step(0.0, G, at=100.0), duration=130.0, rate=50.0)
+    return replace(recording, t=recording.t + 1.7e9)
+
+
+WORN = worn(3.0e-13)
+
+
+@pytest.fixture(scope="module")
+def commissioned(tmp_path_factory: pytest.TempPathFactory) -> dict[float, Path]:
+    """Files of a machine whose healthy recordings pass nothing, and as much as the worn one."""
+    files = {}
+    for G in (0.0, 3.0e-13):
+        folder = tmp_path_factory.mktemp("healthy")
+        for seed in range(11, 15):
+            ss.write(machine(seed, G=G, duration=30.0, rate=50.0), folder / f"run{seed}.nc")
+        files[G] = ss.write_machine(ss.commission(folder, rig="thesis"), folder / "press.toml")
+    return files
+
+
+def alarmed(folder: Path, file: Path, recording: ss.Recording = WORN) -> Service:
+    """A monitor that has raised an alarm of an actuator whose rig is a copy of a machine's file."""
+    (folder / "press.toml").write_bytes(file.read_bytes())
+    (folder / "settings").mkdir()
+    settings = settings_in(folder / "settings")
+    own = [replaced(each, folder / "press.toml") for each in settings.actuator]
+    return served(settings.model_copy(update={"actuator": own}), lines_of({NAME: recording}, 150))[0]
+
+
+def replaced(settings, rig):
+    return settings.model_copy(update={"rig": str(rig)}) if settings.name == NAME else settings
+
+
+def said_by(actuators: WatchedActuators) -> str:
+    event = actuators.store.last_events(NAME)[0]
+    assert (event["event"], event["by"]) == ("comment", "Sealscope")
+    return event["text"]
+
+
+def test_the_samples_of_an_invalid_alarm_are_taught(tmp_path, commissioned):
+    service = alarmed(tmp_path, commissioned[3.0e-13])
+    service.actuators.mark(NAME, "invalid", text="another valve", by_whom="Ada")
+    assert said_by(service.actuators) == "press.toml: taught as healthy"
+    before, after = (ss.load_machine(tmp_path / f"press.toml{end}") for end in (".bak", ""))
+    assert (len(before.healthy), len(after.healthy)) == (4, 5)
+    (taught,) = [own for own in after.healthy if own.file == f"{NAME}-1"]
+    assert WORN.t[0] + 100.0 < taught.start_s < WORN.t[-1]
+    (alarm,) = after.alarms
+    assert (alarm.mark, alarm.reason, alarm.leak_lpm) == ("invalid", "another valve", None)
+
+
+def test_samples_that_leak_are_not_taught_whatever_is_said(tmp_path, commissioned):
+    service = alarmed(tmp_path, commissioned[0.0], worn(1.0e-11))
+    service.actuators.mark(NAME, "invalid", text="no oil seen")
+    assert said_by(service.actuators).startswith("press.toml: not taught: a healthy recording must not leak")
+    assert len(ss.load_machine(tmp_path / "press.toml").healthy) == 4
+
+
+def test_nothing_is_taught_from_the_onset_of_a_valid_alarm_on_until_the_repair(tmp_path, commissioned):
+    file = tmp_path / "press.toml"
+    service = alarmed(tmp_path, commissioned[3.0e-13])
+    service.actuators.mark(NAME, "valid")
+    assert said_by(service.actuators) == "press.toml: written down"
+    known = ss.load_machine(file)
+    (alarm,) = known.alarms
+    assert alarm.onset_s == pytest.approx(WORN.t[0] + 100.0, abs=2.0)
+    assert alarm.leak_lpm == pytest.approx(0.00195, rel=0.3)
+    assert f"{NAME}-1 valid {datetime.now(UTC).date()}" in str(known)
+
+    def healthy(start: float, seed: int = 20) -> ss.Recording:
+        made = {"start": datetime.fromtimestamp(start, UTC).replace(tzinfo=None).isoformat()}
+        return replace(machine(seed, G=3.0e-13, duration=30.0, rate=50.0), provenance=made)
+
+    early, late = healthy(alarm.onset_s - 3600.0), healthy(alarm.date_s + 3600.0)
+    assert len(known.with_healthy(early).healthy) == 5
+    with pytest.raises(InputError, match=r"must be of a time without a leak, got press 1-1 valid"):
+        known.with_healthy(late)
+    service.actuators.mark(NAME, "repaired")
+    again = ss.load_machine(file).with_healthy(late)
+    assert len(again.since(alarm.date_s).healthy) == 1
+    with pytest.raises(InputError, match="without a leak"):
+        again.with_healthy(healthy(alarm.onset_s + 3600.0, 21))
+
+
+def test_without_samples_or_a_file_it_says_so(tmp_path, commissioned):
+    service = alarmed(tmp_path, commissioned[0.0])
+    again = WatchedActuators([*service.actuators.settings.values()], service.store)
+    again._actuators[NAME].kept.clear()
+    again.mark(NAME, "invalid", text="no oil seen")
+    assert said_by(again) == "press.toml: not taught: no samples of the alarm are kept"
+    (tmp_path / "gone").mkdir()
+    service = alarmed(tmp_path / "gone", commissioned[0.0])
+    (tmp_path / "gone" / "press.toml").write_text("[machine]\nformat = 9\n")
+    service.actuators.mark(NAME, "valid")
+    assert said_by(service.actuators).startswith("press.toml: not written: machine.format must be 1, got 9")
