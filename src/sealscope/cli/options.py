@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from textwrap import fill
@@ -20,6 +21,7 @@ from sealscope.errors import InputError, SealscopeError, UnreadableFile
 
 if TYPE_CHECKING:
     from sealscope.diagnosis.commissioned.machine import CommissionedMachine
+    from sealscope.diagnosis.verdict.diagnosis import Diagnosis
     from sealscope.parameters import Rig
     from sealscope.recordings import Recording
     from sealscope.recordings.formats.columns import ChannelMap

@@ -346,9 +346,9 @@ def _lost_outside(side: str) -> Term:
     name = f"p_{side}"
     return Term(
         f"external leak {side}",
-        f"p_{side} dt",
+        f"max(p_{side}, 0) dt",
         "m^3/(s Pa)",
-        lambda s: s.mean(name) * s.dt,
+        lambda s: np.maximum(s.mean(name), 0.0) * s.dt,
         "external leak",
         nuisance=False,
         needs=(name,),
@@ -365,11 +365,11 @@ def _made_up(side: str) -> Term:
 
     def lost(s: Signals) -> Array:
         carries = _middle(s.carried_by_A)
-        return np.asarray((carries if side == "A" else 1.0 - carries) * s.mean(name) * s.dt)
+        return np.asarray((carries if side == "A" else 1.0 - carries) * np.maximum(s.mean(name), 0.0) * s.dt)
 
     return Term(
         f"external leak {side}{MADE_UP}",
-        f"[{name} the larger] {name} dt",
+        f"[{name} the larger] max({name}, 0) dt",
         "m^3/(s Pa)",
         lost,
         "external leak",

@@ -7,6 +7,7 @@ operator's, the noise stands above the ringing, which a leak damps, and in p_A +
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
@@ -17,6 +18,7 @@ from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Information
 from sealscope.diagnosis.inference.terms import priors
 from sealscope.diagnosis.verdict.evidence import Cause
+from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording
 
 _BELIEVED = beliefs("inference.other_steps")["features"]
@@ -90,19 +92,30 @@ FEATURES = (
 
 
 @np.errstate(divide="ignore")
+def _cycles_length(recording: Recording) -> int:
+    """Return the samples of a block: whole cycles, where the duty repeats."""
+    even, cycle = len(recording) // BLOCKS, find_cycle(recording)
+    if cycle is None:
+        return even
+    samples = cycle * recording.rate
+    return round(max(1, math.ceil(even / samples)) * samples)
+
+
 def features(recording: Recording, wanted: Sequence[Feature] = FEATURES) -> list[tuple[Feature, Information]]:
     """Return what the blocks of a recording say of features, those left out that its channels do not show."""
-    length = len(recording) // BLOCKS
+    # without a position command and motion are the drive's, which a leak moves within a cycle as well
+    length = _cycles_length(recording) if wanted is DUTY and "x" in recording else len(recording) // BLOCKS
     if length <= ORDER + 1:
         return []
-    blocks = {name: values[: BLOCKS * length].reshape(BLOCKS, length) for name, values in recording.channels.items()}
+    count = len(recording) // length
+    blocks = {name: values[: count * length].reshape(count, length) for name, values in recording.channels.items()}
     if recording.bridged is not None:
-        missing = recording.bridged[: BLOCKS * length].reshape(BLOCKS, length)
+        missing = recording.bridged[: count * length].reshape(count, length)
         blocks = {name: np.where(missing, np.nan, values) for name, values in blocks.items()}
-    time = recording.t[0] + (np.arange(BLOCKS) + 0.5) * length / recording.rate
+    time = recording.t[0] + (np.arange(count) + 0.5) * length / recording.rate
     wander, shown = priors()["features"]["wander"].value, []
     for feature in wanted:
         values = feature.of(blocks, recording.rate) if feature.needs <= blocks.keys() else None
         if values is not None and np.isfinite(values).all() and np.ptp(values) > 0.0:
-            shown.append((feature, Information(time, np.eye(BLOCKS), values, slope=wander, walk=wander)))
+            shown.append((feature, Information(time, np.eye(count), values, slope=wander, walk=wander)))
     return shown
