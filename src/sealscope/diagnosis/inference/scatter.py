@@ -7,18 +7,16 @@ recording against the others measures how recordings differ; whatever the model 
 Recordings of one session, by their dates, share oil and set-up: y_j of session s is m_s + e_j, with m_s ~ N(m, tau^2)
 and e_j ~ N(0, sigma^2). With r_j the rise of recording j of n against the n - 1 others, y_j = r_j (n - 1)/n,
 
-    sigma^2 = (nu_0 s_0^2 + sum_j (y_j - m_s)^2) / (nu_0 + n - S),
-    tau^2 = (nu_1 tau_0^2 + sum_s max(m_s^2 - sigma^2/n_s, 0)) / (nu_1 + S - 1),
     t = (rise - (1 - q) m_k) / d,    d^2 = sigma^2 + q tau^2 + q^2 (sigma^2/n + tau^2 sum_s (n_s/n)^2),
 
 for a judged recording of session k, q = sigma^2 / (sigma^2 + n_k tau^2); of a new session n_k = m_k = 0 and q = 1.
-Where all are of a single session, d^2 = sigma^2 (1 + 1/n), Student's t with nu_0 + n - 1 degrees of freedom. s_0, tau_0
-and what they count for, nu, are believed beforehand (`terms.toml`): between sessions a healthy machine's leakage goes
+tau has a half-normal prior, sigma^2 a scaled inverse chi square one (s_0, nu_0); with the restricted likelihood of what
+is observed, the rise is a mixture over both. Where all are of a single session, d^2 = sigma^2 (1 + 1/n), and t is
+Student's with nu_0 + n - 1 degrees of freedom. What is believed stands in `terms.toml`: between sessions leakage goes
 with the inverse of the oil's viscosity, in proportion to its level. Recordings without a date are of one session. Where
 the oil's temperature T is known of all, what it makes of the level is taken off, and only that factor's error remains.
 
-Sources: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sections 3.2 and 5.4; F. E. Satterthwaite, Biometrics
-Bulletin 2 (1946) 110 (degrees of freedom of d^2).
+Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sections 3.2, 5.4 and 5.7.
 """
 
 from __future__ import annotations
@@ -32,31 +30,54 @@ from sealscope.diagnosis.inference.blocks import Blocks, Columns, solve, total
 from sealscope.diagnosis.inference.terms import priors
 from sealscope.recordings.recording import Array
 
+#: Nodes of a deviation, and the largest one between sessions over what is believed.
+NODES, WIDEST = 32, 3.0
+
+
+class Mixture(NamedTuple):
+    """A mixture of normal laws about zero: `weights` and `deviations`, (k,) each."""
+
+    weights: Array
+    deviations: Array
+
 
 class Rise(NamedTuple):
-    """The leak's coefficient beyond the baseline's: `value` and its `deviation`, with `freedom` degrees of freedom."""
+    """The leak's coefficient beyond the baseline's: `value` and its `deviation`, with `freedom` degrees of freedom.
+
+    `parts`: the mixture that it follows, where that is no single Student's law.
+    """
 
     value: float
     deviation: float
     freedom: float
+    parts: Mixture | None = None
 
     @property
     def score(self) -> float:
-        """Student's t of the rise."""
+        """The rise over its deviation."""
         return self.value / self.deviation
 
     @property
     def chance(self) -> float:
         """Probability that a healthy recording scores as high."""
-        from scipy.special import stdtr
+        return self._beyond(self.score)
 
-        return float(stdtr(self.freedom, -self.score))
+    def _beyond(self, score: float) -> float:
+        from scipy.special import ndtr, stdtr
+
+        if self.parts is None:
+            return float(stdtr(self.freedom, -score))
+        return float(self.parts.weights @ ndtr(-score * self.deviation / self.parts.deviations))
 
     def threshold(self, chance: float) -> float:
         """Return the score that a healthy recording exceeds with a probability."""
-        from scipy.special import stdtrit
+        from scipy.optimize import brentq
+        from scipy.special import ndtri, stdtrit
 
-        return float(stdtrit(self.freedom, 1.0 - chance))
+        if self.parts is None:
+            return float(stdtrit(self.freedom, 1.0 - chance))
+        ends = np.sort(-ndtri(chance) * self.parts.deviations / self.deviation)
+        return float(brentq(lambda score: self._beyond(score) - chance, ends[0], ends[-1]))
 
     def interval(self, probability: float = 0.95) -> tuple[float, float]:
         """Return the interval of the rise that holds with a probability."""
@@ -103,33 +124,40 @@ def rise(judged: Taught, baseline: Sequence[Taught], columns: Sequence[Columns])
     if len(set(sessions)) == 1:
         return student(value, deviations * (count / max(count - 1, 1)), beliefs["leak"].value * by_flow)
     members = [deviations[np.equal(of_baseline, session)] for session in dict.fromkeys(of_baseline)]
-    sizes, means = np.array([len(own) for own in members]), np.array([own.mean() for own in members])
-    squares = float(sum(((own - own.mean()) ** 2).sum() for own in members))
-    within = _Variance.of(beliefs["leak"].value * by_flow, beliefs["freedom"].value, squares, count - len(members))
-    squares = float(np.maximum(means**2 - within.value / sizes, 0.0).sum())
-    believed = float(np.hypot(oil, beliefs["session"].value * by_flow))
-    between = _Variance.of(believed, beliefs["sessions"].value, squares, len(members) - 1)
     at = list(dict.fromkeys(of_baseline)).index(of_judged) if of_judged in of_baseline else None
+    believed = beliefs["leak"].value * by_flow, float(np.hypot(oil, beliefs["session"].value * by_flow))
+    return _between_sessions(value, members, at, *believed)
+
+
+def _between_sessions(value: float, members: Sequence[Array], at: int | None, usual: float, apart: float) -> Rise:
+    """Return a rise, where recordings are of several sessions: a mixture over the deviations within and between them.
+
+    `members`: of each session of the baseline, its recordings' deviations from the mean; `at`: the judged recording's
+    session, None for a new one; `usual` within a session, and how far sessions are `apart`, as believed.
+    """
+    sizes, means = np.array([len(own) for own in members]), np.array([own.mean() for own in members])
+    count, weight = int(sizes.sum()), priors()["scatter"]["freedom"].value
+    squares = weight * usual**2 + float(sum(((own - own.mean()) ** 2).sum() for own in members))
+    everything = float(sum((own**2).sum() for own in members))
+    least, most = 0.1 * np.sqrt(squares / (weight + count)), 100.0 * np.sqrt(squares + everything)
+    within = np.geomspace(max(least, np.finfo(float).tiny), max(most, np.finfo(float).tiny), NODES)[:, None] ** 2
+    nodes = np.square((np.arange(NODES) + 0.5) / NODES)  # closer near zero
+    between = (WIDEST * apart * nodes) ** 2
+    spread = between[:, None] + within[..., None] / sizes
+    precision = (1.0 / spread).sum(axis=2)
+    centre = (means / spread).sum(axis=2) / precision
+    left = ((means - centre[..., None]) ** 2 / spread).sum(axis=2) + np.log(spread).sum(axis=2) + np.log(precision)
+    left += (weight + count - len(members)) * np.log(within) + squares / within + (WIDEST * nodes) ** 2
+    weights = np.exp(-0.5 * (left - left.min())) * np.sqrt(nodes)
+    weights /= weights.sum()
     alike, mean = (0, 0.0) if at is None else (int(sizes[at]), float(means[at]))
-    q = within.value / (within.value + alike * between.value)
+    q = within / (within + alike * between)
     # of a known session q tau^2 = (1 - q) sigma^2 / n_k
-    of_within = within.value * (1.0 + q**2 / count + ((1.0 - q) / alike if alike else 0.0))
-    of_between = between.value * (float(alike == 0) + q**2 * float(((sizes / count) ** 2).sum()))
-    variance = max(of_within + of_between, np.finfo(float).tiny)
-    freedom = variance**2 / (of_within**2 / within.freedom + of_between**2 / between.freedom)
-    return Rise(value - (1.0 - q) * mean, float(np.sqrt(variance)), freedom)
-
-
-class _Variance(NamedTuple):
-    """An estimate of a variance, and its degrees of freedom."""
-
-    value: float
-    freedom: float
-
-    @classmethod
-    def of(cls, believed: float, weight: float, squares: float, freedom: int) -> _Variance:
-        """Return that of a sum of squares of so many degrees of freedom, beside a belief that weighs as others."""
-        return cls((weight * believed**2 + squares) / (weight + freedom), weight + freedom)
+    variance = within * (1.0 + q**2 / count + ((1.0 - q) / alike if alike else 0.0))
+    variance = variance + between * (float(alike == 0) + q**2 * float(((sizes / count) ** 2).sum()))
+    parts = Mixture(weights.ravel(), np.sqrt(variance).ravel())
+    shrunk = value - float((weights * (1.0 - q)).sum()) * mean
+    return Rise(shrunk, float(np.sqrt((weights * variance).sum())), np.inf, parts)
 
 
 def _sessions(taught: Sequence[Taught]) -> list[int]:
@@ -147,8 +175,8 @@ def _of_oil(taught: Sequence[Taught], level: float, error: float) -> list[float]
     """
     beliefs = priors()["oil"]
     known = [own.oil_degC for own in taught if own.oil_degC is not None]
-    if len(known) < len(taught):
-        return [0.0] * len(taught) + [0.5 * (beliefs["warmest"].value - 1.0) * (level + error)]
+    if len(known) < len(taught):  # the difference of two sessions has twice the variance of each
+        return [0.0] * len(taught) + [0.5**1.5 * (beliefs["warmest"].value - 1.0) * (level + error)]
     warmer = np.array(known) - np.mean(known[:-1])
     factor = np.exp(beliefs["per_kelvin"].value * warmer)
     deviation = beliefs["per_kelvin_deviation"].value * abs(warmer[-1]) * factor[-1] * (level + error)

@@ -94,7 +94,7 @@ FEATURES = (
 @np.errstate(divide="ignore")
 def _cycles_length(recording: Recording) -> int:
     """Return the samples of a block: whole cycles, where the duty repeats."""
-    even, cycle = len(recording) // BLOCKS, find_cycle(recording)
+    even, cycle = len(recording) // int(BLOCKS), find_cycle(recording)
     if cycle is None:
         return even
     samples = cycle * recording.rate
