@@ -1,18 +1,20 @@
 """What is found on a real electro-hydrostatic actuator: healthy runs of one set-up, each judged against the others.
 
-    python benchmarks/real_eha.py FILE... [--leaks 0 0.02 0.05 0.1 0.4] [--plain]
+    python benchmarks/real_eha.py FILE... [--leaks 0 0.02 0.05 0.1 0.4] [--plain] [--commissioned FILE...]
 
 FILE: the logs of the public repository ivliev123/Electro-Hydraulic-Actuator (semicolon CSV, raw counts, 1 kHz), fetched
 by yourself: it has no licence, and none of it is part of this project. A leak of so many L/min, at the run's mean
 pressure difference, is put into the judged run: for the same motion the motor turns faster by G (p_A - p_B) over the
 displacement. The verdict knows the areas and the displacement that the builder states, the other runs, no onset and no
 size. `--plain`: beside it the plain regression of `plain_regression.py`.
+`--commissioned`: the runs are judged by the file of a machine commissioned on these runs alone, in place of the others.
 """
 
 from __future__ import annotations
 
 import argparse
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from plain_regression import regression
@@ -44,11 +46,15 @@ def main() -> None:
     parser.add_argument("files", nargs="+")
     parser.add_argument("--leaks", nargs="*", type=float, default=[0.0, 0.01, 0.02, 0.05, 0.1, 0.4])
     parser.add_argument("--plain", action="store_true")
+    parser.add_argument("--commissioned", nargs="+", default=[])
     options = parser.parse_args()
     rig = load_rig("single-rod-eha").with_overrides(
         {"cylinder.A_A": AREAS[0], "cylinder.A_B": AREAS[1], "pump.q_b": DISPLACEMENT}
     )
-    runs = [ss.read(path, map=MAP) for path in options.files]
+    machine = ss.commission(options.commissioned, rig=rig, map=MAP) if options.commissioned else None
+    if machine is not None:
+        print(f"commissioned on {len(machine.healthy)} runs: the next one shows {machine.summary.smallest}")
+    runs = [ss.read(path, map=MAP) for path in options.files if path not in options.commissioned]
     print("| leak [L/min] | leak | cannot tell | size, median | intervals hold | bound, median |", end="")
     print(
         " plain regression |\n| --- | --- | --- | --- | --- | --- | --- |"
@@ -60,7 +66,8 @@ def main() -> None:
         for k, run in enumerate(runs):
             others = [own for j, own in enumerate(runs) if j != k]
             judged = leaking(run, lpm) if lpm else run
-            verdicts.append(ss.diagnose(judged, others, rig=rig, quick=True))
+            by = partial(ss.diagnose, baseline=others, rig=rig) if machine is None else machine.diagnose
+            verdicts.append(by(judged, quick=True))
             plain += regression(judged, others, 1.6e-6) if options.plain else 0
         found = [own for own in verdicts if own.verdict == "leak"]
         sizes = [own.leak_lpm for own in found if own.leak_lpm is not None]
