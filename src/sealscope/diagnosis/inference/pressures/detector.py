@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 CAUSES: dict[str, Cause] = {
     "G": "piston leak",
     "K": "air in the oil",
-    **dict.fromkeys(("gain", "lead", "bias"), "changed duty"),
-    **dict.fromkeys(("F_C", "F_v", "K_brk", "C_c", "side"), "friction change"),
+    **dict.fromkeys(("gain", "lead", "bias", "spring"), "changed duty"),
+    **dict.fromkeys(("F_C", "F_v", "K_brk", "C_c", "side", "give"), "friction change"),
     **dict.fromkeys(("lag", "scale", "offset"), "sensor fault"),
 }
 _95, _SURE = 1.96, 0.95

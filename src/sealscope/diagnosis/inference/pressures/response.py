@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
+from scipy.signal import lfilter
 
 from sealscope.compiled import contracted, kernel
 from sealscope.diagnosis.inference.onset import Information
@@ -44,7 +45,7 @@ from sealscope.diagnosis.inference.pressures.evidence import (
     wander_of_conductance,
 )
 from sealscope.physics.cylinder import piston_acceleration, pressure_rate
-from sealscope.physics.friction import coulomb_friction, stribeck_friction
+from sealscope.physics.friction import coulomb_friction, stribeck_level
 from sealscope.physics.lanes import SINGLE_WIDTH, load, select, store
 from sealscope.physics.leakage import laminar_leakage
 from sealscope.physics.motor import controller_voltage, shaft_acceleration, winding_current_rate
@@ -59,11 +60,15 @@ if TYPE_CHECKING:
 #: of the oil [Pa], Coulomb friction [N], viscous friction [N s/m], breakaway over Coulomb friction [1], its decay
 #: [s/m], share by which friction is larger on the way out [1], conductance past the piston [m^3/(s Pa)], lag of the
 #: transducers [s]; then what no simulation needs: scale of p_A - p_B [1] and its offset [Pa].
-PARAMETERS = ("gain", "lead", "bias", "K", "F_C", "F_v", "K_brk", "C_c", "side", "G", "lag", "scale", "offset")
-GAIN, LEAD, BIAS, K_OIL, F_C, F_V, K_BRK, C_C, SIDE, G, LAG, SCALE, OFFSET = range(len(PARAMETERS))
-_SIZE, _SIMULATED = len(PARAMETERS), LAG + 1
-State = tuple[float, float, float, float, float]
-Parameters = tuple[float, float, float, float, float, float, float, float, float, float, float]
+PARAMETERS = (
+    *("gain", "bias", "K", "F_C", "F_v", "K_brk", "C_c", "side", "G", "give", "spring"),
+    *("lead", "lag", "scale", "offset"),
+)
+GAIN, BIAS, K_OIL, F_C, F_V, K_BRK, C_C, SIDE, G, GIVE, SPRING, LEAD, LAG, SCALE, OFFSET = range(len(PARAMETERS))
+_SIZE, _SIMULATED = len(PARAMETERS), SPRING + 1
+State = tuple[float, float, float, float, float, float]
+Parameters = tuple[float, float, float, float, float, float, float, float, float, float, float, float, float]
+_CENTRING = 10.0
 #: Longest step of the solver [s]: RK4 is within 100 Pa there, far under the noise of transducers.
 _STEP = 1.01e-3
 #: Steps of differences as a share of what is believed; gain of twice the log likelihood that is worth a run, most steps
@@ -88,26 +93,48 @@ _POSITIVE = [GAIN, K_OIL, F_C, K_BRK, C_C]
 
 
 @contracted
-def _rates(y: State, spin: float, now: Parameters, m: RigNumbers) -> State:
-    """Return dy/dt of y = (p, v, omega, i, I) under the speed `spin` [rad/s] that the command asks for."""
-    p, v, omega, i, integral = y
-    friction = stribeck_friction(v, now[F_C], now[K_BRK], now[C_C], now[F_V], m.v_th, False)
-    friction = friction * select(v < 0.0, 1.0 - now[SIDE], 1.0 + now[SIDE])
+def _steady(v: float, now: Parameters, m: RigNumbers) -> tuple[float, float]:
+    """Return the friction of steady sliding [N], and the velocity over it at which the contact slips [m/(s N)]."""
+    speed = max(abs(v), m.v_th)
+    level = stribeck_level(speed, now[F_C], now[K_BRK], now[C_C]) * select(v < 0.0, 1.0 - now[SIDE], 1.0 + now[SIDE])
+    slip = speed / level
+    return v / slip, slip
+
+
+@contracted
+def _held_by(friction: float, before: float, v: float, h: float, now: Parameters, m: RigNumbers) -> tuple[float, float]:
+    steady, slip = _steady(v, now, m)
+    a = h * slip / now[GIVE]
+    return (friction + 0.5 * a * (before + steady * (1.0 + a))) / (1.0 + a * (1.0 + 0.5 * a)), steady
+
+
+@contracted
+def _rates(y: State, friction: float, spin: float, now: Parameters, m: RigNumbers) -> State:
+    """Return dy/dt of y = (p, v, omega, i, I, x) under the speed `spin` [rad/s] that the command asks for."""
+    p, v, omega, i, integral, x = y
     past = m.A_A * v + laminar_leakage(p, now[G])
     error = spin - omega
     voltage = controller_voltage(error, integral, m.k_p, m.K_i, m.V_max)
     return (
         2.0 * pressure_rate(pump_flow(omega, p, m.q_b, 0.0) - past, m.V, now[K_OIL]),
-        piston_acceleration(0.5 * p, -0.5 * p, friction, 0.0, 0.0, m.A_A, m.A_A, m.M_eq),
+        piston_acceleration(0.5 * p, -0.5 * p, friction + now[F_V] * v, now[SPRING] * x, 0.0, m.A_A, m.A_A, m.M_eq),
         shaft_acceleration(i, omega, pump_torque(p, m.q_b), m.C_m, m.B_M, m.J_M),
         winding_current_rate(voltage, i, omega, m.R_c, m.L_c, m.C_e, m.i_max),
         error,
+        v - x * (1.0 / _CENTRING),
     )
 
 
 @contracted
 def _moved(y: State, h: float, k: State) -> State:
-    return y[0] + h * k[0], y[1] + h * k[1], y[2] + h * k[2], y[3] + h * k[3], y[4] + h * k[4]
+    return (
+        y[0] + h * k[0],
+        y[1] + h * k[1],
+        y[2] + h * k[2],
+        y[3] + h * k[3],
+        y[4] + h * k[4],
+        y[5] + h * k[5],
+    )
 
 
 @kernel
@@ -119,8 +146,8 @@ def simulate_response(
     `command` (n + 1,) [V]: at the sample before, then at each, with ramps between; `theta` (p, lanes), a row a
     parameter; `states` (6, lanes): p, v, omega, i, I and the reading at the sample before, on return at the last.
     """
-    y = (load(states, 0), load(states, 1), load(states, 2), load(states, 3), load(states, 4))
-    read = load(states, 5)
+    y = (load(states, 0), load(states, 1), load(states, 2), load(states, 3), load(states, 4), load(states, 5))
+    friction, read = load(states, 6), load(states, 7)
     now = (
         load(theta, 0),
         load(theta, 1),
@@ -133,8 +160,11 @@ def simulate_response(
         load(theta, 8),
         load(theta, 9),
         load(theta, 10),
+        load(theta, 11),
+        load(theta, 12),
     )
     h = 1.0 / (rate * every)
+    before = _steady(y[1], now, m)[0]
     for sample in range(command.size - 1):
         rise = command[sample + 1] - command[sample]
         ahead = now[GAIN] * now[LEAD] * (rise * rate) + now[BIAS]
@@ -142,12 +172,16 @@ def simulate_response(
             w_0 = now[GAIN] * (command[sample] + rise * (step / every)) + ahead
             w_1 = now[GAIN] * (command[sample] + rise * ((step + 0.5) / every)) + ahead
             w_2 = now[GAIN] * (command[sample] + rise * ((step + 1.0) / every)) + ahead
-            k_1 = _rates(y, w_0, now, m)
-            k_2 = _rates(_moved(y, 0.5 * h, k_1), w_1, now, m)
-            k_3 = _rates(_moved(y, 0.5 * h, k_2), w_1, now, m)
-            k_4 = _rates(_moved(y, h, k_3), w_2, now, m)
+            k_1 = _rates(y, friction, w_0, now, m)
+            y_1 = _moved(y, 0.5 * h, k_1)
+            k_2 = _rates(y_1, _held_by(friction, before, y_1[1], 0.5 * h, now, m)[0], w_1, now, m)
+            y_2 = _moved(y, 0.5 * h, k_2)
+            k_3 = _rates(y_2, _held_by(friction, before, y_2[1], 0.5 * h, now, m)[0], w_1, now, m)
+            y_3 = _moved(y, h, k_3)
+            k_4 = _rates(y_3, _held_by(friction, before, y_3[1], h, now, m)[0], w_2, now, m)
             total = _moved(_moved(_moved(k_1, 2.0, k_2), 2.0, k_3), 1.0, k_4)
             y = _moved(y, h / 6.0, total)
+            friction, before = _held_by(friction, before, y[1], h, now, m)
             read = read + (y[0] - read) * (h / (h + now[LAG]))
         store(out, sample, read)
     store(states, 0, y[0])
@@ -155,7 +189,9 @@ def simulate_response(
     store(states, 2, y[2])
     store(states, 3, y[3])
     store(states, 4, y[4])
-    store(states, 5, read)
+    store(states, 5, y[5])
+    store(states, 6, friction)
+    store(states, 7, read)
 
 
 class Beliefs(NamedTuple):
@@ -171,7 +207,7 @@ class Beliefs(NamedTuple):
         return np.asarray(_NUDGE * np.minimum(self.width, self.wander))
 
 
-def beliefs_of(rig: Rig) -> Beliefs:
+def beliefs_of(rig: Rig, law: str = "static") -> Beliefs:
     """Return the beliefs on machines of a rig at its charge pressure: zeros of the transducers change nothing."""
     friction, gain = rig.friction, rig.motor.omega_per_volt
     of_difference = friction.coulomb_pressure == "difference"
@@ -179,7 +215,7 @@ def beliefs_of(rig: Rig) -> Beliefs:
     own = {"gain": gain, "bias": gain, "K": rig.fluid.K_oil, "F_C": coulomb}
     own |= {name: getattr(friction, name) for name in ("F_v", "K_brk", "C_c")}
     scale = np.array([own.get(name, 1.0) for name in PARAMETERS])
-    mean, wander = priors("response"), priors("response_wander")
+    mean, wander = {**priors("response"), **priors(law)}, {**priors("response_wander"), **priors(law + "_wander")}
     return Beliefs(
         scale * [mean[name].value for name in PARAMETERS],
         scale * [mean[name].width for name in PARAMETERS],
@@ -195,16 +231,18 @@ class Machine(NamedTuple):
     every: int
 
     @staticmethod
-    def of(rig: Rig, rate: float) -> Machine:
+    def of(rig: Rig, rate: float, law: str = "static") -> Machine:
         """Return that of a rig's kind."""
         numbers = rig_numbers(rig)
         area = 0.5 * (numbers.A_A + numbers.A_B)
+        if law == "bristles":
+            numbers = numbers._replace(v_th=1e-4)
         return Machine(numbers._replace(A_A=area, A_B=area), rate, math.ceil(1.0 / rate / _STEP))
 
     def run(self, command: Array, paths: Array, states: Array) -> tuple[Array, Array]:
         """Return p_A - p_B (n, m) [Pa] of up to 16 sets (m, p) from their states (6, m), and the states at the end."""
         lanes = np.minimum(np.arange(SINGLE_WIDTH), len(paths) - 1)
-        theta = np.ascontiguousarray(paths[lanes, :_SIMULATED].T, dtype=np.float32)
+        theta = np.ascontiguousarray(paths[lanes, : LAG + 1].T, dtype=np.float32)
         ends = np.ascontiguousarray(states[:, lanes], dtype=np.float32)
         out = np.empty((command.size - 1, SINGLE_WIDTH), dtype=np.float32)
         simulate_response(command, self.rate, self.every, theta, ends, self.numbers, out)
@@ -297,7 +335,18 @@ class Stretch:
         own = [0, *range(_SIMULATED + 1, len(sets))]
         left = self.dp[:, None] - sets[own, SCALE] * shown[:, own] - sets[own, OFFSET]
         slopes = theta[SCALE] * (shown[:, 1 : _SIMULATED + 1] - shown[:, :1])
-        rest = np.column_stack([self.unit[SCALE] * shown[:, 0], np.full(len(shown), self.unit[OFFSET])])
+        course = np.pad(shown[:, 0], 2, mode="reflect", reflect_type="odd")
+        earlier = theta[SCALE] * self.machine.rate * np.convolve(course, np.array([-1.0, 8.0, 0.0, -8.0, 1.0]) / 12.0, "valid")
+        kept = math.exp(-1.0 / (self.machine.rate * max(theta[LAG], 1e-9)))
+        later = -lfilter([1.0 - kept], [1.0, -kept], earlier)
+        rest = np.column_stack(
+            [
+                self.unit[LEAD] * earlier,
+                self.unit[LAG] * later,
+                self.unit[SCALE] * shown[:, 0],
+                np.full(len(shown), self.unit[OFFSET]),
+            ]
+        )
         rows = self.seen(np.concatenate([left, slopes, rest], axis=1))
         count = len(own)
         return Look(theta, rows[:, 0], rows[:, count:], ends[:, : _SIMULATED + 1]), rows[:, 1:count]
@@ -344,10 +393,11 @@ def held(theta: Array, paths: Array) -> Array:
     """Return sets (m, p) whose positive parameters are between half and twice those of `theta` (p,)."""
     paths[:, _POSITIVE] = np.clip(paths[:, _POSITIVE], 0.5 * theta[_POSITIVE], 2.0 * theta[_POSITIVE])
     paths[:, LAG] = np.maximum(paths[:, LAG], 0.0)
+    paths[:, GIVE] = np.maximum(paths[:, GIVE], 1e-9)
     return np.asarray(paths)
 
 
-def first_fit(stretch: Stretch, beliefs: Beliefs, total: Array) -> tuple[Array, float]:
+def first_fit(stretch: Stretch, beliefs: Beliefs, total: Array, noise: float) -> Look:
     """Return parameters (p,) that hold over a stretch, and the variance that they leave [Pa^2].
 
     The ringing makes many local minima. So the slow part of the pressure is fitted first, from the best of several
@@ -369,15 +419,13 @@ def first_fit(stretch: Stretch, beliefs: Beliefs, total: Array) -> tuple[Array, 
     theta = slow.descend(gains[0], belief, _FIRST_STEPS).theta
     stiffnesses = np.append(stretch.machine.ringing(stretch.dp, total, beliefs), [theta[K_OIL], beliefs.centre[K_OIL]])
     grid = {K_OIL: np.repeat(stiffnesses, 4), K_BRK: np.tile(theta[K_BRK] * np.array(_BREAKAWAYS), 4)}
-    noise = max(float(np.var(np.diff(total, 3))) / 20.0, 1.0)
 
     def fitted(starts: Sequence[Array], steps: int) -> list[Look]:
         looks = [stretch.descend(start, belief, steps, noise) for start in starts]
         return sorted(looks, key=lambda look: float(np.nan_to_num(look.cost(noise, belief, beliefs.unit), nan=np.inf)))
 
     near = fitted(list(tried(stretch, theta, grid)[:_STARTS]), _FEW_STEPS)
-    best = fitted([look.theta for look in near[:2]], _STEPS)[0]
-    return best.theta, stretch.spread(best.left)
+    return fitted([look.theta for look in near[:2]], _STEPS)[0]
 
 
 class LinearBlock(NamedTuple):
@@ -423,18 +471,29 @@ class Follower:
         self.machine, self.beliefs, self.sense = machine, beliefs, sense
         self.theta, self.variance, self.last = beliefs.centre, math.nan, math.nan
         self.covariance = np.diag((beliefs.width / beliefs.unit) ** 2)
-        self.states, self.excess = np.zeros((6, _SIMULATED + 1)), 0.0
+        self.states, self.excess = np.zeros((8, _SIMULATED + 1)), 0.0
 
     @staticmethod
     def begun(recording: Recording, rig: Rig) -> Follower:
         """Return it fitted to the first seconds of a recording, about to take these."""
         u, dp = recording["u"], recording["p_A"] - recording["p_B"]
         sense = float(np.sign(np.mean(u * (dp - dp.mean())))) or 1.0
-        beliefs = beliefs_of(rig)
-        follower = Follower(Machine.of(rig, recording.rate), beliefs, sense)
-        total = (recording["p_A"] + recording["p_B"])[: math.ceil(_WINDOW * recording.rate)]
-        window = follower.stretch(recording.samples(slice(0, math.ceil(_WINDOW * recording.rate))))
-        follower.theta, follower.variance = first_fit(window, beliefs, total)
+        beginning = recording.samples(slice(0, math.ceil(_WINDOW * recording.rate)))
+        follower = Follower(Machine.of(rig, recording.rate), beliefs_of(rig), sense)
+        window, total = follower.stretch(beginning), beginning["p_A"] + beginning["p_B"]
+        noise = max(float(np.var(np.diff(total, 3))) / 20.0, 1.0)
+        look = first_fit(window, follower.beliefs, total, noise)
+        cost = look.cost(noise, Normal(follower.beliefs.centre, np.diag((follower.beliefs.unit / follower.beliefs.width) ** 2)), follower.beliefs.unit)
+        samples = float(np.count_nonzero(window.known))
+        if cost > samples + _UNEXPLAINED * math.sqrt(2.0 * samples):
+            other = Follower(Machine.of(rig, recording.rate, "bristles"), beliefs_of(rig, "bristles"), sense)
+            start = look.theta.copy()
+            start[GIVE] = other.beliefs.centre[GIVE]
+            belief = Normal(other.beliefs.centre, np.diag((other.beliefs.unit / other.beliefs.width) ** 2))
+            bristly = other.stretch(beginning).descend(start, belief, _STEPS, noise)
+            if bristly.cost(noise, belief, other.beliefs.unit) < cost:
+                follower, look = other, bristly
+        follower.theta, follower.variance = look.theta, window.spread(look.left)
         covariance, states = follower.covariance, follower.states
         length = round(_BLOCK * recording.rate)
         taken = min(round(_BEGINNING * recording.rate), len(recording) - length + 1)
