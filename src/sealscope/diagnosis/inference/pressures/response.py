@@ -451,7 +451,7 @@ def first_fit(stretch: Stretch, beliefs: Beliefs, total: Array, noise: float) ->
     )
     breakaways = theta[K_BRK] * _tried("response_start", "K_brk", 4)
     starts = best(stretch, theta, {K_OIL: np.repeat(stiffnesses, 4), K_BRK: np.tile(breakaways, 4)})[:_STARTS]
-    near = fitted(stretch, starts, beliefs, _FEW_STEPS, noise)
+    near = fitted(stretch, list(starts), beliefs, _FEW_STEPS, noise)
     return fitted(stretch, [look.theta for look in near[:2]], beliefs, _STEPS, noise)[0]
 
 
