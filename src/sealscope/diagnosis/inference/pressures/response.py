@@ -89,8 +89,8 @@ _LEAST_SHARE, _DAMPED, _LEAST_DAMPED, _MOST_DAMPED = 0.02, 0.1, 1e-3, 100.0
 #: Beginning along which it is led once, and the blocks there [s].
 _BEGINNING, _BLOCK = 24.0, 6.0
 #: The first fit: length of its window [s], width of the Gaussian that takes the ring out [periods], steps of the slow
-#: fit, starts from which the whole is fitted, steps by which they are compared, and length of the spectra [samples].
-_WINDOW, _SLOW, _FIRST_STEPS, _STARTS, _FEW_STEPS, _SEGMENT = 12.0, 0.6, 6, 8, 2, 256
+#: fit, steps by which starts are compared, and length of the spectra [samples].
+_WINDOW, _SLOW, _FIRST_STEPS, _FEW_STEPS, _SEGMENT = 12.0, 0.6, 6, 2, 256
 _POSITIVE = [GAIN, K_OIL, F_C, K_BRK, C_C]
 
 
@@ -100,22 +100,25 @@ def _of_way(v: float, now: Parameters) -> float:
 
 
 @contracted
-def _steady(v: float, now: Parameters, m: RigNumbers) -> tuple[float, float]:
-    """Return the friction of steady sliding [N], and the velocity over it at which the contact slips [m/(s N)]."""
+def _steady(v: float, now: Parameters, m: RigNumbers) -> tuple[float, float, float]:
+    """Return the friction of steady sliding [N], its level [N], and the speed at which the contact slips [m/s]."""
     speed = max(abs(v), m.v_th)
-    slip = speed / (stribeck_level(speed, now[F_C], now[K_BRK], now[C_C]) * _of_way(v, now))
-    return v / slip, slip
+    level = stribeck_level(speed, now[F_C], now[K_BRK], now[C_C]) * _of_way(v, now)
+    return level * min(max(v / m.v_th, -1.0), 1.0), level, speed
 
 
 @contracted
 def _held_by(friction: float, before: float, v: float, h: float, now: Parameters, m: RigNumbers) -> tuple[float, float]:
-    """Return the friction [N] after h seconds in which that of steady sliding went from `before` to that at v, and it.
+    """Return the friction F [N] after h seconds in which that of steady sliding went from `before` to that at v.
 
-    give dF/dt = v - slip F: LuGre's law without its damping, which dies out as the contact slides.
+    give dF/dt = v - speed F/level: LuGre's law without its damping, which dies out as the contact slides. With a = h
+    speed/(give level), F = (F_0 + (a/2) (before + (1 + a) steady)) / (1 + a + a^2/2), times (give level)^2 above and
+    below; and `steady`, that at v.
     """
-    steady, slip = _steady(v, now, m)
-    a = h * slip / now[GIVE]
-    return (friction + 0.5 * a * (before + steady * (1.0 + a))) / (1.0 + a * (1.0 + 0.5 * a)), steady
+    steady, level, speed = _steady(v, now, m)
+    w, g = h * speed, now[GIVE] * level
+    part = 0.5 * w
+    return (friction * g * g + part * (before * g + steady * (g + w))) / (g * g + w * (g + part)), steady
 
 
 @contracted
@@ -412,8 +415,9 @@ class Stretch:
 
 def _rate_of_change(values: Array) -> Array:
     """Return the change a sample of values (n,), to fourth order: that of a ring is one of its fastest."""
-    padded = np.pad(values, 2, mode="reflect", reflect_type="odd")
-    return np.asarray(np.convolve(padded, np.array([-1.0, 8.0, 0.0, -8.0, 1.0]) / 12.0, "valid"))
+    slope = np.asarray(np.gradient(values))
+    slope[1:-1] -= np.diff(slope, 2) / 6.0
+    return slope
 
 
 def held(theta: Array, paths: Array) -> Array:
@@ -431,35 +435,38 @@ def first_fit(stretch: Stretch, beliefs: Beliefs, total: Array, noise: float) ->
     gains; then the whole, from stiffnesses by which it rings where the spectra of p_A - p_B and of the sum p_A + p_B,
     `total` (n,), in which nothing rings, say, and from several breakaway forces.
     """
-    belief = beliefs.normal
 
-    def best(of: Stretch, theta: Array, changes: dict[int, Array]) -> Array:
-        """Return sets of the parameters (16, p), the best first."""
+    def ranked(of: Stretch, theta: Array, groups: int, changes: dict[int, Array]) -> Array:
+        """Return the groups that 16 sets with `changes` make, the best of each first: (16/groups, groups, p)."""
         sets = np.tile(theta, (SINGLE_WIDTH, 1))
         for parameter, values in changes.items():
             sets[:, parameter] = values
-        squares = np.square(of.residuals(sets)).sum(axis=0)
-        return np.asarray(sets[np.argsort(np.nan_to_num(squares, nan=np.inf))])
+        squares = np.nan_to_num(np.square(of.residuals(sets)).sum(axis=0), nan=np.inf).reshape(groups, -1)
+        return sets.reshape(groups, -1, _SIZE)[range(groups), squares.argsort(axis=1).T]
 
     slow = replace(stretch, smooth=_SLOW * stretch.machine.period(beliefs.centre[K_OIL]))
-    gains = beliefs.centre[GAIN] * _tried("response_start", "gain", SINGLE_WIDTH // 2)
+    gains = beliefs.centre[GAIN] * _tried("response_start", "gain", 8)
     springs = beliefs.centre[SPRING] + beliefs.width[SPRING] * np.array([0.0, 1.0])
-    first = best(slow, beliefs.centre, {GAIN: np.tile(gains, 2), SPRING: np.repeat(springs, len(gains))})[0]
-    theta = slow.descend(first, belief, _FIRST_STEPS).theta
-    stiffnesses = np.append(
-        stretch.machine.ringing(stretch.dp, total, beliefs), beliefs.centre[K_OIL] * _tried("response_start", "K", 2)
-    )
+    first = ranked(slow, beliefs.centre, 1, {GAIN: np.tile(gains, 2), SPRING: np.repeat(springs, 8)})
+    theta = slow.descend(first[0, 0], beliefs.normal, _FIRST_STEPS).theta
+    ringing = stretch.machine.ringing(stretch.dp, total, beliefs)
+    stiffnesses = np.append(ringing, beliefs.centre[K_OIL] * _tried("response_start", "K", 2))
     breakaways = theta[K_BRK] * _tried("response_start", "K_brk", 4)
-    starts = best(stretch, theta, {K_OIL: np.repeat(stiffnesses, 4), K_BRK: np.tile(breakaways, 4)})[:_STARTS]
-    near = fitted(stretch, list(starts), beliefs, _FEW_STEPS, noise)
-    return fitted(stretch, [look.theta for look in near[:2]], beliefs, _STEPS, noise)[0]
+    starts = ranked(stretch, theta, 4, {K_OIL: np.repeat(stiffnesses, 4), K_BRK: np.tile(breakaways, 4)})
+    look = fitted(stretch, list(starts[0]), beliefs, noise, 2)
+    if not _explained(look.cost(noise, beliefs.normal, beliefs.unit), stretch.known):
+        look = fitted(stretch, [look.theta, *starts[1]], beliefs, noise, 2)
+    return look
 
 
-def fitted(stretch: Stretch, starts: Sequence[Array], beliefs: Beliefs, steps: int, noise: float) -> list[Look]:
-    """Return the looks that steps from several starts lead to, the likeliest first."""
-    looks = [stretch.descend(start, beliefs.normal, steps, noise) for start in starts]
-    costs = np.nan_to_num([look.cost(noise, beliefs.normal, beliefs.unit) for look in looks], nan=np.inf)
-    return [looks[place] for place in np.argsort(costs)]
+def fitted(stretch: Stretch, starts: Sequence[Array], beliefs: Beliefs, noise: float, kept: int) -> Look:
+    """Return the likeliest look that steps from several starts lead to, few from all and more from the best `kept`."""
+    for steps, number in ((_FEW_STEPS, kept), (_STEPS, 1)):
+        looks = [stretch.descend(start, beliefs.normal, steps, noise) for start in starts]
+        costs = np.nan_to_num([look.cost(noise, beliefs.normal, beliefs.unit) for look in looks], nan=np.inf)
+        best = [looks[place] for place in np.argsort(costs)[:number]]
+        starts = [look.theta for look in best]
+    return best[0]
 
 
 class LinearBlock(NamedTuple):
@@ -529,7 +536,7 @@ class Follower:
             other = Follower(Machine.of(rig, recording.rate, BRISTLES), beliefs_of(rig, BRISTLES), sense)
             starts = np.array([look.theta, other.beliefs.centre])
             starts[:, GIVE] = other.beliefs.centre[GIVE]
-            giving = fitted(other.stretch(beginning), list(starts), other.beliefs, _STEPS, noise)[0]
+            giving = fitted(other.stretch(beginning), list(starts), other.beliefs, noise, 1)
             if giving.cost(noise, other.beliefs.normal, other.beliefs.unit) < cost:
                 follower, look = other, giving
         follower.theta, follower.variance = look.theta, window.spread(look.left)
