@@ -461,6 +461,7 @@ def first_fit(stretch: Stretch, beliefs: Beliefs, total: Array, noise: float) ->
 
 def fitted(stretch: Stretch, starts: Sequence[Array], beliefs: Beliefs, noise: float, kept: int) -> Look:
     """Return the likeliest look that steps from several starts lead to, few from all and more from the best `kept`."""
+    best: list[Look] = []
     for steps, number in ((_FEW_STEPS, kept), (_STEPS, 1)):
         looks = [stretch.descend(start, beliefs.normal, steps, noise) for start in starts]
         costs = np.nan_to_num([look.cost(noise, beliefs.normal, beliefs.unit) for look in looks], nan=np.inf)
