@@ -20,7 +20,7 @@ import numpy as np
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.live.balance import FOLLOWS, BlockConductance, NotJudged, Shown
 from sealscope.diagnosis.inference.pressures.evidence import SLOWEST, flow_scale, priors, states_flow, unusable
-from sealscope.diagnosis.inference.pressures.response import Follower, G, Machine, beliefs_of
+from sealscope.diagnosis.inference.pressures.response import LAWS, Follower, G, Machine, beliefs_of
 from sealscope.errors import InputError
 from sealscope.recordings.motion import moves
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
@@ -161,7 +161,8 @@ class PressureEstimator:
         state = saved(self, _SAVED) | {"pieces": [plain_array(np.array(piece)) for piece in self._pieces]}
         if (own := self._follower) is None:
             return state | {"follower": None}
-        return state | {"follower": saved(own, _FOLLOWED) | {"rate": own.machine.rate, "sense": own.sense}}
+        machine = {"rate": own.machine.rate, "law": own.machine.law, "sense": own.sense}
+        return state | {"follower": saved(own, _FOLLOWED) | machine}
 
     @classmethod
     def from_state(cls, rig: Rig, state: Mapping[str, Any]) -> PressureEstimator:
@@ -177,7 +178,9 @@ class PressureEstimator:
         rate, sense = (float(part_of(known, name, (float, int))) for name in ("rate", "sense"))
         if not rate > 0.0:
             raise InputError(f"saved state's rate must be > 0 Hz, got {rate}")
-        follower = Follower(Machine.of(rig, rate), beliefs_of(rig), sense)
+        if (law := part_of(known, "law", str)) not in LAWS:
+            raise InputError(f"saved state's law must be {' or '.join(LAWS)}, got {law!r}")
+        follower = Follower(Machine.of(rig, rate, law), beliefs_of(rig, law), sense)
         recall(follower, _FOLLOWED, known)
         estimator._follower = follower
         return estimator

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 CAUSES: dict[str, Cause] = {
     "G": "piston leak",
     "K": "air in the oil",
-    **dict.fromkeys(("gain", "lead", "bias"), "changed duty"),
-    **dict.fromkeys(("F_C", "F_v", "K_brk", "C_c", "side"), "friction change"),
+    **dict.fromkeys(("gain", "lead", "bias", "spring"), "changed duty"),
+    **dict.fromkeys(("F_C", "F_v", "K_brk", "C_c", "side", "give"), "friction change"),
     **dict.fromkeys(("lag", "scale", "offset"), "sensor fault"),
 }
 _95, _SURE = 1.96, 0.95
@@ -79,14 +79,13 @@ class PressureReading:
         """Tests of all that may have stepped, the most likely first; the ring tells no leak from friction."""
         if self.test is None:
             return ()
-        tested = [StepHypothesis("G", CAUSES["G"], self.test, self.test.score)]
         if self.response is None:
-            tested.append(StepHypothesis("F_v", CAUSES["F_v"], self.test, self.test.score))
-        else:
-            for index, name in enumerate(response.PARAMETERS):
-                test = None if name == "G" else step_test(self.response.information(index), (1.0, -1.0))
-                if test is not None:
-                    tested.append(StepHypothesis(name, CAUSES[name], test, test.score))
+            return tuple(StepHypothesis(name, CAUSES[name], self.test) for name in ("G", "F_v"))
+        tests = {
+            name: self.test if name == "G" else step_test(self.response.information(index), (1.0, -1.0))
+            for index, name in enumerate(response.PARAMETERS)
+        }
+        tested = (StepHypothesis(name, CAUSES[name], test) for name, test in tests.items() if test is not None)
         return tuple(sorted(tested, key=lambda own: -own.score))
 
     @cached_property
@@ -95,10 +94,6 @@ class PressureReading:
         own = self.evidence.information
         precision = max(float(own.precision.sum()), np.finfo(float).tiny)
         return float(own.vector.sum()) / precision, precision**-0.5
-
-    def lpm(self, step: float, deviation: float) -> tuple[float, tuple[float, float]]:
-        """Return a change of g as a flow [L/min], with its 95 % interval."""
-        return self.evidence.flow(step, deviation)
 
 
 class PressureResponse:
@@ -144,19 +139,15 @@ def judge(own: PressureReading, probability: float, levels: Sequence[float] = ()
     causes = probabilities(own.hypotheses) if answered is not None and answered.name == WITHIN else {}
     if causes and not is_leak(causes):
         answered = None
-    judging, bound = answered or questions[0], _bound(own, test, against)
+    judging = answered or questions[0]
+    bound = max(against.interval(0.9)[1], 0.0) if against is not None else (test.bound() if test is not None else 0.0)
     if answered is None:
         worth = bound * float(own.evidence.pressure.mean()) <= terms_priors()["worth"]["share"].value * own.flow
         enough = worth and sum(causes.get(cause, 0.0) for cause in LEAKS) < 1.0 - _SURE
         cause = stepped_cause(own.hypotheses, RAREST)
         evidence = Evidence("no leak" if enough else "cannot tell", "", cause=None if cause in LEAKS else cause)
     elif answered.name == WITHIN:
-        assert test is not None
-        onset = test.onset()
-        evidence = Evidence(
-            "leak", "", cause="piston leak", onset_s=onset.value, onset_interval_s=(onset.low, onset.high)
-        )
-        evidence = _sized(own, evidence, *test.fitted)
+        evidence = _begun(own)
     else:
         evidence = Evidence("leak", "", cause="piston leak")  # levels of g lean on the friction: they state no L/min
     return _with_figures(own, evidence, questions, judging, bound)
@@ -182,26 +173,19 @@ def _rise(own: PressureReading, levels: Sequence[float]) -> Rise:
     return student(own.level[0] - total / count, apart, priors("response")["G_level"].width)
 
 
-def _bound(own: PressureReading, test: StepTest | None, against: Rise | None) -> float:
-    """Return the 95 % upper bound of a rise of g within the recording, or since the baseline [m^3/(s Pa)]."""
-    if against is not None:
-        return max(against.interval(0.9)[1], 0.0)
-    assert test is not None
-    return test.bound()
-
-
-def _sized(own: PressureReading, evidence: Evidence, step: float, deviation: float) -> Evidence:
-    """Return a leak's evidence with its flow, as far as the machine's size is stated."""
+def _begun(own: PressureReading) -> Evidence:
+    """Return the evidence of a leak that began within the recording, in L/min where the machine's size is stated."""
+    assert own.test is not None
+    onset = own.test.onset()
+    evidence = Evidence("leak", "", cause="piston leak", onset_s=onset.value, onset_interval_s=onset[1:])
     if not own.stated:
         return replace(evidence, refuses=frozenset({"leak_lpm"}))
-    lpm, interval = own.lpm(step, deviation)
-    return replace(evidence, leak_lpm=max(lpm, 0.0), leak_interval_lpm=interval, course=_course(own, evidence.onset_s))
+    lpm, interval = own.evidence.flow(*own.test.fitted)
+    return replace(evidence, leak_lpm=max(lpm, 0.0), leak_interval_lpm=interval, course=_course(own, onset.value))
 
 
-def _course(own: PressureReading, onset: float | None) -> LeakCourse | None:
-    """Return the leak block by block, beyond the mean before its onset; None without one."""
-    if onset is None or own.test is None:
-        return None
+def _course(own: PressureReading, onset: float) -> LeakCourse:
+    """Return the leak block by block, beyond the mean before its onset."""
     time = own.evidence.information.time
     g = course(own.evidence.information, own.test, step=True)
     before = (time < onset).astype(float)

@@ -1,8 +1,9 @@
 """Pressures and command alone: the whole response of p_A - p_B, simulated and linearised block by block.
 
-The rig reduced to what p_A - p_B depends on has five states: the difference p, the piston's speed v, the motor's speed,
-its current and the integral of its speed loop, under the laws of `sealscope.physics`. With y(theta) the simulated
-pressure difference and theta_k the parameters of block k, which wander from block to block as random walks,
+The rig reduced to what p_A - p_B depends on has seven states: the difference p, the piston's speed v and position, the
+friction, the motor's speed, its current and the integral of its speed loop, under the laws of `sealscope.physics`. Of
+the friction there are two hypotheses, Stribeck's law and LuGre's; the likelier at the beginning is taken. With y(theta)
+the simulated pressure difference and theta_k the parameters of block k, which wander from block to block,
 
     y_k(theta) = y_k(theta_k^0) + J_k (theta_k - theta_k^0),
 
@@ -29,6 +30,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
+from scipy.signal import lfilter
 
 from sealscope.compiled import contracted, kernel
 from sealscope.diagnosis.inference.onset import Information
@@ -44,7 +46,7 @@ from sealscope.diagnosis.inference.pressures.evidence import (
     wander_of_conductance,
 )
 from sealscope.physics.cylinder import piston_acceleration, pressure_rate
-from sealscope.physics.friction import coulomb_friction, stribeck_friction
+from sealscope.physics.friction import coulomb_friction, stribeck_level
 from sealscope.physics.lanes import SINGLE_WIDTH, load, select, store
 from sealscope.physics.leakage import laminar_leakage
 from sealscope.physics.motor import controller_voltage, shaft_acceleration, winding_current_rate
@@ -55,59 +57,97 @@ from sealscope.recordings.recording import Array, Recording, remembered
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: What a block has of its own: speed per volt [rad/(s V)], lead of the command [s], speed beside it [rad/s], stiffness
-#: of the oil [Pa], Coulomb friction [N], viscous friction [N s/m], breakaway over Coulomb friction [1], its decay
-#: [s/m], share by which friction is larger on the way out [1], conductance past the piston [m^3/(s Pa)], lag of the
-#: transducers [s]; then what no simulation needs: scale of p_A - p_B [1] and its offset [Pa].
-PARAMETERS = ("gain", "lead", "bias", "K", "F_C", "F_v", "K_brk", "C_c", "side", "G", "lag", "scale", "offset")
-GAIN, LEAD, BIAS, K_OIL, F_C, F_V, K_BRK, C_C, SIDE, G, LAG, SCALE, OFFSET = range(len(PARAMETERS))
-_SIZE, _SIMULATED = len(PARAMETERS), LAG + 1
-State = tuple[float, float, float, float, float]
-Parameters = tuple[float, float, float, float, float, float, float, float, float, float, float]
-#: Longest step of the solver [s]: RK4 is within 100 Pa there, far under the noise of transducers.
-_STEP = 1.01e-3
+#: What a block has of its own: speed per volt [rad/(s V)], speed beside it [rad/s], stiffness of the oil [Pa], Coulomb
+#: friction [N], viscous friction [N s/m], breakaway over Coulomb friction [1], its decay [s/m], share by which friction
+#: is larger on the way out [1], conductance past the piston [m^3/(s Pa)], give of the contact before it slides [m/N],
+#: stiffness of the load [N/m]; then, whose slopes need no simulation of their own: lead of the command [s], lag of the
+#: transducers [s], scale of p_A - p_B [1] and its offset [Pa].
+PARAMETERS = (
+    *("gain", "bias", "K", "F_C", "F_v", "K_brk", "C_c", "side", "G", "give", "spring"),
+    *("lead", "lag", "scale", "offset"),
+)
+GAIN, BIAS, K_OIL, F_C, F_V, K_BRK, C_C, SIDE, G, GIVE, SPRING, LEAD, LAG, SCALE, OFFSET = range(len(PARAMETERS))
+_SIZE, _SIMULATED = len(PARAMETERS), SPRING + 1
+State = tuple[float, float, float, float, float, float]
+Parameters = tuple[float, float, float, float, float, float, float, float, float, float, float, float, float]
+#: Laws of the friction, two hypotheses: Stribeck's of the rig; and LuGre's, whose contact does not creep (speed [m/s]).
+LAWS = STRIBECK, BRISTLES = "stribeck", "bristles"
+_NO_CREEP, _STIFF = 1e-4, 1e-9
+#: Longest step of the solver [s]: RK4 is within 100 Pa there, far under the noise of transducers; time constant of the
+#: mean position, from which the load's spring counts [s]; row of the position in the states; and first seconds, in
+#: which they settle.
+_STEP, _CENTRING, _POSITION, _SETTLING = 1.01e-3, 10.0, 5, 1.0
 #: Steps of differences as a share of what is believed; gain of twice the log likelihood that is worth a run, most steps
 #: of a fit, turns to the noise's variance.
 _NUDGE, _ENOUGH, _STEPS, _TURNS = 0.05, 5.0, 12, 2
 #: Share of the variance of p_A - p_B that parameters which simulate it leave.
 _EXPLAINED = 0.5
-#: Where a block's chi square is so many deviations more than expected, jumps are tried: conductances [m^3/(s Pa)], and
-#: stiffnesses over the one before.
+#: Where a block's chi square is so many deviations more than expected, jumps are tried.
 _UNEXPLAINED = 3.0
-_CONDUCTANCES, _STIFFNESSES = np.geomspace(1e-12, 2e-10, SINGLE_WIDTH), np.geomspace(0.15, 1.2, SINGLE_WIDTH)
 #: Least share of a step that is tried; damping [1] of steps that did not gain, at first, at least and at most.
 _LEAST_SHARE, _DAMPED, _LEAST_DAMPED, _MOST_DAMPED = 0.02, 0.1, 1e-3, 100.0
 #: Beginning along which it is led once, and the blocks there [s].
 _BEGINNING, _BLOCK = 24.0, 6.0
 #: The first fit: length of its window [s], width of the Gaussian that takes the ring out [periods], steps of the slow
-#: fit, and starts from which the whole is fitted.
-_WINDOW, _SLOW, _FIRST_STEPS, _STARTS = 12.0, 0.6, 6, 8
-#: Breakaway over that of the slow fit, length of the spectra [samples], and steps by which starts are compared.
-_BREAKAWAYS, _SEGMENT, _FEW_STEPS = (0.65, 0.85, 1.0, 1.25), 256, 2
+#: fit, steps by which starts are compared, and length of the spectra [samples].
+_WINDOW, _SLOW, _FIRST_STEPS, _FEW_STEPS, _SEGMENT = 12.0, 0.6, 6, 2, 256
 _POSITIVE = [GAIN, K_OIL, F_C, K_BRK, C_C]
 
 
 @contracted
-def _rates(y: State, spin: float, now: Parameters, m: RigNumbers) -> State:
-    """Return dy/dt of y = (p, v, omega, i, I) under the speed `spin` [rad/s] that the command asks for."""
-    p, v, omega, i, integral = y
-    friction = stribeck_friction(v, now[F_C], now[K_BRK], now[C_C], now[F_V], m.v_th, False)
-    friction = friction * select(v < 0.0, 1.0 - now[SIDE], 1.0 + now[SIDE])
-    past = m.A_A * v + laminar_leakage(p, now[G])
+def _of_way(v: float, now: Parameters) -> float:
+    return select(v < 0.0, 1.0 - now[SIDE], 1.0 + now[SIDE])  # type: ignore[no-any-return]
+
+
+@contracted
+def _steady(v: float, now: Parameters, m: RigNumbers) -> tuple[float, float, float]:
+    """Return the friction of steady sliding [N], its level [N], and the speed at which the contact slips [m/s]."""
+    speed = max(abs(v), m.v_th)
+    level = stribeck_level(speed, now[F_C], now[K_BRK], now[C_C]) * _of_way(v, now)
+    return level * min(max(v / m.v_th, -1.0), 1.0), level, speed
+
+
+@contracted
+def _held_by(friction: float, before: float, v: float, h: float, now: Parameters, m: RigNumbers) -> tuple[float, float]:
+    """Return the friction F [N] after h seconds in which that of steady sliding went from `before` to that at v.
+
+    give dF/dt = v - speed F/level: LuGre's law without its damping, which dies out as the contact slides. With a = h
+    speed/(give level), F = (F_0 + (a/2) (before + (1 + a) steady)) / (1 + a + a^2/2), times (give level)^2 above and
+    below; and `steady`, that at v.
+    """
+    steady, level, speed = _steady(v, now, m)
+    w, g = h * speed, now[GIVE] * level
+    part = 0.5 * w
+    return (friction * g * g + part * (before * g + steady * (g + w))) / (g * g + w * (g + part)), steady
+
+
+@contracted
+def _rates(y: State, friction: float, spin: float, now: Parameters, m: RigNumbers) -> State:
+    """Return dy/dt of y = (p, v, omega, i, I, x) under the speed `spin` [rad/s] that the command asks for."""
+    p, v, omega, i, integral, x = y
+    past, viscous = m.A_A * v + laminar_leakage(p, now[G]), now[F_V] * v * _of_way(v, now)
     error = spin - omega
     voltage = controller_voltage(error, integral, m.k_p, m.K_i, m.V_max)
     return (
         2.0 * pressure_rate(pump_flow(omega, p, m.q_b, 0.0) - past, m.V, now[K_OIL]),
-        piston_acceleration(0.5 * p, -0.5 * p, friction, 0.0, 0.0, m.A_A, m.A_A, m.M_eq),
+        piston_acceleration(0.5 * p, -0.5 * p, friction + viscous, now[SPRING] * x, 0.0, m.A_A, m.A_A, m.M_eq),
         shaft_acceleration(i, omega, pump_torque(p, m.q_b), m.C_m, m.B_M, m.J_M),
         winding_current_rate(voltage, i, omega, m.R_c, m.L_c, m.C_e, m.i_max),
         error,
+        v - x * (1.0 / _CENTRING),
     )
 
 
 @contracted
 def _moved(y: State, h: float, k: State) -> State:
-    return y[0] + h * k[0], y[1] + h * k[1], y[2] + h * k[2], y[3] + h * k[3], y[4] + h * k[4]
+    return (
+        y[0] + h * k[0],
+        y[1] + h * k[1],
+        y[2] + h * k[2],
+        y[3] + h * k[3],
+        y[4] + h * k[4],
+        y[5] + h * k[5],
+    )
 
 
 @kernel
@@ -117,10 +157,11 @@ def simulate_response(
     """Write p_A - p_B [Pa] of all lanes at each sample into `out` (n, lanes), by RK4, `every` steps a sample.
 
     `command` (n + 1,) [V]: at the sample before, then at each, with ramps between; `theta` (p, lanes), a row a
-    parameter; `states` (6, lanes): p, v, omega, i, I and the reading at the sample before, on return at the last.
+    parameter; `states` (8, lanes): p, v, omega, i, I, x, friction and reading at the sample before, on return at the
+    last.
     """
-    y = (load(states, 0), load(states, 1), load(states, 2), load(states, 3), load(states, 4))
-    read = load(states, 5)
+    y = (load(states, 0), load(states, 1), load(states, 2), load(states, 3), load(states, 4), load(states, 5))
+    friction, read = load(states, 6), load(states, 7)
     now = (
         load(theta, 0),
         load(theta, 1),
@@ -133,8 +174,11 @@ def simulate_response(
         load(theta, 8),
         load(theta, 9),
         load(theta, 10),
+        load(theta, 11),
+        load(theta, 12),
     )
     h = 1.0 / (rate * every)
+    before = _steady(y[1], now, m)[0]
     for sample in range(command.size - 1):
         rise = command[sample + 1] - command[sample]
         ahead = now[GAIN] * now[LEAD] * (rise * rate) + now[BIAS]
@@ -142,12 +186,16 @@ def simulate_response(
             w_0 = now[GAIN] * (command[sample] + rise * (step / every)) + ahead
             w_1 = now[GAIN] * (command[sample] + rise * ((step + 0.5) / every)) + ahead
             w_2 = now[GAIN] * (command[sample] + rise * ((step + 1.0) / every)) + ahead
-            k_1 = _rates(y, w_0, now, m)
-            k_2 = _rates(_moved(y, 0.5 * h, k_1), w_1, now, m)
-            k_3 = _rates(_moved(y, 0.5 * h, k_2), w_1, now, m)
-            k_4 = _rates(_moved(y, h, k_3), w_2, now, m)
+            k_1 = _rates(y, friction, w_0, now, m)
+            y_1 = _moved(y, 0.5 * h, k_1)
+            k_2 = _rates(y_1, _held_by(friction, before, y_1[1], 0.5 * h, now, m)[0], w_1, now, m)
+            y_2 = _moved(y, 0.5 * h, k_2)
+            k_3 = _rates(y_2, _held_by(friction, before, y_2[1], 0.5 * h, now, m)[0], w_1, now, m)
+            y_3 = _moved(y, h, k_3)
+            k_4 = _rates(y_3, _held_by(friction, before, y_3[1], h, now, m)[0], w_2, now, m)
             total = _moved(_moved(_moved(k_1, 2.0, k_2), 2.0, k_3), 1.0, k_4)
             y = _moved(y, h / 6.0, total)
+            friction, before = _held_by(friction, before, y[1], h, now, m)
             read = read + (y[0] - read) * (h / (h + now[LAG]))
         store(out, sample, read)
     store(states, 0, y[0])
@@ -155,7 +203,16 @@ def simulate_response(
     store(states, 2, y[2])
     store(states, 3, y[3])
     store(states, 4, y[4])
-    store(states, 5, read)
+    store(states, 5, y[5])
+    store(states, 6, friction)
+    store(states, 7, read)
+
+
+class Normal(NamedTuple):
+    """Normal belief on the parameters: mean (p,) and precision (p, p) in units."""
+
+    mean: Array
+    precision: Array
 
 
 class Beliefs(NamedTuple):
@@ -170,8 +227,13 @@ class Beliefs(NamedTuple):
         """Steps of the parameters for a difference, in which all matrices are."""
         return np.asarray(_NUDGE * np.minimum(self.width, self.wander))
 
+    @property
+    def normal(self) -> Normal:
+        """What is believed of a machine at first."""
+        return Normal(self.centre, np.diag((self.unit / self.width) ** 2))
 
-def beliefs_of(rig: Rig) -> Beliefs:
+
+def beliefs_of(rig: Rig, law: str = STRIBECK) -> Beliefs:
     """Return the beliefs on machines of a rig at its charge pressure: zeros of the transducers change nothing."""
     friction, gain = rig.friction, rig.motor.omega_per_volt
     of_difference = friction.coulomb_pressure == "difference"
@@ -179,12 +241,19 @@ def beliefs_of(rig: Rig) -> Beliefs:
     own = {"gain": gain, "bias": gain, "K": rig.fluid.K_oil, "F_C": coulomb}
     own |= {name: getattr(friction, name) for name in ("F_v", "K_brk", "C_c")}
     scale = np.array([own.get(name, 1.0) for name in PARAMETERS])
-    mean, wander = priors("response"), priors("response_wander")
+    mean, wander = dict(priors("response")), dict(priors("response_wander"))
+    mean["give"], wander["give"] = (priors(law)[name] for name in ("give", "give_wander"))
     return Beliefs(
         scale * [mean[name].value for name in PARAMETERS],
         scale * [mean[name].width for name in PARAMETERS],
         scale * [wander[name].width for name in PARAMETERS],
     )
+
+
+def _tried(table: str, name: str, count: int) -> Array:
+    """Return values (count,) of a parameter at which a fit is begun: `width` times either way about `value`."""
+    known = priors(table)[name]
+    return np.asarray(known.value * np.geomspace(1.0 / known.width, known.width, count))
 
 
 class Machine(NamedTuple):
@@ -193,22 +262,29 @@ class Machine(NamedTuple):
     numbers: RigNumbers
     rate: float
     every: int
+    law: str
 
     @staticmethod
-    def of(rig: Rig, rate: float) -> Machine:
+    def of(rig: Rig, rate: float, law: str = STRIBECK) -> Machine:
         """Return that of a rig's kind."""
         numbers = rig_numbers(rig)
         area = 0.5 * (numbers.A_A + numbers.A_B)
-        return Machine(numbers._replace(A_A=area, A_B=area), rate, math.ceil(1.0 / rate / _STEP))
+        creep = _NO_CREEP if law == BRISTLES else numbers.v_th
+        return Machine(numbers._replace(A_A=area, A_B=area, v_th=creep), rate, math.ceil(1.0 / rate / _STEP), law)
 
     def run(self, command: Array, paths: Array, states: Array) -> tuple[Array, Array]:
-        """Return p_A - p_B (n, m) [Pa] of up to 16 sets (m, p) from their states (6, m), and the states at the end."""
+        """Return p_A - p_B (n, m) [Pa] of up to 16 sets (m, p) from their states (8, m), and the states at the end."""
         lanes = np.minimum(np.arange(SINGLE_WIDTH), len(paths) - 1)
-        theta = np.ascontiguousarray(paths[lanes, :_SIMULATED].T, dtype=np.float32)
+        theta = np.ascontiguousarray(paths[lanes, : LAG + 1].T, dtype=np.float32)
         ends = np.ascontiguousarray(states[:, lanes], dtype=np.float32)
         out = np.empty((command.size - 1, SINGLE_WIDTH), dtype=np.float32)
         simulate_response(command, self.rate, self.every, theta, ends, self.numbers, out)
         return out[:, : len(paths)].astype(np.float64), ends[:, : len(paths)].astype(np.float64)
+
+    def from_mid_stroke(self, speed: Array) -> float:
+        """Return where the piston begins [m] from the middle of its stroke under the motor's speed (n,) [rad/s]."""
+        course = np.cumsum(speed) * self.numbers.q_b / (2.0 * math.pi * self.rate * self.numbers.A_A)
+        return float(-0.5 * (course.max() + course.min()))
 
     def period(self, stiffness: float) -> float:
         """Return the ring's period [samples] at a stiffness of the oil [Pa]."""
@@ -220,11 +296,10 @@ class Machine(NamedTuple):
 
         They are the rig's where no frequency that the recording holds is believed of the machine.
         """
-        window = np.hanning(_SEGMENT)
 
         def power(values: Array) -> Array:
             parts = np.lib.stride_tricks.sliding_window_view(values, _SEGMENT)[:: _SEGMENT // 2]
-            return np.asarray(np.square(np.abs(np.fft.rfft(parts * window, 4 * _SEGMENT))).mean(axis=0))
+            return np.asarray(np.square(np.abs(np.fft.rfft(parts * np.hanning(_SEGMENT), 4 * _SEGMENT))).mean(axis=0))
 
         share = beliefs.width[K_OIL] / beliefs.centre[K_OIL]
         middle = 4 * _SEGMENT / self.period(beliefs.centre[K_OIL])
@@ -235,13 +310,6 @@ class Machine(NamedTuple):
         peaks = np.flatnonzero((beyond[1:-1] >= beyond[2:]) & (beyond[1:-1] >= beyond[:-2]))
         chosen = np.resize(peaks[np.argsort(-beyond[1:-1][peaks])], 2)
         return np.asarray(beliefs.centre[K_OIL] * (k[chosen] / middle) ** 2)
-
-
-class Normal(NamedTuple):
-    """Normal belief on the parameters: mean (p,) and precision (p, p) in units."""
-
-    mean: Array
-    precision: Array
 
 
 class Look(NamedTuple):
@@ -262,7 +330,7 @@ class Look(NamedTuple):
 class Stretch:
     """Samples that one set of parameters holds for.
 
-    `command` (n + 1,) [V] with that of the sample before; `dp` (n,) [Pa]; `states` (6, 12): of path and perturbed paths
+    `command` (n + 1,) [V] with that of the sample before; `dp` (n,) [Pa]; `states` (8, 12): of path and perturbed paths
     before; `unit` (p,); `apart` (n, m): orthonormal rows that are taken out, the mains' lines; `known` (n,): whether a
     sample is. With `smooth` [samples] > 0 only what a Gaussian of that width leaves is fitted.
     """
@@ -297,7 +365,12 @@ class Stretch:
         own = [0, *range(_SIMULATED + 1, len(sets))]
         left = self.dp[:, None] - sets[own, SCALE] * shown[:, own] - sets[own, OFFSET]
         slopes = theta[SCALE] * (shown[:, 1 : _SIMULATED + 1] - shown[:, :1])
-        rest = np.column_stack([self.unit[SCALE] * shown[:, 0], np.full(len(shown), self.unit[OFFSET])])
+        earlier = theta[SCALE] * _rate_of_change(shown[:, 0]) * self.machine.rate
+        kept = math.exp(-1.0 / (self.machine.rate * max(theta[LAG], _STIFF)))
+        rest = np.column_stack(
+            [earlier, lfilter([kept - 1.0], [1.0, -kept], earlier), shown[:, 0], np.ones(len(shown))]
+        )
+        rest *= self.unit[_SIMULATED:]
         rows = self.seen(np.concatenate([left, slopes, rest], axis=1))
         count = len(own)
         return Look(theta, rows[:, 0], rows[:, count:], ends[:, : _SIMULATED + 1]), rows[:, 1:count]
@@ -340,44 +413,61 @@ class Stretch:
         return look
 
 
+def _rate_of_change(values: Array) -> Array:
+    """Return the change a sample of values (n,), to fourth order: that of a ring is one of its fastest."""
+    slope = np.asarray(np.gradient(values))
+    slope[1:-1] -= np.diff(slope, 2) / 6.0
+    return slope
+
+
 def held(theta: Array, paths: Array) -> Array:
     """Return sets (m, p) whose positive parameters are between half and twice those of `theta` (p,)."""
     paths[:, _POSITIVE] = np.clip(paths[:, _POSITIVE], 0.5 * theta[_POSITIVE], 2.0 * theta[_POSITIVE])
     paths[:, LAG] = np.maximum(paths[:, LAG], 0.0)
+    paths[:, GIVE] = np.maximum(paths[:, GIVE], _STIFF)
     return np.asarray(paths)
 
 
-def first_fit(stretch: Stretch, beliefs: Beliefs, total: Array) -> tuple[Array, float]:
-    """Return parameters (p,) that hold over a stretch, and the variance that they leave [Pa^2].
+def first_fit(stretch: Stretch, beliefs: Beliefs, total: Array, noise: float) -> Look:
+    """Return the likeliest parameters that hold over a stretch, beside a noise's variance [Pa^2].
 
     The ringing makes many local minima. So the slow part of the pressure is fitted first, from the best of several
-    gains; then the whole, from stiffnesses by which it rings where the spectra say and from several breakaway forces,
-    and judged beside the noise of the sum p_A + p_B, `total` (n,), in which nothing rings.
+    gains; then the whole, from stiffnesses by which it rings where the spectra of p_A - p_B and of the sum p_A + p_B,
+    `total` (n,), in which nothing rings, say, and from several breakaway forces.
     """
-    belief = Normal(beliefs.centre, np.diag((beliefs.unit / beliefs.width) ** 2))
 
-    def tried(of: Stretch, theta: Array, changes: dict[int, Array]) -> Array:
+    def ranked(of: Stretch, theta: Array, groups: int, changes: dict[int, Array]) -> Array:
+        """Return the groups that 16 sets with `changes` make, the best of each first: (16/groups, groups, p)."""
         sets = np.tile(theta, (SINGLE_WIDTH, 1))
         for parameter, values in changes.items():
             sets[:, parameter] = values
-        squares = np.square(of.residuals(sets)).sum(axis=0)
-        return np.asarray(sets[np.argsort(np.nan_to_num(squares, nan=np.inf))])
+        squares = np.nan_to_num(np.square(of.residuals(sets)).sum(axis=0), nan=np.inf).reshape(groups, -1)
+        return sets.reshape(groups, -1, _SIZE)[range(groups), squares.argsort(axis=1).T]
 
     slow = replace(stretch, smooth=_SLOW * stretch.machine.period(beliefs.centre[K_OIL]))
-    spread = np.exp(np.linspace(-2.0, 2.0, SINGLE_WIDTH) * beliefs.width[GAIN] / beliefs.centre[GAIN])
-    gains = tried(slow, beliefs.centre, {GAIN: beliefs.centre[GAIN] * spread})
-    theta = slow.descend(gains[0], belief, _FIRST_STEPS).theta
-    stiffnesses = np.append(stretch.machine.ringing(stretch.dp, total, beliefs), [theta[K_OIL], beliefs.centre[K_OIL]])
-    grid = {K_OIL: np.repeat(stiffnesses, 4), K_BRK: np.tile(theta[K_BRK] * np.array(_BREAKAWAYS), 4)}
-    noise = max(float(np.var(np.diff(total, 3))) / 20.0, 1.0)
+    gains = beliefs.centre[GAIN] * _tried("response_start", "gain", 8)
+    springs = beliefs.centre[SPRING] + beliefs.width[SPRING] * np.array([0.0, 1.0])
+    first = ranked(slow, beliefs.centre, 1, {GAIN: np.tile(gains, 2), SPRING: np.repeat(springs, 8)})
+    theta = slow.descend(first[0, 0], beliefs.normal, _FIRST_STEPS).theta
+    ringing = stretch.machine.ringing(stretch.dp, total, beliefs)
+    stiffnesses = np.append(ringing, beliefs.centre[K_OIL] * _tried("response_start", "K", 2))
+    breakaways = theta[K_BRK] * _tried("response_start", "K_brk", 4)
+    starts = ranked(stretch, theta, 4, {K_OIL: np.repeat(stiffnesses, 4), K_BRK: np.tile(breakaways, 4)})
+    look = fitted(stretch, list(starts[0]), beliefs, noise, 2)
+    if not _explained(look.cost(noise, beliefs.normal, beliefs.unit), stretch.known):
+        look = fitted(stretch, [look.theta, *starts[1]], beliefs, noise, 2)
+    return look
 
-    def fitted(starts: Sequence[Array], steps: int) -> list[Look]:
-        looks = [stretch.descend(start, belief, steps, noise) for start in starts]
-        return sorted(looks, key=lambda look: float(np.nan_to_num(look.cost(noise, belief, beliefs.unit), nan=np.inf)))
 
-    near = fitted(list(tried(stretch, theta, grid)[:_STARTS]), _FEW_STEPS)
-    best = fitted([look.theta for look in near[:2]], _STEPS)[0]
-    return best.theta, stretch.spread(best.left)
+def fitted(stretch: Stretch, starts: Sequence[Array], beliefs: Beliefs, noise: float, kept: int) -> Look:
+    """Return the likeliest look that steps from several starts lead to, few from all and more from the best `kept`."""
+    best: list[Look] = []
+    for steps, number in ((_FEW_STEPS, kept), (_STEPS, 1)):
+        looks = [stretch.descend(start, beliefs.normal, steps, noise) for start in starts]
+        costs = np.nan_to_num([look.cost(noise, beliefs.normal, beliefs.unit) for look in looks], nan=np.inf)
+        best = [looks[place] for place in np.argsort(costs)[:number]]
+        starts = [look.theta for look in best]
+    return best[0]
 
 
 class LinearBlock(NamedTuple):
@@ -411,11 +501,17 @@ def linear(look: Look, known: Array, second: int) -> LinearBlock:
     )
 
 
+def _explained(cost: float, known: Array) -> bool:
+    """Whether a chi square is not far above the number of samples."""
+    samples = float(np.count_nonzero(known))
+    return cost <= samples + _UNEXPLAINED * math.sqrt(2.0 * samples)
+
+
 class Follower:
     """Leads the response along a machine, block by block: an iterated Kalman filter of its parameters.
 
     `machine`, `beliefs`; `sense`: sign of p_A - p_B that goes with the command; then what changes from block to block:
-    parameters `theta` (p,) and their `covariance` (p, p) in units, `variance` of the noise [Pa^2], `states` (6, 12) and
+    parameters `theta` (p,) and their `covariance` (p, p) in units, `variance` of the noise [Pa^2], `states` (8, 12) and
     `last`, the command at the last sample [V]; `excess` of the last block's chi square, in deviations.
     """
 
@@ -423,18 +519,28 @@ class Follower:
         self.machine, self.beliefs, self.sense = machine, beliefs, sense
         self.theta, self.variance, self.last = beliefs.centre, math.nan, math.nan
         self.covariance = np.diag((beliefs.width / beliefs.unit) ** 2)
-        self.states, self.excess = np.zeros((6, _SIMULATED + 1)), 0.0
+        self.states, self.excess = np.zeros((8, _SIMULATED + 1)), 0.0
 
     @staticmethod
     def begun(recording: Recording, rig: Rig) -> Follower:
         """Return it fitted to the first seconds of a recording, about to take these."""
         u, dp = recording["u"], recording["p_A"] - recording["p_B"]
         sense = float(np.sign(np.mean(u * (dp - dp.mean())))) or 1.0
-        beliefs = beliefs_of(rig)
-        follower = Follower(Machine.of(rig, recording.rate), beliefs, sense)
-        total = (recording["p_A"] + recording["p_B"])[: math.ceil(_WINDOW * recording.rate)]
-        window = follower.stretch(recording.samples(slice(0, math.ceil(_WINDOW * recording.rate))))
-        follower.theta, follower.variance = first_fit(window, beliefs, total)
+        beginning = recording.samples(slice(0, math.ceil(_WINDOW * recording.rate)))
+        total = beginning["p_A"] + beginning["p_B"]
+        noise = max(float(np.var(np.diff(total, 3))) / 20.0, 1.0)
+        follower = Follower(Machine.of(rig, recording.rate), beliefs_of(rig), sense)
+        window = follower.stretch(beginning)
+        look = first_fit(window, follower.beliefs, total, noise)
+        cost = look.cost(noise, follower.beliefs.normal, follower.beliefs.unit)
+        if not _explained(cost, window.known):
+            other = Follower(Machine.of(rig, recording.rate, BRISTLES), beliefs_of(rig, BRISTLES), sense)
+            starts = np.array([look.theta, other.beliefs.centre])
+            starts[:, GIVE] = other.beliefs.centre[GIVE]
+            giving = fitted(other.stretch(beginning), list(starts), other.beliefs, noise, 1)
+            if giving.cost(noise, other.beliefs.normal, other.beliefs.unit) < cost:
+                follower, look = other, giving
+        follower.theta, follower.variance = look.theta, window.spread(look.left)
         covariance, states = follower.covariance, follower.states
         length = round(_BLOCK * recording.rate)
         taken = min(round(_BEGINNING * recording.rate), len(recording) - length + 1)
@@ -453,13 +559,16 @@ class Follower:
     def stretch(self, block: Recording) -> Stretch:
         """Return the samples of a block after the last one."""
         u, n = block["u"], len(block)
-        before = u[0] if math.isnan(self.last) else self.last
         known = np.ones(n) if block.bridged is None else (~block.bridged).astype(float)
+        if math.isnan(self.last):
+            self.last, self.states = float(u[0]), self.states.copy()
+            self.states[_POSITION] = self.machine.from_mid_stroke(u * self.theta[GAIN])
+            known[: round(_SETTLING * block.rate)] = 0.0
         lines = mains_lines(block["p_A"] + block["p_B"], block.rate)
         waves = np.exp(2j * np.pi / block.rate * np.arange(n)[:, None] * lines)
         apart = np.linalg.qr(np.column_stack([waves.real, waves.imag]) * known[:, None])[0]
         dp = self.sense * (block["p_A"] - block["p_B"])
-        return Stretch(self.machine, np.append(before, u), dp, self.states, self.beliefs.unit, apart, known)
+        return Stretch(self.machine, np.append(self.last, u), dp, self.states, self.beliefs.unit, apart, known)
 
     def _belief(self, seconds: float, jumped: int | None = None) -> Normal:
         """Return what is believed of a block so long beforehand; a parameter that `jumped` as widely as at first."""
@@ -476,9 +585,11 @@ class Follower:
         """
         unit, belief = self.beliefs.unit, self._belief(seconds)
         led = [(stretch.descend(self.theta, belief, _STEPS, self.variance), belief)]
-        samples = float(np.count_nonzero(stretch.known))
-        if led[0][0].cost(self.variance, belief, unit) > samples + _UNEXPLAINED * math.sqrt(2.0 * samples):
-            for parameter, values in ((G, _CONDUCTANCES), (K_OIL, self.theta[K_OIL] * _STIFFNESSES)):
+        if not _explained(led[0][0].cost(self.variance, belief, unit), stretch.known):
+            for parameter, values in (
+                (G, _tried("response_jump", "G", SINGLE_WIDTH)),
+                (K_OIL, self.theta[K_OIL] * _tried("response_jump", "K", SINGLE_WIDTH)),
+            ):
                 sets, belief = np.tile(self.theta, (SINGLE_WIDTH, 1)), self._belief(seconds, parameter)
                 sets[:, parameter] = values
                 squares = np.nan_to_num(np.square(stretch.residuals(sets)).sum(axis=0), nan=np.inf)
