@@ -22,7 +22,7 @@ from sealscope.campaigns.plans.reader import load_plan
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.simulation.simulate import simulate_with_truth
 
-PLANS = ("bench-detectors", "bench-strangers-development", "bench-closed-loop-development", "bench-load-development")
+PLANS = ("bench-detectors", "bench-unmodelled-development", "bench-closed-loop-development", "bench-load-development")
 
 
 @dataclass

@@ -39,7 +39,7 @@ from numba.core.registry import CPUDispatcher
 from numba.core.untyped_passes import RewriteSemanticConstants
 from numba.extending import intrinsic
 
-config._config_fname = ""  # numba's settings in the working folder may be a stranger's, and name a library to load
+config._config_fname = ""  # numba's settings in the working folder may be hostile, and name a library to load
 config.reload_config()
 _F = TypeVar("_F", bound=Callable[..., Any])
 _COMPILED_ROOMS = ("compiled.py", "physics", "signals", "control", "simulation", "diagnosis")

@@ -142,7 +142,7 @@ def test_an_installed_controller_is_run(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", PROFILES)
-def test_each_family_is_either_for_development_or_held_back(name):
+def test_each_family_is_either_for_development_or_held_out(name):
     plans = [load_plan(each) for each in plan_names() if each.startswith(f"bench-{name}")]
     assert {plan.name for plan in plans if plan.part != "development"} == {f"bench-{name}"}
     families = [family for plan in plans for family in plan.factors["family"]]

@@ -67,9 +67,9 @@ def test_only_leaks_that_the_bound_allows_count_against_it():
 
 
 def test_the_table_says_which_half_it_is():
-    tables = {table.name: table for table in tables_of(judge(ROWS, [NAME]), part="held back")}
+    tables = {table.name: table for table in tables_of(judge(ROWS, [NAME]), part="held out")}
     families = tables["families"]
-    assert {line[0] for line in families.rows} == {"held back"}
+    assert {line[0] for line in families.rows} == {"held out"}
     assert {line[1] for line in families.rows} == {ALL, "hoses", "mass"}
     assert all(len(line) == len(families.columns) for line in families.rows)
     assert "bound allows 90% detection: count" in families.columns
@@ -90,7 +90,7 @@ def test_rows_survive_being_stored():
 
 
 def test_a_mixture_is_half_of_each_law():
-    plan = load_plan("bench-strangers")
+    plan = load_plan("bench-unmodelled")
     case = next(case for case in cases_of(plan) if case.law == "mixture")
     leaks = leak_of(plan, case)
     assert [leak.law for leak in leaks] == ["laminar", "orifice"]
@@ -114,7 +114,7 @@ def test_a_factor_of_families_needs_a_profile_with_them(tmp_path, text):
         load_plan(path)
     path.write_text(
         text.replace("[factors]", '[factors]\nfamily = ["pipes"]').replace(
-            "seed = 3", 'seed = 3\nprofile = "strangers"'
+            "seed = 3", 'seed = 3\nprofile = "unmodelled"'
         ),
         encoding="utf-8",
     )

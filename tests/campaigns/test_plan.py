@@ -30,9 +30,9 @@ DRAWN = {
     "bench-quick": "5e2c6ad77f0da6f0",
     "bench-single-rod": "7ed0e63b533648d9",
     "bench-single-rod-development": "fad6b4d692c86f36",
-    "bench-strangers": "f4613fe47fdbe6c2",
-    "bench-strangers-development": "778e5fc7b49f54f0",
     "bench-thesis": "e034193cb0b6574f",
+    "bench-unmodelled": "f4613fe47fdbe6c2",
+    "bench-unmodelled-development": "778e5fc7b49f54f0",
     "bench-valve": "c2065dbf8536fac1",
     "bench-volume": "afca12e9d27e4824",
     "duty-pump": "b9abb89ca1d56dd8",
@@ -55,7 +55,7 @@ def test_a_plan_is_read_with_its_units(tiny):
 
 def test_a_bound_is_asked_for_all_sizes_of_leaks_or_for_those_of_a_group():
     assert load_plan("bench-load").bounded == {0.0042}
-    assert load_plan("bench-strangers").bounded == {0.0005, 0.0042, 0.1, 0.5}
+    assert load_plan("bench-unmodelled").bounded == {0.0005, 0.0042, 0.1, 0.5}
     assert not load_plan("bench-volume").bounded
 
 

@@ -258,7 +258,7 @@ def test_a_profile_with_a_slip_is_refused_in_one_line_with_its_place(tmp_path, o
 
 def test_an_unknown_or_unreadable_profile_is_refused(tmp_path):
     with pytest.raises(
-        InputError, match=r"'banch' is no packaged profile \(bench, closed-loop, load, single-rod, strangers, valve\)"
+        InputError, match=r"'banch' is no packaged profile \(bench, closed-loop, load, single-rod, unmodelled, valve\)"
     ):
         load_profile("banch")
     with pytest.raises(InputError, match="profile must be readable, got: No such file"):

@@ -42,7 +42,7 @@ def run(
     `jobs`: processes of this machine, one a core by default and two a core at most, 1 for this process alone;
     `cluster`: address of a Dask scheduler instead; `retry`: carry failed cases out again; `batch`: simulate cases side
     by side (`batches`) with `jobs` threads; `trust`: whether controllers that the plan leads to (`FILE.py:NAME`) are
-    run, which may be a stranger's. The rows are the same whoever makes them and in whatever order, those of batches in
+    run, which may be hostile. The rows are the same whoever makes them and in whatever order, those of batches in
     any batch; kinds of records take turns (`interleaved`). Raises InputError where a controller is not trusted, the
     folder holds another campaign, another run is at work in it, or a batch cannot do what the plan asks for.
     """

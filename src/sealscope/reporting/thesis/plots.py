@@ -51,7 +51,7 @@ def draw(figure: Figure) -> tuple[bytes, bytes]:
     import matplotlib
 
     with matplotlib.rc_context():
-        matplotlib.rcdefaults()  # not the settings in the working folder, which may be a stranger's and run TeX
+        matplotlib.rcdefaults()  # not the settings in the working folder, which may be hostile and run TeX
         matplotlib.rcParams.update({**SETTINGS, "svg.hashsalt": figure.id})
         canvas = _canvas(figure)
         long = [line for ax in canvas.axes for line in ax.lines if np.size(line.get_xdata()) > _LONG]
