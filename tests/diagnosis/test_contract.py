@@ -76,7 +76,7 @@ HOPELESS: dict[str, tuple[Change, str]] = {
 }
 
 
-#: A balance of volumes leaves the samples at a rail out, and needs no heed of pressures that rest.
+#: A balance of volumes leaves the samples at a rail out, and needs no heed of constant pressures.
 BY_PRESSURES = ("10 s at the rail", "10 s at zero", "a straight line")
 
 #: The detector of the documentation's example, which keeps the contract as well.

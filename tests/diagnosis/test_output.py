@@ -161,7 +161,7 @@ def test_any_recording_gets_a_verdict(data: st.DataObject) -> None:
 
     def channel(n: int) -> np.ndarray:
         kind = data.draw(
-            st.sampled_from(["noise", "sine", "constant", "integers", "holes", "half rest", "huge", "none"])
+            st.sampled_from(["noise", "sine", "constant", "integers", "holes", "half still", "huge", "none"])
         )
         noise = random.standard_normal(n)
         k = np.arange(n)
@@ -171,7 +171,7 @@ def test_any_recording_gets_a_verdict(data: st.DataObject) -> None:
             "constant": np.full(n, 5.0),
             "integers": np.rint(2 * noise),
             "holes": np.where(random.random(n) < 0.01, np.nan, noise),
-            "half rest": np.where(k < n // 2, 0.0, noise),
+            "half still": np.where(k < n // 2, 0.0, noise),
             "huge": noise * 1e160,
             "none": np.full(n, np.nan),
         }[kind]

@@ -121,7 +121,7 @@ def test_an_open_loop_delivers_nothing_of_what_leaks() -> None:
 def test_a_closed_loop_delivers_what_leaks(
     rig: str, command: str, load: str, leak: str, channels: tuple[str, ...]
 ) -> None:
-    """Under a load over cycles; unloaded, where the valves of a single rod settle anew at each rest, while it is held.
+    """Under a load over cycles; unloaded, where the valves of a single rod settle anew at each stop, while it is held.
 
     From the command the drive's own law tells the speed.
     """

@@ -231,7 +231,7 @@ def flooded(tmp_path: Path, count: int, largest: int) -> None:
     assert len(passed_over) < 20
     before, after = wire.memory
     print(f"{count} messages: {(after - before) / 1e6:.1f} MB more after four fifths of them")
-    assert after - before < 20_000_000 or count < 10_000  # a brief run does not come to rest
+    assert after - before < 20_000_000 or count < 10_000  # a brief run does not stop
     ours, theirs = rows_of(service.settings.database), rows_of(str(plain / "monitor.db"))
     for table, rows in theirs.items():
         assert [row for row in ours[table] if "press 3" not in row] == rows, table

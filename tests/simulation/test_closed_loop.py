@@ -11,9 +11,9 @@ import pytest
 from sealscope.control import Measured, PositionPI
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.parameters import load_rig
-from sealscope.physics.rest import initial_state
 from sealscope.physics.rig import rig_numbers
 from sealscope.physics.solvers.advance import EXPLICIT, advance
+from sealscope.physics.standstill import initial_state
 from sealscope.simulation.batch.batch import simulate_batch
 from sealscope.simulation.closed_loop import outputs_per_sample
 from sealscope.simulation.courses import parse_force, parse_position
@@ -133,7 +133,7 @@ def test_a_closed_loop_is_the_same_again_whatever_the_steps():
 
 
 def test_a_load_moves_the_piston_by_the_give_of_oil_and_drive(check_rig):
-    """Linear at rest: dx = (D dtheta - V dp/(2 K))/A with dp = F/A and K_i dtheta = -R D dp/C_m."""
+    """Linear at standstill: dx = (D dtheta - V dp/(2 K))/A with dp = F/A and K_i dtheta = -R D dp/C_m."""
     values = {"F_pr": 0.0, "F_cfr": 0.0, "F_v": 4000.0, "p_charge": "3 MPa", "K_i": 10.0, "K_brk": 1.0}
     rig = check_rig(**values)
     experiment = Experiment.of(rig=rig, command="0 sin(t)", load="ramp 1 kN from 0.5 s to 0.6 s", duration=3.0)

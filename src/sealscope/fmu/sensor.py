@@ -33,7 +33,7 @@ from sealscope.diagnosis.inference.blocks import Columns
 from sealscope.diagnosis.inference.live.balance import BLOCK_SECONDS, LEARNED, TELLS, WAKES, live_equations, size_error
 from sealscope.diagnosis.inference.live.known import (
     MISFIT,
-    RESTS,
+    STANDSTILL,
     TINY,
     Known,
     add,
@@ -332,7 +332,7 @@ def _show(m: Any, known: Any, error: float, rows: float, size: float, adds: bool
     """Put what the block `known.own` shows among the last ones."""
     scalars, moved = m.scalars, motion(known.own[-1, -1], rows, known.numbers)
     precision, lead, shift, leaning = says(known, rows, adds)
-    if not precision > (TELLS * scalars[_PRECISION] if moved < RESTS else 0.0):
+    if not precision > (TELLS * scalars[_PRECISION] if moved < STANDSTILL else 0.0):
         return
     total, last, k = lead / precision, m.last, int(scalars[_BLOCKS]) % WINDOW
     g = total - shift / precision
@@ -371,8 +371,8 @@ def _take(m: Any, known: Any, error: float, b: int, rows: float, size: float) ->
     scalars = m.scalars
     if scalars[_PRECISION] > 0.0:
         moved = motion(m.gram[b, _LEFT, _LEFT], rows, known.numbers)
-        scalars[_WOKEN] = scalars[_WOKEN] + 1.0 if moved > 1.0 / RESTS else 0.0
-        if scalars[_WOKEN] >= WAKES:  # all before were of a machine at rest: nothing is compared with them
+        scalars[_WOKEN] = scalars[_WOKEN] + 1.0 if moved > 1.0 / STANDSTILL else 0.0
+        if scalars[_WOKEN] >= WAKES:  # all before were of a machine at standstill: nothing is compared with them
             for i in range(len(known.own)):
                 for j in range(len(known.own)):
                     known.sums[i, j] = 0.0

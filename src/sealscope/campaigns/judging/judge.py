@@ -341,15 +341,15 @@ class _Judging:
             for row, ev, verdict in zip(rows, stated, given, strict=True)
         ]
         bounded = sum(row.bound_lpm is not None for row in rows) if common.get("leak_lpm") else 0
-        found = [verdict == "leak" for row, verdict in zip(rows, given, strict=True) if self._allowed(row)]
+        detected = [verdict == "leak" for row, verdict in zip(rows, given, strict=True) if self._allowed(row)]
         return AlarmShares(
             detector=detector,
             alarms=self._proportion(given.count("leak"), len(rows)),
             cannot_tell=self._proportion(given.count(CANNOT_TELL), len(rows)),
             coverage=self._proportion(sum(held), len(held)),
             named=self._proportion(sum(named), len(named)) if any(stated) else None,
-            reachable=self._proportion(len(found), bounded) if bounded else None,
-            allowed=self._proportion(sum(found), len(found)) if bounded else None,
+            reachable=self._proportion(len(detected), bounded) if bounded else None,
+            allowed=self._proportion(sum(detected), len(detected)) if bounded else None,
             failed=sum(row.error is not None for row in rows),
             **common,
         )
