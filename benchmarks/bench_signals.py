@@ -1,4 +1,4 @@
-"""Time the signal room against PyWavelets, in turn and in one run, so that a busy machine burdens both alike.
+"""Time the package `signals` against PyWavelets, in turn and in one run, so that a busy machine burdens both alike.
 
     python benchmarks/bench_signals.py [--samples 180000] [--rounds 31] [--json FILE]
 

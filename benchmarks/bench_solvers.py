@@ -120,8 +120,8 @@ def theirs(program: Path, case: Case, setting: float, duration: float) -> Solve:
     def solve() -> tuple[float, Rows]:
         file = program.with_suffix(".rows")
         call = [str(program), *case.words(), str(duration), repr(setting), str(RATE), str(file)]
-        told = subprocess.run(call, check=True, capture_output=True, text=True)
-        return float(told.stdout.split()[0]), np.fromfile(file).reshape(-1, 3)
+        finished = subprocess.run(call, check=True, capture_output=True, text=True)
+        return float(finished.stdout.split()[0]), np.fromfile(file).reshape(-1, 3)
 
     return solve
 

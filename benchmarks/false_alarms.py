@@ -85,8 +85,8 @@ def judge(records: Iterator[Recording], detector: str, probability: float, onset
     """A detector's verdicts (`diagnose`: of all together) on some records, and how many alarms lie near the onset."""
     count = Count()
     for one in records:
-        seen = Examination(one, false_alarm_probability=probability)
-        found = seen.fused() if detector == "diagnose" else seen.evidence(detector)
+        examination = Examination(one, false_alarm_probability=probability)
+        found = examination.fused() if detector == "diagnose" else examination.evidence(detector)
         count.records += 1
         count.leak += found.verdict == "leak"
         count.no_leak += found.verdict == "no leak"

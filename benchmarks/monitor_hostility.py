@@ -136,7 +136,7 @@ class Monitor:
             (folder / f"files {k}").mkdir()
         (folder / "bait").mkdir()
         (folder / "monitor.toml").write_text("\n".join(lines))
-        self.broker.keep("sealscope-monitor", [f"plant/{k}" for k in range(len(names)) if k % FILES])
+        self.broker.open_session("sealscope-monitor", [f"plant/{k}" for k in range(len(names)) if k % FILES])
         self.client = Client(CallbackAPIVersion.VERSION2, "plant", protocol=MQTTProtocolVersion.MQTTv5)
         self.client.reconnect_delay_set(1, 1)
         self.client.connect("127.0.0.1", self.broker.port)
@@ -554,11 +554,11 @@ def _differing(calm: Monitor, attacked: Monitor) -> tuple[dict[str, int], dict[s
     theirs = {"blocks": calm.blocks(), **{name: calm.rows(query) for name, query in queries.items()}}
     differ: dict[str, int] = {}
     digits: dict[str, int] = {}
-    for name, sound in theirs.items():
-        lost, doubled = Counter(map(_shown, sound)), Counter(map(_shown, ours[name]))
+    for name, expected in theirs.items():
+        lost, doubled = Counter(map(_shown, expected)), Counter(map(_shown, ours[name]))
         differ[f"{name} lost"] = sum((lost - doubled).values())
         differ[f"{name} too many"] = sum((doubled - lost).values())
-        exact = Counter(map(str, sound)) - Counter(map(str, ours[name]))
+        exact = Counter(map(str, expected)) - Counter(map(str, ours[name]))
         digits[name] = exact.total() - differ[f"{name} lost"]
     return {name: len(each) for name, each in theirs.items()}, differ, digits
 

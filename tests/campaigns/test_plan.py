@@ -71,7 +71,7 @@ def test_kinds_of_records_take_turns(tiny):
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "told"),
+    ("before", "after", "message"),
     [
         ('name = "tiny"', 'name = "../tiny"', "name must be of at most 80 letters"),
         ('duration = "6 s"', 'duration = "6 V"', "duration"),
@@ -100,9 +100,9 @@ def test_kinds_of_records_take_turns(tiny):
         ("seed = 3", 'seed = 3\nkeep_recordings = "yes"', "campaign.keep_recordings must be a valid boolean"),
     ],
 )
-def test_what_breaks_a_rule_is_one_line_with_the_place(tmp_path, text, before, after, told):
+def test_what_breaks_a_rule_is_one_line_with_the_place(tmp_path, text, before, after, message):
     assert before in text
-    with pytest.raises(InputError, match=re.escape(told)) as error:
+    with pytest.raises(InputError, match=re.escape(message)) as error:
         plan_of(tmp_path, text.replace(before, after, 1))
     assert "plan.toml" in str(error.value)
     assert "\n" not in str(error.value)
@@ -173,7 +173,7 @@ def test_names_and_seeds_are_the_same_in_another_process(tiny):
         "from sealscope.campaigns.cases.case import cases_of\n"
         "print([(c.id, c.machine_seed, c.noise_seed) for c in cases_of(load_plan(sys.argv[1]))])"
     )
-    found = subprocess.run([sys.executable, "-c", code, str(tiny)], capture_output=True, text=True, check=True)
+    result = subprocess.run([sys.executable, "-c", code, str(tiny)], capture_output=True, text=True, check=True)
     plan = load_plan(tiny)
     assert isinstance(plan, SimulatedPlan)
-    assert found.stdout.strip() == str([(c.id, c.machine_seed, c.noise_seed) for c in cases_of(plan)])
+    assert result.stdout.strip() == str([(c.id, c.machine_seed, c.noise_seed) for c in cases_of(plan)])

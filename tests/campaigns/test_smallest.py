@@ -32,13 +32,13 @@ def minute(rig: Rig) -> Findable:
 
 def test_what_is_planned_is_found(rig: Rig, minute: Findable) -> None:
     """1.3 times the size is found in most recordings made afresh, and a third of it in none."""
-    found = []
+    result = []
     for factor in (1.3, 1.0 / 3.0):
         leak = Leak("laminar", coefficient=factor * minute.conductance, opening=From(30.0))
         runs = [replace(experiment_of(rig, DUTY, 60.0, seed), leaks=(leak,)) for seed in range(10, 14)]
         records = [simulate_with_truth(run).recording for run in runs]
-        found.append(sum(VolumeBalance(rig).examine(own, [], 0.01).verdict == "leak" for own in records))
-    assert found[0] >= 3 and found[1] == 0
+        result.append(sum(VolumeBalance(rig).examine(own, [], 0.01).verdict == "leak" for own in records))
+    assert result[0] >= 3 and result[1] == 0
 
 
 def test_what_is_separable_from_the_pump_is_no_smaller_than_what_is_found(rig: Rig, minute: Findable) -> None:

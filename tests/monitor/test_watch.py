@@ -182,8 +182,8 @@ def test_a_repair_begins_a_new_baseline():
     watch = Watch.from_state(WHOLE[0].state())
     watch.relearn()
     assert watch.leak is None and watch.baseline is None
-    sound = machine(5, duration=90.0, rate=50.0)
-    _, estimates = run(moved(sound, 400.0), [900], watch)
+    healthy = machine(5, duration=90.0, rate=50.0)
+    _, estimates = run(moved(healthy, 400.0), [900], watch)
     assert watch.baseline is not None and watch.baseline.version == 2
     assert watch.leak is None
     assert estimates[-1].status == "watched"

@@ -64,7 +64,7 @@ def test_warming_oil_warms(unmodelled):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ('[[family]]\nname = "a"\n', "family[1].why is missing"),
         ('[[family]]\nname = "a"\nwhy = "b"\nwarm = true\n', "family[1].warm is not known"),
@@ -81,12 +81,12 @@ def test_warming_oil_warms(unmodelled):
         ),
     ],
 )
-def test_a_family_that_breaks_a_rule_is_one_line(tmp_path, text, told):
+def test_a_family_that_breaks_a_rule_is_one_line(tmp_path, text, message):
     path = tmp_path / "odd.toml"
     path.write_text('[profile]\nname = "odd"\ntitle = "Odd"\nextends = "bench"\n' + text, encoding="utf-8")
     with pytest.raises(InputError, match=r"odd\.toml") as error:
         load_profile(path)
-    assert told in str(error.value)
+    assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
@@ -156,10 +156,10 @@ def test_a_jittering_clock_samples_where_it_says():
     f, interval = 60.0, 1.0 / 2000.0
     t = np.arange(4000) * interval
     late = np.clip(0.4 * np.random.default_rng(1).standard_normal(1000), -1.0, 1.0)
-    found = at_jittered(lambda values: values[::4], np.sin(2 * np.pi * f * t), late)
+    result = at_jittered(lambda values: values[::4], np.sin(2 * np.pi * f * t), late)
     exact = np.sin(2 * np.pi * f * (t[::4] + late * interval))
     punctual = np.sin(2 * np.pi * f * t[::4])
-    assert np.abs(found - exact)[1:].max() < 0.01 * np.abs(punctual - exact).max()
+    assert np.abs(result - exact)[1:].max() < 0.01 * np.abs(punctual - exact).max()
 
 
 def test_harmonics_stand_beside_the_hum():

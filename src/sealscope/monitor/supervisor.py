@@ -183,12 +183,12 @@ class Supervisor:
             finally:
                 timer.cancel()
 
-        def keep() -> None:
+        def attempts() -> None:
             while not part.attempt(lasting) and again and not self._stopping.wait(part.pause_s):
                 pass
             ended()
 
-        return _started(keep, name)
+        return _started(attempts, name)
 
     def repeat(
         self, name: str, step: Callable[[], object], every_s: float, *, last: Callable[[], object] | None = None
@@ -196,13 +196,13 @@ class Supervisor:
         """Start a thread that runs a step every so many seconds, and `last` when `stopping` is set."""
         part = self.part(name)
 
-        def keep() -> None:
+        def attempts() -> None:
             while not self._stopping.wait(max(every_s, part.pause_s)):
                 part.attempt(step)
             if last is not None:
                 part.attempt(last, at_once=True)
 
-        return _started(keep, name)
+        return _started(attempts, name)
 
 
 class LimitedLines(logging.Filter):
