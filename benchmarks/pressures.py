@@ -94,11 +94,11 @@ def main() -> None:
             spent.append(time.process_time() - begun)
             low, high = answers[-1].interval
             holds += bool(lpm) and low <= simulated.truth.mean_leak_lpm <= high
-        found = [answer for answer in answers if answer.leak]
-        dated = sum(abs(answer.onset - ONSET) <= SECONDS / BLOCKS for answer in found)
-        ratio = np.median([answer.flow / lpm for answer in found]) if lpm and found else np.nan
+        detected = [answer for answer in answers if answer.leak]
+        dated = sum(abs(answer.onset - ONSET) <= SECONDS / BLOCKS for answer in detected)
+        ratio = np.median([answer.flow / lpm for answer in detected]) if lpm and detected else np.nan
         print(
-            f"{lpm:g} L/min {given.fault}: {len(found)} of {given.machines} a leak; interval holds {holds}, dated "
+            f"{lpm:g} L/min {given.fault}: {len(detected)} of {given.machines} a leak; interval holds {holds}, dated "
             f"within a block {dated}; median of flow over truth {ratio:.2f}; {np.median(spent):.2f} s; "
             f"{dict(Counter(answer.words for answer in answers))}",
             flush=True,

@@ -16,7 +16,7 @@ from sealscope.campaigns.cases.bound import (
     information,
     leak_bound,
     noise_covariance,
-    smallest_found,
+    smallest_detectable,
 )
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
@@ -180,8 +180,8 @@ def test_litres_a_minute_are_counted_at_a_stated_pressure() -> None:
 
 
 def test_best_test_finds_what_its_normal_law_says() -> None:
-    assert smallest_found(1.0, 0.01, 0.9) == pytest.approx(2.3263 + 1.2816, abs=1e-3)
-    assert smallest_found(2.0, 0.05, 0.5) == pytest.approx(2 * 1.6449, abs=1e-3)
+    assert smallest_detectable(1.0, 0.01, 0.9) == pytest.approx(2.3263 + 1.2816, abs=1e-3)
+    assert smallest_detectable(2.0, 0.05, 0.5) == pytest.approx(2 * 1.6449, abs=1e-3)
     for bad in (0.0, 1.0, -0.1, math.nan):
         with pytest.raises(InputError, match="between 0 and 1"):
-            smallest_found(1.0, bad)
+            smallest_detectable(1.0, bad)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sealscope.campaigns.cases.bound import UNKNOWN, change_bound, in_lpm, leak_bound, smallest_found
+from sealscope.campaigns.cases.bound import UNKNOWN, change_bound, in_lpm, leak_bound, smallest_detectable
 from sealscope.campaigns.cases.case import cases_of
 from sealscope.campaigns.cases.machines import leak_of
 from sealscope.campaigns.cases.row import CaseRow
@@ -59,7 +59,7 @@ def test_each_family_is_counted_by_hand():
 
 def test_only_leaks_that_the_bound_allows_count_against_it():
     """0.004 L/min is 4 s at s = 0.001, which the best test finds at 1 %, and 2 s at 0.002, which it does not."""
-    assert smallest_found(0.001, 0.01, 0.9) < 0.004 < smallest_found(0.002, 0.01, 0.9)
+    assert smallest_detectable(0.001, 0.01, 0.9) < 0.004 < smallest_detectable(0.002, 0.01, 0.9)
     result = findings()
     assert (result[ALL, 0.004, "orifice"].allowed.count, result[ALL, 0.004, "orifice"].allowed.n) == (0, 1)
     assert (result[ALL, 0.004, ANY_LAW].allowed.count, result[ALL, 0.004, ANY_LAW].allowed.n) == (1, 2)

@@ -85,7 +85,7 @@ class HostileWire:
     """
 
     def __init__(self, valid: list[bytes], count: int, largest: int) -> None:
-        self._random, self._sound, self._count, self._largest = np.random.default_rng(count), valid, count, largest
+        self._random, self._valid, self._count, self._largest = np.random.default_rng(count), valid, count, largest
         self.sent: Counter[str] = Counter()
         self.odd = 0
         self.memory: list[int] = []
@@ -102,13 +102,13 @@ class HostileWire:
         return part
 
     def _mixed(self) -> Iterator[bytes]:
-        every = self._count // len(self._sound)
+        every = self._count // len(self._valid)
         before_reading = 9 * self._count // 10  # the last line is read when no large one is under way
         large = set(self._random.choice(before_reading, self._largest, replace=False).tolist())
         for number in range(self._count):
-            if number % every == 0 and (at := number // every) < len(self._sound):
-                yield self._sound[at] + b"\n"
-                self._passed.append(self._sound[at])
+            if number % every == 0 and (at := number // every) < len(self._valid):
+                yield self._valid[at] + b"\n"
+                self._passed.append(self._valid[at])
             if number in (self._count // 5, self._count - 1):
                 self.memory.append(_resident())
             reason, line = self._large(number) if number in large else self._hostile(number)

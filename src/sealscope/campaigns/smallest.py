@@ -158,7 +158,7 @@ def findable(
     try:
         for seed in range(RECORDS):
             recording = simulate_with_truth(experiment_of(rig, duty, duration, seed)).recording
-            step, apart, pressure = _found_in(recording, rig, false_alarm, detection)
+            step, apart, pressure = _detectable_in(recording, rig, false_alarm, detection)
             steps.append(step)
             separable_steps.append(apart)
             pressures.append(pressure)
@@ -168,7 +168,7 @@ def findable(
     return Findable(duty, duration, step, apart, pressure)
 
 
-def _found_in(recording: Recording, rig: Rig, false_alarm: float, detection: float) -> tuple[float, float, float]:
+def _detectable_in(recording: Recording, rig: Rig, false_alarm: float, detection: float) -> tuple[float, float, float]:
     """Return the conductance found, that separable from the pump, and the mean pressure, of a leak-free recording."""
     detector = VolumeBalance(rig)
     if reason := detector.usable(recording):

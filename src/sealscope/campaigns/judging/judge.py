@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from sealscope.campaigns.cases.bound import smallest_found
+from sealscope.campaigns.cases.bound import smallest_detectable
 from sealscope.campaigns.cases.case import FAMILY
 from sealscope.campaigns.cases.row import NO_CAUSE, PISTON_LEAK, CaseRow, cause_of, covers, duty_of, named_cause
 from sealscope.campaigns.plans.detectors import plan_detector
@@ -360,7 +360,7 @@ class _Judging:
     def _allowed(self, row: CaseRow) -> bool:
         """Whether the best test at this false-alarm probability finds the leak of a row nine times in ten."""
         bound = row.bound_lpm
-        return bound is not None and smallest_found(bound, self.false_alarm, ALLOWED_DETECTION) <= _flow(row)
+        return bound is not None and smallest_detectable(bound, self.false_alarm, ALLOWED_DETECTION) <= _flow(row)
 
     def _stating(self, rows: Sequence[CaseRow]) -> list[str]:
         """Return the detectors that state evidence."""
