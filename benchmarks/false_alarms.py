@@ -143,12 +143,12 @@ def main() -> None:
     clean = sum((count for name, count in totals.items() if name.startswith("none")), Count())
     leaky = sum((count for name, count in totals.items() if not name.startswith("none")), Count())
     print(f"\n{'detector':<34}{'false alarms':>20}{'leaks found':>20}")
-    for name, false, statement in (
+    for name, false, detected in (
         (chosen.detector, clean.leak, leaky.leak),
         ("always fires", clean.records, leaky.records),
         ("never fires", 0, 0),
     ):
-        print(f"{name:<34}{f'{false}/{clean.records}':>20}{f'{statement}/{leaky.records}':>20}")
+        print(f"{name:<34}{f'{false}/{clean.records}':>20}{f'{detected}/{leaky.records}':>20}")
     print(f"{time.perf_counter() - start:.0f} s")
     if chosen.json:
         partial = chosen.json.with_name(chosen.json.name + ".partial")
