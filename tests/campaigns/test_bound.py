@@ -89,7 +89,7 @@ def test_unknown_parameters_can_only_raise_the_bound() -> None:
     assert all(after >= before for before, after in pairwise(bounds))
 
 
-def test_what_cannot_be_told_apart_is_refused() -> None:
+def test_what_cannot_be_separated_is_refused() -> None:
     slopes = np.stack([np.ones(10), 2.0 * np.ones(10)])[:, None, :]
     with pytest.raises(InputError, match="must be told apart"):
         cramer_rao(information(slopes, np.eye(1)))
