@@ -89,16 +89,16 @@ def exponent(sizes: Any, seconds: Any) -> tuple[float, float]:
 def growth(case: Case, rounds: int) -> dict[str, Any]:
     """Processor seconds against number and length of runs, seconds by the clock against threads."""
     step = 1e-3
-    found: dict[str, Any] = {}
+    timings: dict[str, Any] = {}
     by_runs = [min(timed(experiments(case, n, 20.0, step), 1)[0] for _ in range(rounds)) for n in RUNS]
-    found["runs"] = {"sizes": RUNS, "seconds": by_runs, "exponent": exponent(RUNS, by_runs)}
+    timings["runs"] = {"sizes": RUNS, "seconds": by_runs, "exponent": exponent(RUNS, by_runs)}
     by_length = [min(timed(experiments(case, 32, length, step), 1)[0] for _ in range(rounds)) for length in LENGTHS]
-    found["run length [s]"] = {"sizes": LENGTHS, "seconds": by_length, "exponent": exponent(LENGTHS, by_length)}
+    timings["run length [s]"] = {"sizes": LENGTHS, "seconds": by_length, "exponent": exponent(LENGTHS, by_length)}
     cores = [n for n in (1, 2, 4, 8, 16, 32) if n <= (os.cpu_count() or 1)]
     batch = experiments(case, 256, 20.0, step)
     by_cores = [min(timed(batch, n)[1] for _ in range(rounds)) for n in cores]
-    found["threads (by the clock)"] = {"sizes": cores, "seconds": by_cores, "exponent": exponent(cores, by_cores)}
-    return found
+    timings["threads (by the clock)"] = {"sizes": cores, "seconds": by_cores, "exponent": exponent(cores, by_cores)}
+    return timings
 
 
 def main() -> None:

@@ -107,18 +107,18 @@ def main() -> None:
     if min(chosen.rounds, chosen.imports) < 1:
         parser.error("--rounds and --imports must be 1 or more")
     values = {"orifices": "present", "closed_A": 0.5, "closed_B": 0.5}
-    sound = [simulate(seed=seed, set=values) for seed in range(6)]
+    healthy = [simulate(seed=seed, set=values) for seed in range(6)]
     leaky = simulate(seed=9, leak="0.0042 L/min from 90 s", set=values)
     cases: dict[str, Callable[[], object]] = {
-        "within the recording, no leak": lambda: diagnose(sound[0]),
+        "within the recording, no leak": lambda: diagnose(healthy[0]),
         "within the recording, leak": lambda: diagnose(leaky),
-        "within the recording, at 0.1 %": lambda: diagnose(sound[0], false_alarm_probability=1e-3),
-        "against 1 recording, known": lambda: diagnose(leaky, sound[:1]),
-        "against 6 recordings, known": lambda: diagnose(leaky, sound),
+        "within the recording, at 0.1 %": lambda: diagnose(healthy[0], false_alarm_probability=1e-3),
+        "against 1 recording, known": lambda: diagnose(leaky, healthy[:1]),
+        "against 6 recordings, known": lambda: diagnose(leaky, healthy),
     }
-    pressures = [recording.only(["u", "p_A", "p_B"]) for recording in (sound[0], leaky)]
+    pressures = [recording.only(["u", "p_A", "p_B"]) for recording in (healthy[0], leaky)]
     cases |= {
-        "the judge alone, no leak": lambda: diagnose(sound[0], quick=True),
+        "the judge alone, no leak": lambda: diagnose(healthy[0], quick=True),
         "the judge alone, leak": lambda: diagnose(leaky, quick=True),
         "pressures and command, no leak": lambda: diagnose(pressures[0]),
         "pressures and command, leak": lambda: diagnose(pressures[1]),

@@ -159,7 +159,7 @@ def served(
 
             service.hand(decoded(payload, name, stored))  # type: ignore[attr-defined]
 
-        def settle(number: int) -> None:
+        def wait_for_blocks(number: int) -> None:
             while done[0] < number:
                 time.sleep(0.01)
 
@@ -170,7 +170,7 @@ def served(
                 due = clock + k + n / count if paced else time.perf_counter()
                 time.sleep(max(0.0, due - time.perf_counter()))
                 send(name, payloads[learned + k], due)  # a service that falls behind makes the sender late, too
-        settle(rounds * count)
+        wait_for_blocks(rounds * count)
         total = rounds * count
         measured.extend([(time.process_time() - began) / total, (time.perf_counter() - clock) / total])
 

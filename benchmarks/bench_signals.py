@@ -1,4 +1,4 @@
-"""Time the signal room against PyWavelets, in turn and in one run, so that a busy machine burdens both alike.
+"""Time the package `signals` against PyWavelets, in turn and in one run, so that a busy machine burdens both alike.
 
     python benchmarks/bench_signals.py [--samples 180000] [--rounds 31] [--json FILE]
 
@@ -65,7 +65,7 @@ def main() -> None:
     chosen = parser.parse_args()
     x = np.random.default_rng(0).normal(size=chosen.samples)
     channels = x[: chosen.samples // 64 * 64].reshape(64, -1)
-    found = details(x)
+    levels = details(x)
 
     def swt() -> object:
         return pywt.swt(x[: x.size // 16 * 16], "db8", level=LEVELS, trim_approx=True)
@@ -76,7 +76,7 @@ def main() -> None:
     def windows_live() -> None:
         stream = RmsStream()
         for start in range(0, x.size, 500):
-            stream.update(found.values[:, start : start + 500])
+            stream.update(levels.values[:, start : start + 500])
 
     cases = {
         "stream, one block | pywt.swt": (in_blocks(DetailStream(), x, x.size), swt),
@@ -86,7 +86,7 @@ def main() -> None:
         "stream, 64 channels, blocks of 50 | pywt.swt": (in_blocks(DetailStream(64), channels, 50), swt),
         "details() | pywt.swt": (lambda: details(x), swt),
         "details(decimated) | pywt.wavedec": (lambda: details(x, transform="decimated"), wavedec),
-        "windowed_rms of 4 levels | pywt.wavedec": (lambda: windowed_rms(found), wavedec),
+        "windowed_rms of 4 levels | pywt.wavedec": (lambda: windowed_rms(levels), wavedec),
         "RmsStream of 4 levels, blocks of 500 | pywt.wavedec": (windows_live, wavedec),
     }
     print(f"{x.size} samples in all, db8, {LEVELS} levels, {chosen.rounds} rounds; median (25 % .. 75 %)")

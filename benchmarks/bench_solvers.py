@@ -120,8 +120,8 @@ def theirs(program: Path, case: Case, setting: float, duration: float) -> Solve:
     def solve() -> tuple[float, Rows]:
         file = program.with_suffix(".rows")
         call = [str(program), *case.words(), str(duration), repr(setting), str(RATE), str(file)]
-        told = subprocess.run(call, check=True, capture_output=True, text=True)
-        return float(told.stdout.split()[0]), np.fromfile(file).reshape(-1, 3)
+        finished = subprocess.run(call, check=True, capture_output=True, text=True)
+        return float(finished.stdout.split()[0]), np.fromfile(file).reshape(-1, 3)
 
     return solve
 
@@ -161,35 +161,35 @@ def same_trajectory(case: Case, peers: dict[str, Path]) -> dict[str, float]:
     """Rms difference in p_A [Pa] of each peer from ours over 5 s, all converged; exits where it is above `SAME`."""
     method = "rk4" if case.closed is None else "imex"
     converged = ours(case, method, CONVERGED[method], 5.0)()[1]
-    found = {}
+    results = {}
     for name, program in peers.items():
         if name == "C++ IMEX" and case.closed is None:
             continue
         tight = 1e-10 if name == "CVODE BDF" else {"C++ IMEX": 2.5e-5}.get(name, 1e-5 if case.closed is None else 1e-6)
-        found[name] = rms(theirs(program, case, tight, 5.0)()[1][:, 1] - converged[:, 1])
-        if not found[name] <= SAME:
+        results[name] = rms(theirs(program, case, tight, 5.0)()[1][:, 1] - converged[:, 1])
+        if not results[name] <= SAME:
             raise SystemExit(
-                f"{case.name}: {name} and ours must agree within {SAME} Pa rms in p_A, got {found[name]:.3g} Pa"
+                f"{case.name}: {name} and ours must agree within {SAME} Pa rms in p_A, got {results[name]:.3g} Pa"
             )
-    return found
+    return results
 
 
 def contenders(case: Case, peers: dict[str, Path], duration: float) -> dict[str, Solve]:
     """Every solver and setting that is timed for the case; the first is our default."""
     method = "rk4" if case.closed is None else "imex"
-    found = {OURS: ours(case, "auto", None, duration)}
+    results = {OURS: ours(case, "auto", None, duration)}
     for h in (1e-3, 5e-4, 2e-4, 1e-4) if method == "rk4" else (1e-3, 5e-4, 2e-4):
-        found[f"ours, {method}, h = {h:g} s"] = ours(case, method, h, duration)
-    found[f"ours, {method}, h = {REFUSED:g} s, refused"] = ours(case, method, REFUSED, duration)
+        results[f"ours, {method}, h = {h:g} s"] = ours(case, method, h, duration)
+    results[f"ours, {method}, h = {REFUSED:g} s, refused"] = ours(case, method, REFUSED, duration)
     if "C++ RK4" in peers:
         for h in (1e-3, 5e-4, 1e-4) if case.closed is None else (1e-4, 2e-5, 1e-5, 5e-6):
-            found[f"C++ RK4, h = {h:g} s"] = theirs(peers["C++ RK4"], case, h, duration)
+            results[f"C++ RK4, h = {h:g} s"] = theirs(peers["C++ RK4"], case, h, duration)
     if "C++ IMEX" in peers and case.closed is not None:
-        found["C++ IMEX, h = 0.001 s"] = theirs(peers["C++ IMEX"], case, 1e-3, duration)
+        results["C++ IMEX, h = 0.001 s"] = theirs(peers["C++ IMEX"], case, 1e-3, duration)
     if "CVODE BDF" in peers:
         for rtol in (1e-4, 1e-5, 1e-6, 1e-7, 1e-8):
-            found[f"CVODE BDF, rtol = {rtol:g}"] = theirs(peers["CVODE BDF"], case, rtol, duration)
-    return found
+            results[f"CVODE BDF, rtol = {rtol:g}"] = theirs(peers["CVODE BDF"], case, rtol, duration)
+    return results
 
 
 def quartiles(values: np.ndarray) -> list[float]:
@@ -276,10 +276,12 @@ def draw(figures: dict[str, Any], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     chosen, axes = plt.subplots(1, len(figures), figsize=(4.2 * len(figures), 4.0), sharey=True, squeeze=False)
-    for ax, (case, found) in zip(axes[0], figures.items(), strict=True):
+    for ax, (case, results) in zip(axes[0], figures.items(), strict=True):
         for family, style in FAMILIES.items():
             points = [
-                (one["seconds"][0], one["p_A_rms"]) for name, one in found["solvers"].items() if name.startswith(family)
+                (one["seconds"][0], one["p_A_rms"])
+                for name, one in results["solvers"].items()
+                if name.startswith(family)
             ]
             if points:
                 seconds, error = np.array(sorted(points)).T

@@ -85,13 +85,13 @@ def judge(records: Iterator[Recording], detector: str, probability: float, onset
     """A detector's verdicts (`diagnose`: of all together) on some records, and how many alarms lie near the onset."""
     count = Count()
     for one in records:
-        seen = Examination(one, false_alarm_probability=probability)
-        found = seen.fused() if detector == "diagnose" else seen.evidence(detector)
+        examination = Examination(one, false_alarm_probability=probability)
+        statement = examination.fused() if detector == "diagnose" else examination.evidence(detector)
         count.records += 1
-        count.leak += found.verdict == "leak"
-        count.no_leak += found.verdict == "no leak"
-        count.cannot_tell += found.verdict == "cannot tell"
-        count.near += onset is not None and found.onset_s is not None and abs(found.onset_s - onset) <= NEAR
+        count.leak += statement.verdict == "leak"
+        count.no_leak += statement.verdict == "no leak"
+        count.cannot_tell += statement.verdict == "cannot tell"
+        count.near += onset is not None and statement.onset_s is not None and abs(statement.onset_s - onset) <= NEAR
     return count
 
 
@@ -143,12 +143,12 @@ def main() -> None:
     clean = sum((count for name, count in totals.items() if name.startswith("none")), Count())
     leaky = sum((count for name, count in totals.items() if not name.startswith("none")), Count())
     print(f"\n{'detector':<34}{'false alarms':>20}{'leaks found':>20}")
-    for name, false, found in (
+    for name, false, detected in (
         (chosen.detector, clean.leak, leaky.leak),
         ("always fires", clean.records, leaky.records),
         ("never fires", 0, 0),
     ):
-        print(f"{name:<34}{f'{false}/{clean.records}':>20}{f'{found}/{leaky.records}':>20}")
+        print(f"{name:<34}{f'{false}/{clean.records}':>20}{f'{detected}/{leaky.records}':>20}")
     print(f"{time.perf_counter() - start:.0f} s")
     if chosen.json:
         partial = chosen.json.with_name(chosen.json.name + ".partial")

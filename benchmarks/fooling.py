@@ -68,10 +68,10 @@ class Machine:
         """Return the record of another machine at the same duty."""
         return recording_of(self.spare, self.folder)
 
-    def another(self, fault: str = "", leak: bool = True) -> ss.Recording:
+    def repeated(self, fault: str = "", leak: bool = True) -> ss.Recording:
         """Return another record of this machine: with a fault from half on, or without its leak."""
         own = replace(self.case, fault=fault, leak_lpm=self.case.leak_lpm if leak else 0.0)
-        name = f"{self.case.id}-{fault or 'sound'}".replace(" ", "-").replace("%", "percent")
+        name = f"{self.case.id}-{fault or 'healthy'}".replace(" ", "-").replace("%", "percent")
         return recording_of(replace(own, id=name, noise_seed=self.case.noise_seed ^ 1), self.folder)
 
 
@@ -90,12 +90,12 @@ class Sample:
     def faulty(self, fault: str) -> ss.Recording:
         """Return the record of this machine with a fault from half on."""
         assert self.machine is not None
-        return self.machine.another(fault)
+        return self.machine.repeated(fault)
 
-    def sound(self) -> ss.Recording:
+    def healthy(self) -> ss.Recording:
         """Return another record of this machine, without a leak."""
         assert self.machine is not None
-        return self.machine.another(leak=False)
+        return self.machine.repeated(leak=False)
 
     @property
     def late(self) -> Flags:
@@ -316,11 +316,11 @@ row("a square wave for p_A", "garbage")(
 for _fault in ("air 1 %", "air 2 %", "friction +20 %", "rod seal A 0.01 L/min", "sensor p_A offset 5 psi"):
     row(f"{_fault} from half on", "machine")(lambda s, fault=_fault: s.faulty(fault))
 
-row("against its own baseline", "baseline", lambda s: s.sound())(lambda s: s.record)
+row("against its own baseline", "baseline", lambda s: s.healthy())(lambda s: s.record)
 row("against a copy of itself", "baseline", lambda s: s.record)(lambda s: s.record)
 row("against another machine's baseline", "baseline", lambda s: s.other)(lambda s: s.record)
-row("against a baseline with a smoother filter", "baseline", lambda s: _smooth_sensor(s.sound()))(lambda s: s.record)
-row("against a baseline with hum", "baseline", lambda s: _humming(s.sound()))(lambda s: s.record)
+row("against a baseline with a smoother filter", "baseline", lambda s: _smooth_sensor(s.healthy()))(lambda s: s.record)
+row("against a baseline with hum", "baseline", lambda s: _humming(s.healthy()))(lambda s: s.record)
 row("against a baseline of noise", "baseline", lambda s: s.changed(lambda v: v.mean() + s.white(1e5)))(
     lambda s: s.record
 )
@@ -344,11 +344,11 @@ def made_of(name: str, machine: Machine, number: int, view: str) -> tuple[ss.Rec
     random = np.random.default_rng([number, *name.encode()])
     sample, channels = Sample(machine.record, random, machine.other, machine), VIEWS[view]
 
-    def seen(made: ss.Recording) -> ss.Recording:
+    def through_view(made: ss.Recording) -> ss.Recording:
         return made.only([own for own in made.channels if own != "q_leak" and (channels is None or own in channels)])
 
     change, baseline = ROWS[name].change, ROWS[name].baseline
-    return seen(change(sample)), [] if baseline is None else [seen(baseline(sample))]
+    return through_view(change(sample)), [] if baseline is None else [through_view(baseline(sample))]
 
 
 def digest(recordings: Iterable[ss.Recording]) -> str:
@@ -424,11 +424,11 @@ def write_table(file: Path, lines: Iterable[dict[str, object]]) -> None:
         sides = [f"{side}: {verdict}" for side in ("healthy", "leaking") for verdict in verdicts]
         writer.writerow(["machines", "group", "row", "channels", *sides, "causes named, healthy"])
         for part, (name, row_), view in product(("judged on", "developed on"), ROWS.items(), VIEWS):
-            sound, worn = (counts.get((name, view, part, leaking), Counter[str]()) for leaking in (False, True))
-            if sound or worn:
-                named = [(key.removeprefix("cause: "), count) for key, count in sorted(sound.items())]
+            leak_free, worn = (counts.get((name, view, part, leaking), Counter[str]()) for leaking in (False, True))
+            if leak_free or worn:
+                named = [(key.removeprefix("cause: "), count) for key, count in sorted(leak_free.items())]
                 causes = [f"{cause} {count}" for cause, count in named if cause not in (*verdicts, "None")]
-                cells = [side[verdict] for side in (sound, worn) for verdict in verdicts]
+                cells = [side[verdict] for side in (leak_free, worn) for verdict in verdicts]
                 writer.writerow([part, row_.group, name, view, *cells, "; ".join(causes)])
 
 

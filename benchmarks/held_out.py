@@ -58,14 +58,14 @@ def main() -> None:
         "throttles": (of_level(samples, "closed"), "condition"),
     }
     for classifier in plan.detectors:
-        for what, (seen, leave_out) in held_out.items():
+        for what, (chosen_samples, leave_out) in held_out.items():
             areas, swapped = [], []
             for run in range(chosen.splits if isinstance(classifier, ChosenClassifier) else 1):
-                own = dealt(seen, random) if run else seen
+                own = dealt(chosen_samples, random) if run else chosen_samples
                 scores = held_out_scores(own, classifier, leave_out)
                 areas.append(auc(scores[own.leak_lpm <= 0], scores[own.leak_lpm > 0]).value)
             for _ in range(chosen.swaps):
-                own = dealt(seen, random)
+                own = dealt(chosen_samples, random)
                 numbers = {test: k for k, test in enumerate(dict.fromkeys(own.tests))}
                 coin = random.random(len(numbers)) < 0.5
                 leaks = (own.leak_lpm > 0) ^ coin[[numbers[test] for test in own.tests]]

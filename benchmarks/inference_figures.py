@@ -36,12 +36,12 @@ def balance() -> None:
     made = blocks_of(recording, rig)
     assert made is not None
     blocks, columns = made
-    told = information(blocks, columns, columns[0].leak)
-    test = step_test(told)
+    step_information = information(blocks, columns, columns[0].leak)
+    test = step_test(step_information)
     assert test is not None
     unit = float(blocks.driving().mean()) / LITRE_PER_MINUTE
-    free = np.linalg.pinv(told.precision, hermitian=True)
-    fitted = course(told, test, step=True)
+    free = np.linalg.pinv(step_information.precision, hermitian=True)
+    fitted = course(step_information, test, step=True)
     before = float((unit * fitted.mean)[blocks.time < ONSET].mean())
     figure, (left, middle, right) = plt.subplots(1, 3, figsize=(11.0, 3.2), layout="constrained")
     phi = test_function(recording.rate).ravel()
@@ -51,7 +51,11 @@ def balance() -> None:
     left.set(xlabel="t [s]", title="a test function")
     left.legend()
     middle.errorbar(
-        blocks.time, unit * (free @ told.vector) - before, 1.96 * unit * np.sqrt(np.diag(free)), fmt=".", color="0.6"
+        blocks.time,
+        unit * (free @ step_information.vector) - before,
+        1.96 * unit * np.sqrt(np.diag(free)),
+        fmt=".",
+        color="0.6",
     )
     middle.plot(blocks.time, unit * fitted.mean - before, label="level, slope, walk, step")
     middle.plot([0.0, ONSET, ONSET, 180.0], [0.0, 0.0, LEAK, LEAK], "k:", label="what was put in")

@@ -44,7 +44,7 @@ def examined(recording: Recording, detector: str) -> Evidence:
 
 def row(lpm: float, detector: str, times: int) -> str:
     """Return the line of one size."""
-    found = stated = holds = records = impossible = 0
+    detected = stated = holds = records = impossible = 0
     errors = []
     for number, ((command, throttles), law) in enumerate([*product(settings(), LAWS)] * times):
         onset = float(np.random.default_rng([number, round(1e6 * lpm)]).uniform(EARLIEST, LATEST))
@@ -59,7 +59,7 @@ def row(lpm: float, detector: str, times: int) -> str:
         evidence = examined(simulated.recording, detector)
         if evidence.verdict != "leak":
             continue
-        found += 1
+        detected += 1
         if evidence.onset_s is not None:
             errors.append(abs(evidence.onset_s - onset))
         if evidence.leak_interval_lpm is not None:
@@ -68,7 +68,7 @@ def row(lpm: float, detector: str, times: int) -> str:
             holds += low <= simulated.truth.mean_leak_lpm <= high
     off = f"{np.median(errors):.2f} s, {max(errors):.2f} s" if errors else ""
     note = f"; {impossible} beyond the pump" if impossible else ""
-    return f"| {lpm:g} | {found} of {records} | {holds} of {stated} | {off} |{note}"
+    return f"| {lpm:g} | {detected} of {records} | {holds} of {stated} | {off} |{note}"
 
 
 def main() -> None:

@@ -136,7 +136,7 @@ class Monitor:
             (folder / f"files {k}").mkdir()
         (folder / "bait").mkdir()
         (folder / "monitor.toml").write_text("\n".join(lines))
-        self.broker.keep("sealscope-monitor", [f"plant/{k}" for k in range(len(names)) if k % FILES])
+        self.broker.open_session("sealscope-monitor", [f"plant/{k}" for k in range(len(names)) if k % FILES])
         self.client = Client(CallbackAPIVersion.VERSION2, "plant", protocol=MQTTProtocolVersion.MQTTv5)
         self.client.reconnect_delay_set(1, 1)
         self.client.connect("127.0.0.1", self.broker.port)
@@ -208,7 +208,7 @@ class Monitor:
     def blocks(self) -> list[tuple[Any, ...]]:
         """Return actuator and identity of the plant's blocks."""
         rows = self.rows("select actuator, identity from blocks where actuator not like '%bait'")
-        return sorted(row for row in rows if not row[1].startswith("stranger"))
+        return sorted(row for row in rows if not row[1].startswith("hostile"))
 
     def lines_out(self) -> Counter[int]:
         """Return how often each event has gone out by a line."""
@@ -281,42 +281,42 @@ class Attacks:
         self.publish("spBv1.0/plant/NDEATH/bait", encoded(SparkplugPayload(1, array, None)))
         self.publish("spBv1.0/plant/NDATA/bait", self.chance.randbytes(60))
 
-    def stranger(self, suffix: bytes, contents: bytes, folder: str | None = None) -> Path:
+    def hostile_file(self, suffix: bytes, contents: bytes, folder: str | None = None) -> Path:
         """Write a hostile file into the folder of an actuator, or into the bait's."""
         self._number += 1
         if folder is None:
             wet = [f"files {k}" for k in range(0, len(self.monitor.names), FILES)]
             folder = self.chance.choice([*wet, "bait", "bait"])
-        name = b"stranger %d" % self._number + suffix
+        name = b"hostile %d" % self._number + suffix
         path = Path(os.fsdecode(os.fsencode(self.monitor.folder / folder) + b"/" + name))
         with suppress(OSError):  # the folder may be away
             path.write_bytes(contents)
         return path
 
     def latin_name(self) -> None:
-        self.stranger(b" pr\xe9sse.csv", b"t [s],x [m]\n0,1\nnot a number")
+        self.hostile_file(b" pr\xe9sse.csv", b"t [s],x [m]\n0,1\nnot a number")
         good = "t [s],p_A [Pa]\n" + "".join(f"{k / 50},{k}\n" for k in range(4000))
-        self.stranger(b" sch\xf6n.csv", good.encode(), "bait")
+        self.hostile_file(b" sch\xf6n.csv", good.encode(), "bait")
 
     def damaged_file(self) -> None:
         suffix = self.chance.choice([b".csv", b".parquet", b".mat", b".h5", b".mf4", b".tdms", b".zip", b".xlsx"])
-        self.stranger(suffix, self.chance.randbytes(3000))
+        self.hostile_file(suffix, self.chance.randbytes(3000))
 
     def corner_workbook(self) -> None:
-        path = self.stranger(b".xlsx", b"", "bait")
+        path = self.hostile_file(b".xlsx", b"", "bait")
         workbook(path, [rows([("A1", 1), ("XFD1048576", 1)])])
 
     def bomb(self) -> None:
-        self.stranger(b".csv.gz", BOMB, "bait")
+        self.hostile_file(b".csv.gz", BOMB, "bait")
 
     def foreign_link(self) -> None:
-        path = self.stranger(b" link.csv", b"")
+        path = self.hostile_file(b" link.csv", b"")
         with suppress(OSError):
             path.unlink()
             path.symlink_to("/etc/passwd")
 
     def future_file(self) -> None:
-        path = self.stranger(b" of the future.csv", b"t [s],x [m]\n0,1\n")
+        path = self.hostile_file(b" of the future.csv", b"t [s],x [m]\n0,1\n")
         with suppress(OSError):
             os.utime(path, (4e9, 4e9))
 
@@ -554,11 +554,11 @@ def _differing(calm: Monitor, attacked: Monitor) -> tuple[dict[str, int], dict[s
     theirs = {"blocks": calm.blocks(), **{name: calm.rows(query) for name, query in queries.items()}}
     differ: dict[str, int] = {}
     digits: dict[str, int] = {}
-    for name, sound in theirs.items():
-        lost, doubled = Counter(map(_shown, sound)), Counter(map(_shown, ours[name]))
+    for name, expected in theirs.items():
+        lost, doubled = Counter(map(_shown, expected)), Counter(map(_shown, ours[name]))
         differ[f"{name} lost"] = sum((lost - doubled).values())
         differ[f"{name} too many"] = sum((doubled - lost).values())
-        exact = Counter(map(str, sound)) - Counter(map(str, ours[name]))
+        exact = Counter(map(str, expected)) - Counter(map(str, ours[name]))
         digits[name] = exact.total() - differ[f"{name} lost"]
     return {name: len(each) for name, each in theirs.items()}, differ, digits
 

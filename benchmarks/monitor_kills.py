@@ -92,7 +92,7 @@ class Plant:
 
     def subscribed(self) -> None:
         """Make the session that the broker keeps messages for."""
-        self.broker.keep(self.name, [f"{self.name}/{actuator}" for actuator in LEAKS])
+        self.broker.open_session(self.name, [f"{self.name}/{actuator}" for actuator in LEAKS])
 
     def published(self, messages: list[tuple[str, bytes]]) -> None:
         """Publish messages, each once."""

@@ -118,8 +118,8 @@ class Wander:
 
     def after(self, seconds: float) -> float:
         """Return the value after so many seconds."""
-        keep = math.exp(-seconds / self._seconds)
-        self.value = keep * self.value + self._size * math.sqrt(1.0 - keep**2) * self._random.standard_normal()
+        decay = math.exp(-seconds / self._seconds)
+        self.value = decay * self.value + self._size * math.sqrt(1.0 - decay**2) * self._random.standard_normal()
         return self.value
 
 

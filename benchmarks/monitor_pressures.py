@@ -67,10 +67,10 @@ class Wander:
 
     def course(self, count: int, spacing: float) -> np.ndarray:
         """Return so many values, so many seconds apart, from the present one on."""
-        keep, values = math.exp(-spacing / self._seconds), []
+        decay, values = math.exp(-spacing / self._seconds), []
         for _ in range(count):
             values.append(self.value)
-            self.value = keep * self.value + self._size * math.sqrt(1.0 - keep**2) * self._random.standard_normal()
+            self.value = decay * self.value + self._size * math.sqrt(1.0 - decay**2) * self._random.standard_normal()
         return np.array(values)
 
 
@@ -235,10 +235,10 @@ def main() -> None:
             write({**place, **row})
             for kind in LEAKS:
                 write({**place, **leaking(state, copy.deepcopy(then), kind, hours)})
-    told()
+    summarise()
 
 
-def told() -> None:
+def summarise() -> None:
     """Print the sums."""
     rows = rows_of_results()
     mine = [row for row in rows if row["kind"] == "healthy"]
@@ -253,13 +253,14 @@ def told() -> None:
     )
     for kind in LEAKS:
         mine = [row for row in rows if row["kind"] == kind]
-        seen = [row for row in mine if row["delay_s"]]
-        line = f"{kind} L/min: {len(seen)} of {len(mine)} raised an alarm"
-        if seen:
-            delays = sorted(float(row["delay_s"]) for row in seen)
-            shares = [float(row["stated_lpm"]) / float(row["true_lpm"]) for row in seen]
+        alarmed = [row for row in mine if row["delay_s"]]
+        line = f"{kind} L/min: {len(alarmed)} of {len(mine)} raised an alarm"
+        if alarmed:
+            delays = sorted(float(row["delay_s"]) for row in alarmed)
+            shares = [float(row["stated_lpm"]) / float(row["true_lpm"]) for row in alarmed]
             held = sum(
-                float(row["stated_low_lpm"]) <= float(row["true_lpm"]) <= float(row["stated_high_lpm"]) for row in seen
+                float(row["stated_low_lpm"]) <= float(row["true_lpm"]) <= float(row["stated_high_lpm"])
+                for row in alarmed
             )
             line += (
                 f", after {delays[0]:.0f} to {delays[-1]:.0f} s (median {np.median(delays):.0f} s), stated at "

@@ -22,7 +22,7 @@ from sealscope.campaigns.plans.reader import load_plan
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.simulation.simulate import simulate_with_truth
 
-PLANS = ("bench-detectors", "bench-strangers-development", "bench-closed-loop-development", "bench-load-development")
+PLANS = ("bench-detectors", "bench-unmodelled-development", "bench-closed-loop-development", "bench-load-development")
 
 
 @dataclass
@@ -43,8 +43,8 @@ def judged(plan_name: str, records: int, false_alarm: float, channels: str) -> d
     for case in interleaved(cases_of(plan))[:records]:
         simulated = simulate_with_truth(experiment_of(plan, case))
         kind, started = kinds[case.leak_lpm, case.fault], time.process_time()
-        seen = simulated.recording.only(channels.split(",")) if channels else simulated.recording
-        verdict = diagnose(seen, rig=plan.rig, false_alarm_probability=false_alarm, quick=True)
+        viewed = simulated.recording.only(channels.split(",")) if channels else simulated.recording
+        verdict = diagnose(viewed, rig=plan.rig, false_alarm_probability=false_alarm, quick=True)
         kind.seconds.append(time.process_time() - started)
         kind.verdicts.append(verdict.verdict)
         if verdict.bound_lpm is not None:

@@ -117,7 +117,7 @@ def press(load: str, rng: np.random.Generator) -> Day:
     )
 
 
-def another_day(machine: Day, rng: np.random.Generator) -> Day:
+def other_day(machine: Day, rng: np.random.Generator) -> Day:
     """Return the press on a day of its own."""
     return replace(
         machine,
@@ -165,7 +165,7 @@ def main() -> None:
                 rig = folder / "press.toml"
                 per_rev = machine.displacement * 2.0 * np.pi
                 rig.write_text(rig_text("press", machine.area, machine.rod_area, machine.stroke, per_rev))
-                days = [another_day(machine, rng) for _ in range(HEALTHY)]
+                days = [other_day(machine, rng) for _ in range(HEALTHY)]
                 healthy = [
                     ss.read(log(folder, f"healthy{k}", simulate(day, rng)), map="auto") for k, day in enumerate(days)
                 ]
@@ -174,7 +174,7 @@ def main() -> None:
                     verdicts["healthy"].append(ss.diagnose(recording, baseline=others, rig=str(rig)).verdict)
                     plain_false += regression(recording, others, per_rev)
                 for k in range(LEAKING):
-                    day, flow = leaking(another_day(machine, rng), asked.share, rng)
+                    day, flow = leaking(other_day(machine, rng), asked.share, rng)
                     recording = ss.read(log(folder, f"leak{k}", simulate(day, rng)), map="auto")
                     answer = ss.diagnose(recording, baseline=healthy[:6], rig=str(rig))
                     verdicts["leak"].append(answer.verdict)

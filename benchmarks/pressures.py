@@ -7,7 +7,7 @@
     python benchmarks/pressures.py response --machines 24 --seed 91 --leaks 0 0.0042 0.1 0.5
 
 Machines of the profile `bench`, 180 s at 500 Hz, the leak by either law in turn from 90 s on, or a fault; `--families`:
-of the development families of `strangers` in turn. By a provider a machine counts as found where the step of the
+of the development families of `unmodelled` in turn. By a provider a machine counts as found where the step of the
 conductance has a chance below `--false-alarm` (`sealscope.diagnosis.inference.onset`), by the detector where the
 verdict is `leak`; its other verdicts and causes are counted. The time is that of a core.
 """
@@ -84,7 +84,7 @@ def main() -> None:
         for number in range(given.machines):
             family = FAMILIES[number % len(FAMILIES)] if given.families else ""
             seed = 10_000 * given.seed + round(1e4 * lpm) * 100 + number
-            machine = draw("strangers" if family else "bench", seed, duration=SECONDS, family=family)
+            machine = draw("unmodelled" if family else "bench", seed, duration=SECONDS, family=family)
             leak = f"{lpm:g} L/min {('laminar', 'orifice')[number % 2]} from {ONSET:g} s" if lpm else ()
             fault = {"fault": f"{given.fault} from {ONSET:g} s"} if given.fault else {}
             run = machine.experiment(seed=seed + 5, leak=leak, **fault)
@@ -94,11 +94,11 @@ def main() -> None:
             spent.append(time.process_time() - begun)
             low, high = answers[-1].interval
             holds += bool(lpm) and low <= simulated.truth.mean_leak_lpm <= high
-        found = [answer for answer in answers if answer.leak]
-        dated = sum(abs(answer.onset - ONSET) <= SECONDS / BLOCKS for answer in found)
-        ratio = np.median([answer.flow / lpm for answer in found]) if lpm and found else np.nan
+        detected = [answer for answer in answers if answer.leak]
+        dated = sum(abs(answer.onset - ONSET) <= SECONDS / BLOCKS for answer in detected)
+        ratio = np.median([answer.flow / lpm for answer in detected]) if lpm and detected else np.nan
         print(
-            f"{lpm:g} L/min {given.fault}: {len(found)} of {given.machines} a leak; interval holds {holds}, dated "
+            f"{lpm:g} L/min {given.fault}: {len(detected)} of {given.machines} a leak; interval holds {holds}, dated "
             f"within a block {dated}; median of flow over truth {ratio:.2f}; {np.median(spent):.2f} s; "
             f"{dict(Counter(answer.words for answer in answers))}",
             flush=True,

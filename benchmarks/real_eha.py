@@ -69,16 +69,16 @@ def main() -> None:
             by = partial(ss.diagnose, baseline=others, rig=rig) if machine is None else machine.diagnose
             verdicts.append(by(judged, quick=True))
             plain += regression(judged, others, 1.6e-6) if options.plain else 0
-        found = [own for own in verdicts if own.verdict == "leak"]
-        sizes = [own.leak_lpm for own in found if own.leak_lpm is not None]
+        detected = [own for own in verdicts if own.verdict == "leak"]
+        sizes = [own.leak_lpm for own in detected if own.leak_lpm is not None]
         hold = sum(
-            own.leak_interval_lpm[0] <= lpm <= own.leak_interval_lpm[1] for own in found if own.leak_lpm is not None
+            own.leak_interval_lpm[0] <= lpm <= own.leak_interval_lpm[1] for own in detected if own.leak_lpm is not None
         )
         bounds = [own.bound_lpm for own in verdicts if own.bound_lpm is not None]
         size = f"{np.median(sizes):.3g}" if sizes else ""
         bound = f"{np.median(bounds):.2g}" if bounds else ""
         unsure = sum(own.verdict == "cannot tell" for own in verdicts)
-        line = f"| {lpm:g} | {len(found)} of {len(runs)} | {unsure} | {size} | {hold} of {len(sizes)} | {bound} |"
+        line = f"| {lpm:g} | {len(detected)} of {len(runs)} | {unsure} | {size} | {hold} of {len(sizes)} | {bound} |"
         print(line + (f" {plain} |" if options.plain else ""), flush=True)
 
 

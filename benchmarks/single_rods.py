@@ -88,8 +88,8 @@ def machine(family: str, number: int, seed: int) -> Machine:
     }
     numbers: dict[str, Any] = {}
     for name, value in factor.items():
-        room, field = name.split(".")
-        numbers[name] = getattr(getattr(rig, room), field) * value
+        part, field = name.split(".")
+        numbers[name] = getattr(getattr(rig, part), field) * value
     numbers["pump.G_pump"] = float(rig.pump.G_pump * pump / 16e-6 * random.uniform(0.3, 2.0))
     volts, rate = ((3, 2), (5, 2), (4, 1), (2, 1), (6, 3))[random.integers(5)]
     amplitude = volts * rig.motor.omega_per_volt * pump / (2.0 * np.pi) / (area * rate)

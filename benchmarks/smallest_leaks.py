@@ -37,15 +37,15 @@ LARGEST, HALVINGS = 8.0, 7
 def shown(machine: ss.CommissionedMachine, run: ss.Recording, largest: float) -> float:
     """Return the smallest leak [L/min] that a run shows, 0 where it needs none, inf where the largest does not do."""
 
-    def found(lpm: float) -> bool:
+    def detected(lpm: float) -> bool:
         return machine.diagnose(leaking(run, lpm) if lpm else run, quick=True).verdict == "leak"
 
     low, high = 0.0, largest
-    if found(low) or not found(high):
-        return 0.0 if found(low) else np.inf
+    if detected(low) or not detected(high):
+        return 0.0 if detected(low) else np.inf
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
-        low, high = (low, middle) if found(middle) else (middle, high)
+        low, high = (low, middle) if detected(middle) else (middle, high)
     return high
 
 
@@ -89,12 +89,12 @@ def main() -> None:
         counts = []
         for factor in FACTORS:
             leak = Leak("laminar", coefficient=factor * predicted.conductance, opening=From(0.5 * given.duration))
-            found = 0
+            detected = 0
             for seed in range(given.seeds):
                 experiment = replace(experiment_of(rig, duty, given.duration, 1000 + seed), leaks=(leak,))
                 recording = simulate_with_truth(experiment).recording
-                found += VolumeBalance(rig).examine(recording, [], 0.01).verdict == "leak"
-            counts.append(f"{found} of {given.seeds}")
+                detected += VolumeBalance(rig).examine(recording, [], 0.01).verdict == "leak"
+            counts.append(f"{detected} of {given.seeds}")
         size = predicted.conductance * predicted.pressure / LITRE_PER_MINUTE
         print(f"| {name}, {command} | {size:.2g} | " + " | ".join(counts) + " |", flush=True)
 

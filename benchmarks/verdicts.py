@@ -56,8 +56,8 @@ def diagnoses(folder: Path | None) -> Iterator[dict[str, Any]]:
     for case in chosen_cases():
         recording = recording_of(case, folder)
         for view, channels in VIEWS.items():
-            seen = recording if channels is None else recording.only(channels & set(recording.channels))
-            tree = ss.diagnose(seen, rig="thesis").as_dict()  # stated, so that L/min is compared
+            channels_of_view = recording if channels is None else recording.only(channels & set(recording.channels))
+            tree = ss.diagnose(channels_of_view, rig="thesis").as_dict()  # stated, so that L/min is compared
             del tree["quality"], tree["file"]
             yield {"tag": f"{case.id} {case.leak_lpm} L/min {case.fault} {view}", **tree}
 

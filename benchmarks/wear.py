@@ -11,8 +11,8 @@ a day it drifts as the bench does. The first 20 days are healthy, then the pisto
 (laminar, at the machine's own mean pressure difference). Recordings of 120 s at 500 Hz. Level of `all channels`: volume
 balance; of `pressures and command`: pressure response.
 
-`table` runs the trend on them, told that the last 1, 2, 5 or 20 healthy days were healthy (and shown no earlier one);
-the detector knows neither the machine, nor its temperature, nor when the wear begins. `--false-alarms N`: as many
+`table` runs the trend on them, knowing that the last 1, 2, 5 or 20 healthy days were healthy (and shown no earlier
+one); the detector knows neither the machine, nor its temperature, nor when the wear begins. `--false-alarms N`: as many
 machine-years of healthy days are drawn with the scatter and its correlation that the healthy days of these machines
 show, and go through the same test.
 """
@@ -43,7 +43,7 @@ from sealscope.units import LITRE_PER_MINUTE
 
 HEALTHY_DAYS, WORN_DAYS, SECONDS, YEARS = 20, 84, 120.0, 10.0
 WEAR = 0.002
-TOLD = (1, 2, 5, 20)
+HEALTHY_COUNTS = (1, 2, 5, 20)
 VIEWS = {"all channels": "volume balance", "pressures and command": "pressure response"}
 #: Temperature of the oil from day to day [K], what of it lasts, and what a kelvin changes.
 _KELVIN, _LASTS = 2.0, 0.7
@@ -109,8 +109,8 @@ def simulate(folder: Path, machines: int, pressures_of: int, seconds: float) -> 
             recording = recording_of(seed, day, float(warm[day]), worn * slope if worn else 0.0)
             with path.open("a", encoding="utf-8") as file:
                 for view in wanted:
-                    seen = recording if view == "all channels" else recording.only(("u", "p_A", "p_B"))
-                    own = reading_of(seen, rig)
+                    channels_of_view = recording if view == "all channels" else recording.only(("u", "p_A", "p_B"))
+                    own = reading_of(channels_of_view, rig)
                     row = {
                         "machine": seed,
                         "day": day,
@@ -158,15 +158,15 @@ def levels_of(days: Sequence[dict[str, Any]], basis: str) -> tuple[Levels, float
     return levels_at(t, value * unit, error * unit), unit
 
 
-def prior_of(basis: str, levels: Levels, told: int, unit: float) -> DayToDay:
+def prior_of(basis: str, levels: Levels, healthy_days: int, unit: float) -> DayToDay:
     """Return the prior as `sealscope trend` sets it."""
-    own = scatter_of(basis, float(np.mean(levels.value[:told])) / unit)  # type: ignore[arg-type]
+    own = scatter_of(basis, float(np.mean(levels.value[:healthy_days])) / unit)  # type: ignore[arg-type]
     return own._replace(scale=own.scale * unit)
 
 
-def first_alarm(levels: Levels, prior: DayToDay, told: int) -> float | None:
+def first_alarm(levels: Levels, prior: DayToDay, healthy_days: int) -> float | None:
     """Return the day of the first alarm when each day was the last one, None where there is none."""
-    alarm = search(levels, prior, told).alarm(YEARS * 365.25)
+    alarm = search(levels, prior, healthy_days).alarm(YEARS * 365.25)
     return None if alarm is None else float(levels.t[alarm])
 
 
@@ -179,11 +179,11 @@ def delays(folder: Path) -> None:
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for view, basis in VIEWS.items():
         machines = machines_of(folder, view)
-        for told in TOLD if machines else ():
+        for healthy_days in HEALTHY_COUNTS if machines else ():
             waits, early, silent = [], 0, 0
             for days in machines:
-                levels, unit = levels_of(days[HEALTHY_DAYS - told :], basis)
-                alarm = first_alarm(levels, prior_of(basis, levels, told, unit), told)
+                levels, unit = levels_of(days[HEALTHY_DAYS - healthy_days :], basis)
+                alarm = first_alarm(levels, prior_of(basis, levels, healthy_days, unit), healthy_days)
                 if alarm is None:
                     silent += 1
                 elif alarm < HEALTHY_DAYS:
@@ -195,7 +195,7 @@ def delays(folder: Path) -> None:
             shown = [f"{q:.0f}" if math.isfinite(q) else "never" for q in quantiles]
             flows = [f"{q * WEAR / MONTH:.4f}" if math.isfinite(q) else "never" for q in quantiles]
             print(
-                f"| {view} | {told} | {n} | {len(waits)} | {early} | {shown[0]} ({shown[1]} to {shown[2]}) | "
+                f"| {view} | {healthy_days} | {n} | {len(waits)} | {early} | {shown[0]} ({shown[1]} to {shown[2]}) | "
                 f"{flows[0]} ({flows[1]} to {flows[2]}) |"
             )
 
@@ -226,17 +226,17 @@ def false_alarms(folder: Path, years: int) -> None:
             continue
         # the correlation of a short series is low by about (1 + 3 lasts)/n
         lasts = min(max(lasts + (1.0 + 3.0 * lasts) / HEALTHY_DAYS, 0.0), 0.95)
-        for told in TOLD:
-            alarms, random = 0, np.random.default_rng(told)
+        for healthy_days in HEALTHY_COUNTS:
+            alarms, random = 0, np.random.default_rng(healthy_days)
             for year in range(years):
                 mean, scatter, error, unit = machines[year % len(machines)]
                 noise = random.standard_normal(365)
                 for k in range(1, noise.size):
                     noise[k] = lasts * noise[k - 1] + math.sqrt(1.0 - lasts**2) * noise[k]
                 levels = levels_at(np.arange(365.0), mean + scatter * noise, error)
-                prior = prior_of(basis, levels, told, unit)
+                prior = prior_of(basis, levels, healthy_days, unit)
                 few = levels.merged()
-                known = max(1, round(told * len(few) / len(levels)))
+                known = max(1, round(healthy_days * len(few) / len(levels)))
                 begin = 0
                 while begin < len(few) - 1:  # an alarm is looked into, and the series goes on
                     alarm = search(few.part(slice(begin, None)), prior, known).alarm(YEARS * 365.25)
@@ -246,7 +246,7 @@ def false_alarms(folder: Path, years: int) -> None:
             low, high = clopper_pearson(min(alarms, years), years)
             usual = np.median([own[1] / own[0] for own in machines])
             print(
-                f"| {view} | {told} | {years} | {alarms} | {10 * alarms / years:.2f} ({10 * low:.2f} to "
+                f"| {view} | {healthy_days} | {years} | {alarms} | {10 * alarms / years:.2f} ({10 * low:.2f} to "
                 f"{10 * high:.2f}) | {usual:.1%} | {lasts:.2f} |"
             )
 

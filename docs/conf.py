@@ -117,16 +117,16 @@ def types() -> list[str]:
     homes = _classes()
     shown = {name: getattr(sealscope, name) for name in sealscope.__all__}
     modules = {name for name, value in shown.items() if isinstance(value, ModuleType)}  # show their own classes
-    waiting, found = list(shown.values()), {}
+    waiting, linked = list(shown.values()), {}
     while waiting:
         for text in _docstrings(waiting.pop()):
             stated = re.findall(r"^[\w*, ]+ : (.*)|^(\w[\w ,.]*)$(?=\n {4}\S)", text, re.MULTILINE)
             names = set(re.findall(r"(?<![.\w])[A-Z]\w+", " ".join(map(" ".join, stated)))) & homes.keys()
-            for name in sorted(names - shown.keys() - found.keys()):
+            for name in sorted(names - shown.keys() - linked.keys()):
                 module, _, own = homes[name].rpartition(".")
-                found[name] = homes[name]
+                linked[name] = homes[name]
                 waiting.append(getattr(import_module(module), own))
-    return [found[name] for name in sorted(found) if found[name].split(".")[1] not in modules]
+    return [linked[name] for name in sorted(linked) if linked[name].split(".")[1] not in modules]
 
 
 napoleon_type_aliases = {name: f"~{home}" for name, home in _classes().items()}

@@ -60,7 +60,7 @@ def depth(folder: Path) -> int:
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: name_of(folder) or "sealscope")
 def test_a_folder_is_seen_at_a_glance(folder):
-    if folder == SOURCE:  # the rooms, whose order is import-linter's; ground modules belong to none
+    if folder == SOURCE:  # the packages, whose order is import-linter's; ground modules belong to none
         assert len({path.parent.name for path in folder.glob("*/*.py")}) <= MOST_ENTRIES
     else:
         assert len(entries(folder)) <= MOST_ENTRIES
@@ -72,15 +72,15 @@ def test_the_depth_of_a_folder_is_measured():
     assert "physics" in entries(SOURCE)
 
 
-def test_a_class_name_stands_in_one_room():
-    rooms: dict[str, set[str]] = {}
+def test_a_class_name_stands_in_one_package():
+    packages: dict[str, set[str]] = {}
     for path in FILES:
-        room = path.relative_to(SOURCE).parts[0]
+        package = path.relative_to(SOURCE).parts[0]
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ClassDef):
-                rooms.setdefault(node.name, set()).add(room)
-    assert len(rooms) > 100
-    assert {name: sorted(homes) for name, homes in rooms.items() if len(homes) > 1} == {}
+                packages.setdefault(node.name, set()).add(package)
+    assert len(packages) > 100
+    assert {name: sorted(homes) for name, homes in packages.items() if len(homes) > 1} == {}
 
 
 def test_nothing_is_called_utils():
@@ -91,13 +91,13 @@ def test_nothing_is_called_utils():
 def undocumented(path: Path) -> list[str]:
     """Public modules, classes and functions of a file without a docstring; methods answer for their class."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    found = [] if ast.get_docstring(tree) or not tree.body else [name_of(path)]
+    result = [] if ast.get_docstring(tree) or not tree.body else [name_of(path)]
     for node in tree.body:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) and not node.name.startswith("_"):
             overload = any("overload" in ast.unparse(one) for one in getattr(node, "decorator_list", []))
             if not ast.get_docstring(node) and not overload:
-                found.append(f"{name_of(path)}:{node.lineno} {node.name}")
-    return found
+                result.append(f"{name_of(path)}:{node.lineno} {node.name}")
+    return result
 
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)

@@ -4,7 +4,7 @@ import sys
 
 if __name__ == "__main__":
     if not sys.flags.safe_path:
-        del sys.path[0]  # the working folder, whose files may be a stranger's
+        del sys.path[0]  # the working folder, whose files may be hostile
     from sealscope.cli import main
 
     main()

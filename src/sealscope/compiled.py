@@ -2,8 +2,9 @@
 
 Plain ``cache=True`` keys a kernel by its own file only, so an edit to a law in another file leaves the kernel's
 old machine code valid and silently wrong. Here the cache directory is named by a hash over the sources of every
-room that holds compiled code, the versions of numba and Python and the processor, and lies in the user's cache folder
-(never in site-packages, which may be read-only). `SEALSCOPE_CACHE_DIR` moves it; an empty value turns caching off.
+package that holds compiled code, the versions of numba and Python and the processor, and lies in the user's cache
+folder (never in site-packages, which may be read-only). `SEALSCOPE_CACHE_DIR` moves it; an empty value turns caching
+off.
 
 Compiled code is unpickled, which can run any command: only folders of the user that nobody else can write are used. A
 file of the cache that is cut off or cannot be written is a cache miss.
@@ -39,19 +40,19 @@ from numba.core.registry import CPUDispatcher
 from numba.core.untyped_passes import RewriteSemanticConstants
 from numba.extending import intrinsic
 
-config._config_fname = ""  # numba's settings in the working folder may be a stranger's, and name a library to load
+config._config_fname = ""  # numba's settings in the working folder may be hostile, and name a library to load
 config.reload_config()
 _F = TypeVar("_F", bound=Callable[..., Any])
-_COMPILED_ROOMS = ("compiled.py", "physics", "signals", "control", "simulation", "diagnosis")
+_COMPILED_PACKAGES = ("compiled.py", "physics", "signals", "control", "simulation", "diagnosis")
 _KEPT_GENERATIONS = 4
 _log = logging.getLogger(__name__)
 
 
 def source_hash(root: Path) -> str:
-    """Hash of every source file, and of the numbers beside them, in the rooms under `root` with compiled functions."""
+    """Hash of every source file, and of the numbers beside them, in the compiled packages under `root`."""
     digest = hashlib.sha256()
-    for room in _COMPILED_ROOMS:
-        place = root / room
+    for package in _COMPILED_PACKAGES:
+        place = root / package
         files = (path for path in place.rglob("*") if path.suffix in (".py", ".toml"))
         for path in sorted(files) if place.is_dir() else [place]:
             digest.update(path.relative_to(root).as_posix().encode() + b"\0")

@@ -214,8 +214,8 @@ def check(dataset: str | Dataset, folder: str | os.PathLike[str]) -> FolderCheck
     >>> import sealscope as ss
     >>> from pathlib import Path
     >>> _ = Path("profile.txt").write_text("3\t100\t0\t130\t1\n")
-    >>> found = ss.datasets.check("zema-hydraulic", ".")
-    >>> list(found.wrong), "data.zip" in found.missing
+    >>> checked = ss.datasets.check("zema-hydraulic", ".")
+    >>> list(checked.wrong), "data.zip" in checked.missing
     (['profile.txt'], True)
     """
     checksums = named(dataset).checksums
@@ -285,16 +285,16 @@ def read(
     (2.0, 15000000.0)
     """
     chosen = named(dataset)
-    found = check(chosen, folder)
-    if check_files and found.wrong:
-        name, path = next(iter(found.wrong.items()))
+    checked = check(chosen, folder)
+    if check_files and checked.wrong:
+        name, path = next(iter(checked.wrong.items()))
         raise InputError(
             f"{name} of {chosen.name} must have the checksum {chosen.checksums[name]}, got another: download it anew "
             f"({path})"
         )
-    files = {**found.right, **found.wrong}
+    files = {**checked.right, **checked.wrong}
     if not check_files:
-        files = {**{path.name: path for path in found.unknown}, **files}
+        files = {**{path.name: path for path in checked.unknown}, **files}
     channels = dict(chosen.channel_map if map is None else map)
     recordings = _cycles if chosen.layout == "cycles" else _strokes
     return recordings(chosen, files, channels, Path(folder))

@@ -6,11 +6,11 @@ from sealscope.campaigns.cases.case import cases_of
 from sealscope.campaigns.cases.work import work
 
 
-def die_on_one(plan, case, keep=None):
+def die_on_one(plan, case, folder=None):
     """A task that kills its process on one case, for good."""
     if case.id == min(one.id for one in cases_of(plan)):
         os._exit(3)
-    return work(plan, case, keep)
+    return work(plan, case, folder)
 
 
 def die_on(deadly, item):

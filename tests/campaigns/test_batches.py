@@ -80,14 +80,14 @@ def test_without_noise_the_scores_are_those_of_the_recordings(plan_with):
         assert row.error is None
         assert row.scores["d3 of p_A fell @ side"] == scores["d3 of p_A fell @ side"] == (None, None)
         known = [name for name in SCORED if name != "d3 of p_A fell @ side"]
-        found = np.array([row.scores[name][0] for name in known])
+        result = np.array([row.scores[name][0] for name in known])
         # a fault's jump falls on the boundary of another block
         within = 1e-6 if case.fault else 1e-9
-        np.testing.assert_allclose(found, [scores[name][0] for name in known], rtol=0, atol=within)
+        np.testing.assert_allclose(result, [scores[name][0] for name in known], rtol=0, atol=within)
         assert row.flow_lpm == pytest.approx(truth.mean_leak_lpm, rel=1e-6)
         if not case.fault and case.levels["closed"] == "0 %":  # where both choose the same step, down to it
             by_itself = work(plan, case)
-            np.testing.assert_allclose(found, [by_itself.scores[name][0] for name in known], rtol=0, atol=1e-9)
+            np.testing.assert_allclose(result, [by_itself.scores[name][0] for name in known], rtol=0, atol=1e-9)
     assert np.ptp([row.scores["d3 of p_A fell"][0] for row in rows.values()]) > 0.01
 
 
@@ -119,18 +119,18 @@ def test_interrupted_it_goes_on_to_the_same_bytes(plan_with, monkeypatch, tmp_pa
         path.name: path.read_bytes() for path in write_result(simulated_result(plan, tmp_path / "once"), tmp_path)
     }
     monkeypatch.setattr(batches, "RUNS", 8)
-    told = []
+    reported = []
 
     def stop(done, total, failures):
-        told.append(done)
+        reported.append(done)
         if done == 11:  # in the middle of the second batch's rows
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         campaign.run(plan, tmp_path / "twice", batch=True, progress=stop)
     assert store.progress_of(plan, tmp_path / "twice").done == 11
-    assert campaign.run(plan, tmp_path / "twice", batch=True, progress=lambda done, *_: told.append(done)).complete
-    assert told[12:] == list(range(11, 27))
+    assert campaign.run(plan, tmp_path / "twice", batch=True, progress=lambda done, *_: reported.append(done)).complete
+    assert reported[12:] == list(range(11, 27))
     again = {
         path.name: path.read_bytes() for path in write_result(simulated_result(plan, tmp_path / "twice"), tmp_path)
     }
@@ -155,8 +155,8 @@ def test_a_case_that_fails_costs_no_other(plan_with):
     plan = plan_with([{"count": 5}, {"leak": "0.015 L/min", "count": 5}, {"leak": "30 L/min", "count": 2}])
     cases = [case for case in cases_of(plan) if case.use == "judge"]
     rows = rows_of(plan, cases)
-    sound = [case for case in cases if case.leak_lpm < 1]
-    assert rows_of(plan, sound) == {case.id: rows[case.id] for case in sound}
+    healthy = [case for case in cases if case.leak_lpm < 1]
+    assert rows_of(plan, healthy) == {case.id: rows[case.id] for case in healthy}
     for case in cases:
         assert (rows[case.id].error is None) == (case.leak_lpm < 1)
         if case.leak_lpm > 1:

@@ -16,7 +16,7 @@ from sealscope.campaigns.cases.bound import (
     information,
     leak_bound,
     noise_covariance,
-    smallest_found,
+    smallest_detectable,
 )
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
@@ -89,7 +89,7 @@ def test_unknown_parameters_can_only_raise_the_bound() -> None:
     assert all(after >= before for before, after in pairwise(bounds))
 
 
-def test_what_cannot_be_told_apart_is_refused() -> None:
+def test_what_cannot_be_separated_is_refused() -> None:
     slopes = np.stack([np.ones(10), 2.0 * np.ones(10)])[:, None, :]
     with pytest.raises(InputError, match="must be told apart"):
         cramer_rao(information(slopes, np.eye(1)))
@@ -102,23 +102,23 @@ def test_what_cannot_be_told_apart_is_refused() -> None:
 
 
 def test_noise_of_the_rig_holds_own_common_and_conversion(rig: Rig) -> None:
-    found = noise_covariance(rig)
-    assert np.sqrt(np.diag(found)) / PSI == pytest.approx([1.23, 1.50], abs=2e-3)  # the rig's d1, Appendix C
-    assert found[0, 1] == pytest.approx(rig.sensors.common_noise**2)
+    result = noise_covariance(rig)
+    assert np.sqrt(np.diag(result)) / PSI == pytest.approx([1.23, 1.50], abs=2e-3)  # the rig's d1, Appendix C
+    assert result[0, 1] == pytest.approx(rig.sensors.common_noise**2)
     with pytest.raises(InputError, match="pressure channels"):
         noise_covariance(rig, ("x",))
 
 
 def test_leak_derivative_is_a_slope(short: Experiment) -> None:
     """It foretells a run it was not made from, and better than in proportion as the leak shrinks."""
-    found = leak_sensitivity(short)
-    assert found.nonlinearity <= 0.02
+    result = leak_sensitivity(short)
+    assert result.nonlinearity <= 0.02
     none = clean_channels(short)
-    assert np.abs(found.slope).max() > 0
+    assert np.abs(result.slope).max() > 0
     misses = []
     for G in (4e-14, 2e-14):
         change = clean_channels(short, (Leak("laminar", coefficient=G),)) - none
-        misses.append(np.sqrt(np.mean((change - G * found.slope) ** 2)))
+        misses.append(np.sqrt(np.mean((change - G * result.slope) ** 2)))
         assert misses[-1] < 0.05 * np.sqrt(np.mean(change**2))
     assert misses[0] / misses[1] > 2.5  # 4 for a smooth rig; friction has corners
 
@@ -130,10 +130,10 @@ def test_leak_derivative_does_not_depend_on_the_solvers_step(short: Experiment) 
 
 
 def test_parameter_derivative_is_a_slope(short: Experiment) -> None:
-    found = parameter_sensitivity(short, "F_v")
+    result = parameter_sensitivity(short, "F_v")
     rig = short.rig.with_overrides({"F_v": short.rig.friction.F_v * 1.002})
     change = clean_channels(replace(short, rig=rig)) - clean_channels(short)
-    assert np.sqrt(np.mean((change - 0.002 * found.slope) ** 2)) < 0.05 * np.sqrt(np.mean(change**2))
+    assert np.sqrt(np.mean((change - 0.002 * result.slope) ** 2)) < 0.05 * np.sqrt(np.mean(change**2))
     for name in ("integrator", "F_l"):
         with pytest.raises(InputError, match="a number other than 0"):
             parameter_sensitivity(short, name)
@@ -148,30 +148,30 @@ def test_pump_leakage_and_piston_leakage_look_alike_without_throttles(short: Exp
 
 def test_bound_falls_with_time_and_rises_with_noise(rig: Rig) -> None:
     lengths = (math.pi * 8, math.pi * 16, math.pi * 32)
-    found = [leak_bound(run_of(rig, "3 sin(4t)", one), covariance=WHITE).known for one in lengths]
-    assert found[0] / found[1] == pytest.approx(math.sqrt(2.0), rel=0.02)
-    assert found[1] / found[2] == pytest.approx(math.sqrt(2.0), rel=0.02)
+    result = [leak_bound(run_of(rig, "3 sin(4t)", one), covariance=WHITE).known for one in lengths]
+    assert result[0] / result[1] == pytest.approx(math.sqrt(2.0), rel=0.02)
+    assert result[1] / result[2] == pytest.approx(math.sqrt(2.0), rel=0.02)
     louder = leak_bound(run_of(rig, "3 sin(4t)", lengths[0]), covariance=9.0 * WHITE).known
-    assert louder / found[0] == pytest.approx(3.0, rel=1e-9)
+    assert louder / result[0] == pytest.approx(3.0, rel=1e-9)
 
 
 @pytest.mark.parametrize("command", FIGURES)
 def test_published_figures_with_all_else_known(rig: Rig, command: str) -> None:
     x_0, figure = FIGURES[command]
     experiment = run_of(rig, command, 90.0, x_0)
-    found = leak_bound(experiment, covariance=WHITE)
-    assert in_lpm(found.known) == pytest.approx(figure, rel=0.15)
-    assert found.nonlinearity <= 0.02
+    result = leak_bound(experiment, covariance=WHITE)
+    assert in_lpm(result.known) == pytest.approx(figure, rel=0.15)
+    assert result.nonlinearity <= 0.02
 
 
 def test_unknown_friction_stiffness_and_gain_cost_a_known_share(rig: Rig) -> None:
     """Change between two 90 s halves: 0.00048 L/min where everything is found from each half, 1.5 times what it is
     with all else known."""
-    found = leak_bound(run_of(rig, "7 sin(4t)", 90.0), covariance=WHITE, unknown=UNKNOWN)
-    assert found.unknown is not None
-    assert found.unknown_parameters == UNKNOWN
-    assert math.sqrt(2.0) * in_lpm(found.unknown) == pytest.approx(0.0005, rel=0.15)
-    assert 1.2 < found.unknown / found.known < 2.0
+    result = leak_bound(run_of(rig, "7 sin(4t)", 90.0), covariance=WHITE, unknown=UNKNOWN)
+    assert result.unknown is not None
+    assert result.unknown_parameters == UNKNOWN
+    assert math.sqrt(2.0) * in_lpm(result.unknown) == pytest.approx(0.0005, rel=0.15)
+    assert 1.2 < result.unknown / result.known < 2.0
 
 
 def test_litres_a_minute_are_counted_at_a_stated_pressure() -> None:
@@ -180,8 +180,8 @@ def test_litres_a_minute_are_counted_at_a_stated_pressure() -> None:
 
 
 def test_best_test_finds_what_its_normal_law_says() -> None:
-    assert smallest_found(1.0, 0.01, 0.9) == pytest.approx(2.3263 + 1.2816, abs=1e-3)
-    assert smallest_found(2.0, 0.05, 0.5) == pytest.approx(2 * 1.6449, abs=1e-3)
+    assert smallest_detectable(1.0, 0.01, 0.9) == pytest.approx(2.3263 + 1.2816, abs=1e-3)
+    assert smallest_detectable(2.0, 0.05, 0.5) == pytest.approx(2 * 1.6449, abs=1e-3)
     for bad in (0.0, 1.0, -0.1, math.nan):
         with pytest.raises(InputError, match="between 0 and 1"):
-            smallest_found(1.0, bad)
+            smallest_detectable(1.0, bad)

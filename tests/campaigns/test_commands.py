@@ -106,7 +106,7 @@ def test_an_incomplete_campaign_says_so(call, tiny, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (("campaign", "run", "no-such-plan"), "no packaged plan"),
         (("campaign", "report", "TINY", "-o", "nowhere"), "must have rows to report on"),
@@ -115,9 +115,9 @@ def test_an_incomplete_campaign_says_so(call, tiny, tmp_path):
         (("campaign", "run", "appendix-c", "--batch"), "must simulate its records; run it without --batch"),
     ],
 )
-def test_wrong_calls_are_one_line(call, tiny, tmp_path, monkeypatch, words, told):
+def test_wrong_calls_are_one_line(call, tiny, tmp_path, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
     status, _, err = call(*(tiny if word == "TINY" else word for word in words))
     assert status in (1, 2)
-    assert told in err
+    assert message in err
     assert len(err.splitlines()) == 1

@@ -28,7 +28,7 @@ from sealscope.reporting.campaign.page import campaign_text, render_campaign_pag
 
 PLAN = """
 [campaign]
-name = "seen"
+name = "watched"
 duration = "40 s"
 onset = "20 s"
 rate = "500 Hz"
@@ -88,7 +88,7 @@ def plan(tmp_path, monkeypatch):
     plugins.plug_ins.cache_clear()
     plan_detector.cache_clear()
     examined.clear()
-    path = tmp_path / "seen.toml"
+    path = tmp_path / "watched.toml"
     path.write_text(PLAN, encoding="utf-8")
     return load_plan(path)
 
@@ -96,7 +96,7 @@ def plan(tmp_path, monkeypatch):
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """A folder for the finished campaign of this file's plan, and what its watcher saw: run by the first that asks."""
-    return {"folder": tmp_path_factory.mktemp("finished") / "seen", "examined": None}
+    return {"folder": tmp_path_factory.mktemp("finished") / "watched", "examined": None}
 
 
 @pytest.fixture
@@ -105,7 +105,7 @@ def done(plan, tmp_path, finished):
         assert campaign.run(plan, finished["folder"], jobs=1).failed == 0
         finished["examined"] = tuple(examined)
     examined[:] = finished["examined"]
-    return copytree(finished["folder"], tmp_path / "seen")
+    return copytree(finished["folder"], tmp_path / "watched")
 
 
 def test_every_detector_sees_its_channels_and_is_run_once(plan, done):
@@ -139,14 +139,16 @@ def test_rows_keep_what_was_stated_and_come_back_from_disk(plan, done):
 def test_the_fused_verdict_is_that_of_diagnose(plan, done):
     for row in read_rows(done).values():
         recording = read(done / "recordings" / f"{row.id}.nc")
-        seen = recording.only(name for name in recording.channels if name != "q_leak")
-        for key, one in (("diagnose", seen), ("diagnose @ pressures", seen.only(["u", "p_A", "p_B"]))):
-            found = diagnose(one, false_alarm_probability=plan.false_alarm, rig=plan.rig)
+        observed = recording.only(name for name in recording.channels if name != "q_leak")
+        for key, one in (("diagnose", observed), ("diagnose @ pressures", observed.only(["u", "p_A", "p_B"]))):
+            outcome = diagnose(one, false_alarm_probability=plan.false_alarm, rig=plan.rig)
             said = row.statements[key]
-            assert (said.verdict, said.cause, said.onset_s) == (found.verdict, found.cause, found.onset_s)
-            assert said.score == pytest.approx(found.score)
+            assert (said.verdict, said.cause, said.onset_s) == (outcome.verdict, outcome.cause, outcome.onset_s)
+            assert said.score == pytest.approx(outcome.score)
             if rank_of(said) is not None:
-                beyond = found.score / found.threshold if found.threshold > 0 else found.score - found.threshold
+                beyond = (
+                    outcome.score / outcome.threshold if outcome.threshold > 0 else outcome.score - outcome.threshold
+                )
                 assert row.scores[key][0] == pytest.approx(beyond)
 
 
@@ -203,21 +205,21 @@ def test_what_it_adds_up_to(plan, done):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         (('assume_set = { "pump.q_b" = 1e-7 }', ""), "rig that its detectors assume"),
         (("", ('pressures = ["u", "p_A", "p_B"]', 'pressures = ["p_A", "p_B"]')), "channels that its detectors see"),
         (("", ("false_alarm = 0.2", "false_alarm = 0.19")), "false-alarm probability"),
     ],
 )
-def test_rows_of_other_assumptions_are_not_mixed_in(plan, done, tmp_path, change, told):
+def test_rows_of_other_assumptions_are_not_mixed_in(plan, done, tmp_path, change, message):
     text = PLAN.replace("seed = 3", f"seed = 3\n{change[0]}")
     if change[1]:
         assert change[1][0] in text
         text = text.replace(*change[1])
-    (tmp_path / "seen.toml").write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match=told):
-        campaign.run(load_plan(tmp_path / "seen.toml"), done, jobs=1)
+    (tmp_path / "watched.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=message):
+        campaign.run(load_plan(tmp_path / "watched.toml"), done, jobs=1)
 
 
 def test_rows_of_an_older_form_are_refused(plan, done):
@@ -231,8 +233,8 @@ def test_rows_of_an_older_form_are_refused(plan, done):
 @pytest.mark.slow
 def test_detectors_may_assume_another_rig(plan, done, tmp_path):
     text = PLAN.replace("seed = 3", 'seed = 3\nassume_set = { "pump.q_b" = 1e-7 }').replace("count = 6", "count = 4")
-    (tmp_path / "seen.toml").write_text(text, encoding="utf-8")
-    other = load_plan(tmp_path / "seen.toml")
+    (tmp_path / "watched.toml").write_text(text, encoding="utf-8")
+    other = load_plan(tmp_path / "watched.toml")
     assert other.rig == plan.rig
     assert other.assumed.pump.q_b == 1e-7
     campaign.run(other, tmp_path / "other", jobs=1)
@@ -243,23 +245,23 @@ def test_detectors_may_assume_another_rig(plan, done, tmp_path):
 
 
 def test_what_names_stand_for(plan):
-    seen = plan_detector("watcher @ pressures")
-    assert (seen.of, seen.view, seen.scorer) == ("watcher", "pressures", None)
+    observed = plan_detector("watcher @ pressures")
+    assert (observed.of, observed.view, observed.scorer) == ("watcher", "pressures", None)
     assert plan_detector("rms change").scorer is None
     assert plan_detector("d3 of p_A fell @ pressures").needs_threshold
     assert not plan_detector("sign rule: d3 of p_A fell").needs_threshold
-    for name, told in (
+    for name, message in (
         ("watchr", "did you mean 'watcher'"),
         ("watcher, calibrated", "must be one of"),
         ("watcher, quick", "must be one of"),
         ("watcher @ nowhere", "must be one of"),
     ):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             check_detector(name, plan.views)
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "told"),
+    ("before", "after", "message"),
     [
         ('pressures = ["u"', 'pressures = ["q_leak"', "must not hold q_leak"),
         ('pressures = ["u"', 'pressures = ["v"', "must be a list of channels"),
@@ -271,20 +273,20 @@ def test_what_names_stand_for(plan):
         ('"watcher",', '"watcher", 3,', "campaign.detectors.1 must be"),
     ],
 )
-def test_what_breaks_a_rule_is_one_line(plan, tmp_path, before, after, told):
+def test_what_breaks_a_rule_is_one_line(plan, tmp_path, before, after, message):
     assert before in PLAN
-    (tmp_path / "seen.toml").write_text(PLAN.replace(before, after, 1), encoding="utf-8")
-    with pytest.raises(InputError, match=told) as error:
-        load_plan(tmp_path / "seen.toml")
-    assert "seen.toml" in str(error.value)
+    (tmp_path / "watched.toml").write_text(PLAN.replace(before, after, 1), encoding="utf-8")
+    with pytest.raises(InputError, match=message) as error:
+        load_plan(tmp_path / "watched.toml")
+    assert "watched.toml" in str(error.value)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.slow
 def test_channels_restrict_those_that_name_no_view(plan, tmp_path):
     text = PLAN.replace("seed = 3", 'seed = 3\nchannels = ["p_A", "p_B"]').replace("count = 6", "count = 4")
-    (tmp_path / "seen.toml").write_text(text, encoding="utf-8")
-    campaign.run(load_plan(tmp_path / "seen.toml"), tmp_path / "few", jobs=1)
+    (tmp_path / "watched.toml").write_text(text, encoding="utf-8")
+    campaign.run(load_plan(tmp_path / "watched.toml"), tmp_path / "few", jobs=1)
     assert set(examined) == {("p_A", "p_B"), ("u", "p_A", "p_B")}
 
 
@@ -307,16 +309,16 @@ def test_flows_onsets_and_causes_by_hand():
         row(9, "cannot tell", fault="air 1 %"),
         replace(row(10, "leak", fault="air 1 %"), error="it failed"),
     ]
-    found = judge(rows, ["watcher"], onset_s=90.0)
-    (onset,) = found.onsets
+    outcome = judge(rows, ["watcher"], onset_s=90.0)
+    (onset,) = outcome.onsets
     assert (onset.errors.n, onset.errors.median.value, onset.errors.median_size.value) == (2, -6.0, 2.0)
     assert (onset.errors.coverage.count, onset.errors.coverage.n) == (1, 2)
-    free, leaky = found.flows
+    free, leaky = outcome.flows
     assert (free.leak_lpm, free.errors.bias.value, free.errors.without, free.errors.coverage.value) == (0.0, 0.1, 1, 1)
     assert leaky.errors.bias.value == pytest.approx((0.5 - 0.1 - 0.7) / 3)
     assert (leaky.errors.without, leaky.errors.coverage.count, leaky.errors.coverage.n) == (1, 1, 2)
     assert (leaky.median.value, leaky.median_size.value) == pytest.approx((-0.1, 0.5))
-    (named,) = found.causes
+    (named,) = outcome.causes
     said = {
         (true, name): int(named.confusion.counts[i][j])
         for i, true in enumerate(named.confusion.rows)
@@ -329,7 +331,7 @@ def test_flows_onsets_and_causes_by_hand():
         ("friction change", "friction change"): 1, ("friction change", "piston leak"): 1,
         ("air in the oil", "cannot tell"): 2,
     }  # fmt: skip
-    assert not found.thresholds
+    assert not outcome.thresholds
 
 
 def test_every_fault_of_the_simulator_has_a_cause():

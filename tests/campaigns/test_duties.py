@@ -69,7 +69,7 @@ def test_the_controller_assumes_the_rig_as_designed_and_not_the_machine(tmp_path
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "told"),
+    ("before", "after", "message"),
     [
         ('"position 20 mm sin(2t)"', '"position 900 mm sin(2t)"', "factors.command: position must stay within"),
         ('"position 20 mm sin(2t)"', '"position 20 sin(2t)"', "factors.command: position must have its unit"),
@@ -81,11 +81,11 @@ def test_the_controller_assumes_the_rig_as_designed_and_not_the_machine(tmp_path
         ('rig = "thesis-closed-loop"', 'rig = "servo-valve"', ""),
     ],
 )  # fmt: skip
-def test_a_duty_that_no_run_can_have_is_refused_in_one_line(tmp_path, before, after, told):
+def test_a_duty_that_no_run_can_have_is_refused_in_one_line(tmp_path, before, after, message):
     text = PLAN.replace(before, after)
-    if not told:  # a controller that reads the pump's angle, on a rig without one
-        text, told = text.replace('"flatness"', '"fault-tolerant"'), "factors.controller: "
-    with pytest.raises(InputError, match=re.escape(told)) as error:
+    if not message:  # a controller that reads the pump's angle, on a rig without one
+        text, message = text.replace('"flatness"', '"fault-tolerant"'), "factors.controller: "
+    with pytest.raises(InputError, match=re.escape(message)) as error:
         plan_of(tmp_path, text)
     assert "plan.toml" in str(error.value)
     assert "\n" not in str(error.value)
@@ -142,7 +142,7 @@ def test_an_installed_controller_is_run(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", PROFILES)
-def test_each_family_is_either_for_development_or_held_back(name):
+def test_each_family_is_either_for_development_or_held_out(name):
     plans = [load_plan(each) for each in plan_names() if each.startswith(f"bench-{name}")]
     assert {plan.name for plan in plans if plan.part != "development"} == {f"bench-{name}"}
     families = [family for plan in plans for family in plan.factors["family"]]
@@ -174,7 +174,7 @@ def test_a_family_draws_its_loads_and_controllers():
 
 
 @pytest.mark.parametrize(
-    ("duty", "told"),
+    ("duty", "message"),
     [
         ('commands = ["3 sin(t)"]\ncontrollers = ["pi"]\nwhy = "x"\n', "a controller must have a target to follow"),
         ('commands = ["3 sin(t)"]\nloads = ["2"]\nwhy = "x"\n', "load must have its unit"),
@@ -182,10 +182,10 @@ def test_a_family_draws_its_loads_and_controllers():
         ('commands = ["position 5 mm sin(t)"]\namplitude = [0.9, 1.1]\nwhy = "x"\n', "has no amplitude to be drawn"),
     ],
 )
-def test_a_profiles_duty_is_refused_in_one_line(tmp_path, duty, told):
+def test_a_profiles_duty_is_refused_in_one_line(tmp_path, duty, message):
     path = tmp_path / "own.toml"
     path.write_text(f'[profile]\nname = "own"\ntitle = "own"\nextends = "bench"\n[duty]\n{duty}', encoding="utf-8")
-    with pytest.raises(InputError, match=re.escape(told)) as error:
+    with pytest.raises(InputError, match=re.escape(message)) as error:
         load_profile(path)
     assert "own.toml" in str(error.value)
 

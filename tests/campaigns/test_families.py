@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sealscope.campaigns.cases.bound import UNKNOWN, change_bound, in_lpm, leak_bound, smallest_found
+from sealscope.campaigns.cases.bound import UNKNOWN, change_bound, in_lpm, leak_bound, smallest_detectable
 from sealscope.campaigns.cases.case import cases_of
 from sealscope.campaigns.cases.machines import leak_of
 from sealscope.campaigns.cases.row import CaseRow
@@ -44,32 +44,32 @@ def findings():
 
 
 def test_each_family_is_counted_by_hand():
-    found = findings()
-    hoses = found["hoses", 0.0, ANY_LAW]
+    result = findings()
+    hoses = result["hoses", 0.0, ANY_LAW]
     assert (hoses.alarms.count, hoses.alarms.n, hoses.cannot_tell.count, hoses.failed) == (1, 3, 1, 1)
     assert hoses.allowed is None
-    assert found[ALL, 0.0, ANY_LAW].alarms.n == 4
-    both = found["hoses", 0.004, ANY_LAW]
+    assert result[ALL, 0.0, ANY_LAW].alarms.n == 4
+    both = result["hoses", 0.004, ANY_LAW]
     assert (both.alarms.count, both.alarms.n) == (1, 2)
     assert (both.coverage.count, both.coverage.n) == (1, 2)
-    assert found["hoses", 0.004, "laminar"].coverage.count == 1
-    assert found["mass", 0.004, "orifice"].coverage.n == 0
-    assert ("mass", 0.004, ANY_LAW) not in found  # it has one law
+    assert result["hoses", 0.004, "laminar"].coverage.count == 1
+    assert result["mass", 0.004, "orifice"].coverage.n == 0
+    assert ("mass", 0.004, ANY_LAW) not in result  # it has one law
 
 
 def test_only_leaks_that_the_bound_allows_count_against_it():
     """0.004 L/min is 4 s at s = 0.001, which the best test finds at 1 %, and 2 s at 0.002, which it does not."""
-    assert smallest_found(0.001, 0.01, 0.9) < 0.004 < smallest_found(0.002, 0.01, 0.9)
-    found = findings()
-    assert (found[ALL, 0.004, "orifice"].allowed.count, found[ALL, 0.004, "orifice"].allowed.n) == (0, 1)
-    assert (found[ALL, 0.004, ANY_LAW].allowed.count, found[ALL, 0.004, ANY_LAW].allowed.n) == (1, 2)
-    assert (found[ALL, 0.004, ANY_LAW].reachable.count, found[ALL, 0.004, ANY_LAW].reachable.n) == (2, 3)
+    assert smallest_detectable(0.001, 0.01, 0.9) < 0.004 < smallest_detectable(0.002, 0.01, 0.9)
+    result = findings()
+    assert (result[ALL, 0.004, "orifice"].allowed.count, result[ALL, 0.004, "orifice"].allowed.n) == (0, 1)
+    assert (result[ALL, 0.004, ANY_LAW].allowed.count, result[ALL, 0.004, ANY_LAW].allowed.n) == (1, 2)
+    assert (result[ALL, 0.004, ANY_LAW].reachable.count, result[ALL, 0.004, ANY_LAW].reachable.n) == (2, 3)
 
 
 def test_the_table_says_which_half_it_is():
-    tables = {table.name: table for table in tables_of(judge(ROWS, [NAME]), part="held back")}
+    tables = {table.name: table for table in tables_of(judge(ROWS, [NAME]), part="held out")}
     families = tables["families"]
-    assert {line[0] for line in families.rows} == {"held back"}
+    assert {line[0] for line in families.rows} == {"held out"}
     assert {line[1] for line in families.rows} == {ALL, "hoses", "mass"}
     assert all(len(line) == len(families.columns) for line in families.rows)
     assert "bound allows 90% detection: count" in families.columns
@@ -90,7 +90,7 @@ def test_rows_survive_being_stored():
 
 
 def test_a_mixture_is_half_of_each_law():
-    plan = load_plan("bench-strangers")
+    plan = load_plan("bench-unmodelled")
     case = next(case for case in cases_of(plan) if case.law == "mixture")
     leaks = leak_of(plan, case)
     assert [leak.law for leak in leaks] == ["laminar", "orifice"]
@@ -102,9 +102,9 @@ def test_a_change_is_bounded_by_both_sides_of_its_onset():
     seconds = 3.2
     experiment = Experiment.of(command="7 sin(4t)", duration=seconds)
     one = leak_bound(experiment, unknown=UNKNOWN).unknown
-    found = change_bound(experiment, seconds, seconds, 1e5)
-    assert found == pytest.approx(2**0.5 * in_lpm(one, 1e5), rel=1e-9)
-    assert change_bound(experiment, 4 * seconds, 4 * seconds, 1e5) == pytest.approx(found / 2, rel=1e-9)
+    result = change_bound(experiment, seconds, seconds, 1e5)
+    assert result == pytest.approx(2**0.5 * in_lpm(one, 1e5), rel=1e-9)
+    assert change_bound(experiment, 4 * seconds, 4 * seconds, 1e5) == pytest.approx(result / 2, rel=1e-9)
 
 
 def test_a_factor_of_families_needs_a_profile_with_them(tmp_path, text):
@@ -114,7 +114,7 @@ def test_a_factor_of_families_needs_a_profile_with_them(tmp_path, text):
         load_plan(path)
     path.write_text(
         text.replace("[factors]", '[factors]\nfamily = ["pipes"]').replace(
-            "seed = 3", 'seed = 3\nprofile = "strangers"'
+            "seed = 3", 'seed = 3\nprofile = "unmodelled"'
         ),
         encoding="utf-8",
     )

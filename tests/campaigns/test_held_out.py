@@ -210,9 +210,9 @@ def test_appendix_c_with_whole_tests_held_out(sheet_folder, tmp_path, monkeypatc
     assert float(rates[name]["detected: fraction"]) == pytest.approx(34 / 41)
     assert float(rates[name]["false alarms: fraction"]) == pytest.approx(4 / 41)
     assert {"always fire", "never fire"} <= set(rates)
-    told = capsys.readouterr().out
-    assert "0.955" in told
-    assert "chosen: d2 d3 d4" in told
+    message = capsys.readouterr().out
+    assert "0.955" in message
+    assert "chosen: d2 d3 d4" in message
     better = ("logistic on d2, d3, d4 of both chambers", "logistic, details and ridge chosen in the training tests")
     for other in better:
         assert float(areas[other]["low"]) > 0.955  # the whole interval lies over the plain baseline's figure
@@ -236,7 +236,7 @@ def test_without_the_sheet_it_says_what_it_needs(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("entry", "told"),
+    ("entry", "message"),
     [
         ('data = "other"', "held_out.data must be 'appendix-c'"),
         ('leave_out = "half"', "held_out.leave_out must be 'test'"),
@@ -251,7 +251,7 @@ def test_without_the_sheet_it_says_what_it_needs(tmp_path, monkeypatch):
         ('colour = "red"', "colour is not known"),
     ],
 )
-def test_a_wrong_plan_is_one_line(tmp_path, entry, told):
+def test_a_wrong_plan_is_one_line(tmp_path, entry, message):
     lines = {
         "data": 'data = "appendix-c"',
         "leave_out": 'leave_out = "test"',
@@ -268,5 +268,5 @@ def test_a_wrong_plan_is_one_line(tmp_path, entry, told):
     text = "\n".join(['[campaign]\nname = "mine"\n[held_out]', *table, "[[held_out.detectors]]", *detector])
     path = tmp_path / "mine.toml"
     path.write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=message):
         load_plan(path)

@@ -31,11 +31,11 @@ def row(number, score, use="judge", leak=0.0, fault="", command="3 sin(4t)"):
 def rows_of(seed, calibrate=199, free=400, leaky=200):
     """Leak-free scores uniform in 0..1; a leak of size 1 raises them by 0.3, one of 2 by 2."""
     random = np.random.default_rng(seed)
-    found = [row(k, random.random(), "calibrate") for k in range(calibrate)]
-    found += [row(10000 + k, random.random()) for k in range(free)]
-    found += [row(20000 + k, random.random() + 0.3, leak=1.0) for k in range(leaky)]
-    found += [row(30000 + k, random.random() + 2.0, leak=2.0) for k in range(leaky)]
-    return found
+    result = [row(k, random.random(), "calibrate") for k in range(calibrate)]
+    result += [row(10000 + k, random.random()) for k in range(free)]
+    result += [row(20000 + k, random.random() + 0.3, leak=1.0) for k in range(leaky)]
+    result += [row(30000 + k, random.random() + 2.0, leak=2.0) for k in range(leaky)]
+    return result
 
 
 def judged(rows, false_alarm=0.05, **options):
@@ -44,12 +44,12 @@ def judged(rows, false_alarm=0.05, **options):
 
 def test_the_table_counts_by_hand():
     rows = rows_of(1)
-    found = judged(rows, hours=0.05)
+    result = judged(rows, hours=0.05)
     ranked = sorted(one.scores[CHANGED][0] for one in rows if one.use == "calibrate")
     threshold = ranked[-10]  # 5 % of 200
     free = [one.scores[CHANGED][0] > threshold for one in rows if one.use == "judge" and one.leak_lpm == 0]
     small = [one.scores[CHANGED][0] > threshold for one in rows if one.leak_lpm == 1.0]
-    table = {(one.detector, one.leak_lpm): one for one in found.table}
+    table = {(one.detector, one.leak_lpm): one for one in result.table}
     first = table[CHANGED, 1.0]
     assert first.false_alarm.count == sum(free)
     assert first.detection.count == sum(small)
@@ -73,16 +73,16 @@ def test_the_false_alarm_rate_is_kept_on_fresh_records():
 
 def test_roc_and_area_know_the_closed_form():
     """Uniform scores moved by 0.3: area 1 - 0.7^2/2."""
-    found = judged(rows_of(3, free=1500, leaky=900))
-    area = next(one.area for one in found.rocs if one.detector == CHANGED and one.leak_lpm == 1.0)
+    result = judged(rows_of(3, free=1500, leaky=900))
+    area = next(one.area for one in result.rocs if one.detector == CHANGED and one.leak_lpm == 1.0)
     assert area.low < 1 - 0.7**2 / 2 < area.high
-    assert any(math.isnan(one.leak_lpm) for one in found.rocs)
+    assert any(math.isnan(one.leak_lpm) for one in result.rocs)
 
 
 def test_a_duty_without_leak_free_records_cannot_be_told():
     rows = [*rows_of(4), row(50000, 9.0, leak=3.0, command="5 sin(2t)"), row(50001, 9.0, leak=3.0)]
-    found = judged(rows)
-    last = next(one for one in found.table if (one.detector, one.leak_lpm) == (CHANGED, 3.0))
+    result = judged(rows)
+    last = next(one for one in result.table if (one.detector, one.leak_lpm) == (CHANGED, 3.0))
     assert (last.detection.count, last.cannot_tell.count, last.n) == (1, 1, 2)
     with pytest.raises(InputError, match="must be at least 999 of a duty, got at most 199"):
         judged(rows, false_alarm=0.001)
@@ -95,18 +95,18 @@ def test_duties_have_thresholds_of_their_own():
     rows += [row(10000 + k, random.random()) for k in range(100)]
     rows += [row(11000 + k, 10 + random.random(), command="5 sin(2t)") for k in range(100)]
     rows += [row(12000, 5.0, leak=1.0), row(12001, 5.0, leak=1.0, command="5 sin(2t)")]
-    found = judged(rows)
-    assert {duty for _, duty in found.thresholds} == {"3 sin(4t)", "5 sin(2t)"}
-    table = next(one for one in found.table if one.detector == CHANGED)
+    result = judged(rows)
+    assert {duty for _, duty in result.thresholds} == {"3 sin(4t)", "5 sin(2t)"}
+    table = next(one for one in result.table if one.detector == CHANGED)
     assert table.detection.count == 1  # the same score is high at the one point and low at the other
     assert table.false_alarm.value == pytest.approx(0.05, abs=0.05)
 
 
 def test_other_faults_are_not_leaks():
     rows = [*rows_of(6), *(row(60000 + k, 9.0, fault="air in the oil") for k in range(4))]
-    found = judged(rows)
-    assert next(one for one in found.table if one.detector == CHANGED).false_alarm.n == 400
-    alarms = {one.detector: (one.fault, one.alarms.count, one.alarms.n) for one in found.faults}
+    result = judged(rows)
+    assert next(one for one in result.table if one.detector == CHANGED).false_alarm.n == 400
+    alarms = {one.detector: (one.fault, one.alarms.count, one.alarms.n) for one in result.faults}
     assert alarms[CHANGED] == alarms["always fire"] == ("air in the oil", 4, 4)
     assert alarms["never fire"] == ("air in the oil", 0, 4)
 

@@ -26,12 +26,12 @@ detectors = ["d3 of p_A changed", "sign rule: d3 of p_A fell"]
 rate = "500 Hz"
 
 [[recordings.sets]]
-files = "sound-*.csv"
+files = "healthy-*.csv"
 use = "calibrate"
 end = 11
 
 [[recordings.sets]]
-files = "sound-*.csv"
+files = "healthy-*.csv"
 first = 11
 
 [[recordings.sets]]
@@ -42,10 +42,10 @@ size = 0.3
 
 @pytest.fixture
 def folder(tmp_path):
-    """Twelve sound recordings and two leaky ones of one machine."""
+    """Twelve healthy recordings and two leaky ones of one machine."""
     for seed in range(1, 13):
         made = simulate_with_truth(Experiment.of(command="3 sin(4t)", duration=8.0, seed=seed)).recording
-        write(made, tmp_path / f"sound-{seed}.csv")
+        write(made, tmp_path / f"healthy-{seed}.csv")
     for seed in range(2):
         leak = simulate_with_truth(
             Experiment.of(command="3 sin(4t)", duration=8.0, seed=50 + seed, leak="0.3 L/min from 4 s")
@@ -74,7 +74,7 @@ def test_recordings_are_calibrated_and_judged(folder):
 
 
 def test_numbers_in_names_count_as_numbers(folder):
-    """`sound-10` comes after `sound-9`: the first ten are those numbered 1 to 10."""
+    """`healthy-10` comes after `healthy-9`: the first ten are those numbered 1 to 10."""
     rows = recorded_rows(plan_of(folder), folder)
     judged = recorded_rows(plan_of(folder, PLAN.replace("first = 11", "first = 12")), folder)
     assert sum(row.use == "calibrate" for row in rows) == 10
@@ -91,7 +91,7 @@ def test_a_file_that_cannot_be_judged_is_a_row_with_its_error(folder):
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "told"),
+    ("before", "after", "message"),
     [
         ('files = "leaky-*.csv"', 'files = "../*.csv"', "files must be a pattern within the folder"),
         ("size = 0.3", "size = -1.0", "recordings.sets[3].size must be greater than or equal to 0"),
@@ -100,9 +100,9 @@ def test_a_file_that_cannot_be_judged_is_a_row_with_its_error(folder):
         ("size = 0.3", "colour = 1", "colour is not known"),
     ],
 )
-def test_a_wrong_plan_is_one_line(tmp_path, before, after, told):
+def test_a_wrong_plan_is_one_line(tmp_path, before, after, message):
     assert before in PLAN
-    with pytest.raises(InputError, match=re.escape(told)):
+    with pytest.raises(InputError, match=re.escape(message)):
         plan_of(tmp_path, PLAN.replace(before, after))
 
 
@@ -126,7 +126,7 @@ def test_data_that_are_not_there_are_named(tmp_path):
 
 
 def test_rotary_strokes(real_folder):
-    """Levels of d3 lie high where the seal is defective; ten sound strokes raise one alarm at 10 %."""
+    """Levels of d3 lie high where the seal is defective; ten healthy strokes raise one alarm at 10 %."""
     result = recorded_result(load_plan("rotary-seal"), real_folder / "vtnsi_actuator")
     assert (result.judgement.leak_free, result.judgement.judged, len(result.judgement.failed)) == (20, 40, 0)
     assert {duty for _, duty in result.judgement.thresholds} == {"in", "out"}  # the two directions

@@ -30,9 +30,9 @@ DRAWN = {
     "bench-quick": "5e2c6ad77f0da6f0",
     "bench-single-rod": "7ed0e63b533648d9",
     "bench-single-rod-development": "fad6b4d692c86f36",
-    "bench-strangers": "f4613fe47fdbe6c2",
-    "bench-strangers-development": "778e5fc7b49f54f0",
     "bench-thesis": "e034193cb0b6574f",
+    "bench-unmodelled": "f4613fe47fdbe6c2",
+    "bench-unmodelled-development": "778e5fc7b49f54f0",
     "bench-valve": "c2065dbf8536fac1",
     "bench-volume": "afca12e9d27e4824",
     "duty-pump": "b9abb89ca1d56dd8",
@@ -55,7 +55,7 @@ def test_a_plan_is_read_with_its_units(tiny):
 
 def test_a_bound_is_asked_for_all_sizes_of_leaks_or_for_those_of_a_group():
     assert load_plan("bench-load").bounded == {0.0042}
-    assert load_plan("bench-strangers").bounded == {0.0005, 0.0042, 0.1, 0.5}
+    assert load_plan("bench-unmodelled").bounded == {0.0005, 0.0042, 0.1, 0.5}
     assert not load_plan("bench-volume").bounded
 
 
@@ -71,7 +71,7 @@ def test_kinds_of_records_take_turns(tiny):
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "told"),
+    ("before", "after", "message"),
     [
         ('name = "tiny"', 'name = "../tiny"', "name must be of at most 80 letters"),
         ('duration = "6 s"', 'duration = "6 V"', "duration"),
@@ -100,9 +100,9 @@ def test_kinds_of_records_take_turns(tiny):
         ("seed = 3", 'seed = 3\nkeep_recordings = "yes"', "campaign.keep_recordings must be a valid boolean"),
     ],
 )
-def test_what_breaks_a_rule_is_one_line_with_the_place(tmp_path, text, before, after, told):
+def test_what_breaks_a_rule_is_one_line_with_the_place(tmp_path, text, before, after, message):
     assert before in text
-    with pytest.raises(InputError, match=re.escape(told)) as error:
+    with pytest.raises(InputError, match=re.escape(message)) as error:
         plan_of(tmp_path, text.replace(before, after, 1))
     assert "plan.toml" in str(error.value)
     assert "\n" not in str(error.value)
@@ -173,7 +173,7 @@ def test_names_and_seeds_are_the_same_in_another_process(tiny):
         "from sealscope.campaigns.cases.case import cases_of\n"
         "print([(c.id, c.machine_seed, c.noise_seed) for c in cases_of(load_plan(sys.argv[1]))])"
     )
-    found = subprocess.run([sys.executable, "-c", code, str(tiny)], capture_output=True, text=True, check=True)
+    result = subprocess.run([sys.executable, "-c", code, str(tiny)], capture_output=True, text=True, check=True)
     plan = load_plan(tiny)
     assert isinstance(plan, SimulatedPlan)
-    assert found.stdout.strip() == str([(c.id, c.machine_seed, c.noise_seed) for c in cases_of(plan)])
+    assert result.stdout.strip() == str([(c.id, c.machine_seed, c.noise_seed) for c in cases_of(plan)])

@@ -80,9 +80,9 @@ def test_killed_twice_it_goes_on_to_the_same_bytes(once, tiny, tmp_path):
             file.write(b'{"id": "0123", "sco')
     before = store.progress_of(plan, folder)
     assert 12 <= before.done < 26
-    told = []
-    assert campaign.run(plan, folder, jobs=2, progress=lambda *words: told.append(words)).complete
-    assert told[0] == (before.done, 26, 0)
+    reported = []
+    assert campaign.run(plan, folder, jobs=2, progress=lambda *words: reported.append(words)).complete
+    assert reported[0] == (before.done, 26, 0)
     assert files_of(plan, folder) == expected
     ids = [json.loads(line)["id"] for line in (folder / store.ROWS).read_bytes().splitlines()]
     assert len(ids) == len(set(ids)) == 26
@@ -94,15 +94,15 @@ def test_no_process_outlives_a_killed_campaign(tiny, tmp_path):
     wait_for_rows(tmp_path / "killed", 3, process)
 
     def children():
-        found = []
+        outcome = []
         for stat in Path("/proc").glob("[0-9]*/stat"):
             try:
                 words = stat.read_text().rpartition(")")[2].split()
             except OSError:
                 continue
             if words[1] == str(process.pid) and words[0] != "Z":
-                found.append(int(stat.parent.name))
-        return found
+                outcome.append(int(stat.parent.name))
+        return outcome
 
     workers = children()
     assert len(workers) >= 2
@@ -158,11 +158,11 @@ def doomed(case):
     return case.use == "judge" and int(case.id, 16) % 3 == 0
 
 
-def break_some(plan, case, keep=None):
+def break_some(plan, case, folder=None):
     """A task that fails on a third of the records to judge."""
     if doomed(case):
         return CaseRow.of(case, error=str(SimulationFailed("the run diverged")))
-    return work(plan, case, keep)
+    return work(plan, case, folder)
 
 
 def test_a_failed_case_is_a_row_with_its_error(tiny, tmp_path):
@@ -175,10 +175,10 @@ def test_a_failed_case_is_a_row_with_its_error(tiny, tmp_path):
     assert again.failed == bad
     result = simulated_result(plan, tmp_path / "bad")
     assert {row.error for row in result.judgement.failed} == {"the run diverged"}
-    found = [row for row in result.judgement.table if row.detector == "d3 of p_A changed"]
-    assert [row.n for row in found] == [5, 5]  # a failed record stays in the count, as one that cannot be told
+    outcome = [row for row in result.judgement.table if row.detector == "d3 of p_A changed"]
+    assert [row.n for row in outcome] == [5, 5]  # a failed record stays in the count, as one that cannot be told
     leaky_bad = sum(row.leak_lpm > 0 for row in result.judgement.failed)
-    assert sum(row.cannot_tell.count for row in found) == leaky_bad
+    assert sum(row.cannot_tell.count for row in outcome) == leaky_bad
     assert campaign.run(plan, tmp_path / "bad", jobs=1, retry=True).failed == 0
 
 
@@ -218,10 +218,10 @@ def test_the_code_key_covers_every_source_that_a_case_runs(tiny):
         "print(sorted(loaded - covered)); print(len(loaded) > 60)"
     )
     environment = {**os.environ, "PYTHONPATH": str(SOURCES)}
-    found = subprocess.run(
+    outcome = subprocess.run(
         [sys.executable, "-c", code, str(tiny)], env=environment, capture_output=True, text=True, check=True
     )
-    assert found.stdout.splitlines() == ["[]", "True"]
+    assert outcome.stdout.splitlines() == ["[]", "True"]
 
 
 def test_rows_of_another_campaign_are_not_mixed_in(tiny, text, tmp_path):
@@ -238,9 +238,9 @@ def test_more_records_and_detectors_are_added_to_what_is_there(tiny, text, tmp_p
     campaign.run(load_plan(tiny), folder, jobs=1)
     more = tmp_path / "more.toml"
     more.write_text(text.replace("count = 6", "count = 8"), encoding="utf-8")
-    told = []
-    campaign.run(load_plan(more), folder, jobs=1, progress=lambda *words: told.append(words))
-    assert told[0] == (26, 28, 0)
+    reported = []
+    campaign.run(load_plan(more), folder, jobs=1, progress=lambda *words: reported.append(words))
+    assert reported[0] == (26, 28, 0)
     more.write_text(text.replace('"d3 of p_A changed"', '"d4 of p_A changed"'), encoding="utf-8")
     assert store.progress_of(load_plan(more), folder).done == 0
     campaign.run(load_plan(more), folder, jobs=1)

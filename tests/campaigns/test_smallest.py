@@ -32,17 +32,17 @@ def minute(rig: Rig) -> Findable:
 
 def test_what_is_planned_is_found(rig: Rig, minute: Findable) -> None:
     """1.3 times the size is found in most recordings made afresh, and a third of it in none."""
-    found = []
+    result = []
     for factor in (1.3, 1.0 / 3.0):
         leak = Leak("laminar", coefficient=factor * minute.conductance, opening=From(30.0))
         runs = [replace(experiment_of(rig, DUTY, 60.0, seed), leaks=(leak,)) for seed in range(10, 14)]
         records = [simulate_with_truth(run).recording for run in runs]
-        found.append(sum(VolumeBalance(rig).examine(own, [], 0.01).verdict == "leak" for own in records))
-    assert found[0] >= 3 and found[1] == 0
+        result.append(sum(VolumeBalance(rig).examine(own, [], 0.01).verdict == "leak" for own in records))
+    assert result[0] >= 3 and result[1] == 0
 
 
-def test_what_is_told_from_the_pump_is_no_smaller_than_what_is_found(rig: Rig, minute: Findable) -> None:
-    assert minute.conductance <= minute.told_apart
+def test_what_is_separable_from_the_pump_is_no_smaller_than_what_is_found(rig: Rig, minute: Findable) -> None:
+    assert minute.conductance <= minute.separable
     rarer, surer = (findable(rig, DUTY, 20.0, **of) for of in ({"false_alarm": 1e-3}, {"detection": 0.99}))
     usual = findable(rig, DUTY, 20.0)
     assert minute.conductance < usual.conductance < min(rarer.conductance, surer.conductance)
@@ -73,7 +73,7 @@ def test_a_leak_that_no_recording_finds_is_said_so(monkeypatch: pytest.MonkeyPat
 def test_without_a_term_of_the_pump_nothing_tells_it_apart() -> None:
     own = Findable(DUTY, 60.0, 1e-14, np.inf, 1e5)
     text = RecordingPlan("bench", None, own, own, (own,), 1e5, 0.01, 0.9).text()
-    assert "told from a leak of the pump: no" in text and "6e-05 L/min" in text.splitlines()[0]
+    assert "separated from a leak of the pump: no" in text and "6e-05 L/min" in text.splitlines()[0]
 
 
 def test_what_is_no_command_is_refused(rig: Rig) -> None:

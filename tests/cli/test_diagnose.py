@@ -44,7 +44,7 @@ FOREIGN = ("--map", "p_A=PG_1", "--map", "p_B=PG_2", "--rate", "1000")
 REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "real" / "vtnsi_actuator"
 
 
-def keep_contract(result):
+def check_contract(result):
     """Every key with its type, in the stated order; verdicts among the stated three."""
     assert list(result) == list(KEYS)
     for key, kind in KEYS.items():
@@ -71,7 +71,7 @@ def test_jsonl_is_one_object_a_line_and_nothing_else(call, recordings):
     assert (done.status, done.err) == (0, "")
     leak, healthy = done.objects
     for result, file in ((leak, files[0]), (healthy, files[1])):
-        keep_contract(result)
+        check_contract(result)
         assert result["file"] == str(file)
         assert result["false_alarm_probability"] == 0.01
     assert leak["verdict"] == "leak"
@@ -134,7 +134,7 @@ def test_baselines_after_one_flag_or_one_flag_each(call, recordings):
     assert item.status == 0
     assert item == each == first
     (result,) = item.objects
-    keep_contract(result)
+    check_contract(result)
     assert "3 comparable leak-free recordings" in said(result, "rms change")
 
 
@@ -236,7 +236,7 @@ def test_foreign_logs_with_a_map_and_a_rate(call, strokes, tmp_path):
     verdicts = [item["verdict"] for item in done.objects]
     assert verdicts[:4] == ["leak"] * 4 and "leak" not in verdicts[4:]
     for item, count in zip(done.objects, [20] * 4 + [19] * 4, strict=True):
-        keep_contract(item)
+        check_contract(item)
         assert f"{count} comparable leak-free recordings" in item["reason"]  # of both directions
 
 
@@ -272,7 +272,7 @@ def test_every_real_stroke_gets_a_verdict(call, every):
     assert len(own.objects) == 15
     assert Counter(item["verdict"] for item in own.objects)["leak"] <= 1
     for item in done.objects + own.objects:
-        keep_contract(item)
+        check_contract(item)
     counts = {said(item, "rms change").split("comparable")[0].split()[-1] for item in own.objects}
     assert counts == {"15"}
 
@@ -322,9 +322,9 @@ def test_scripts_may_fail_on_a_verdict(call, recordings):
     assert call("diagnose", files[1], "--quiet", "--fail-on", "leak").status == 0
     assert call("diagnose", files[1], "--quiet", "--fail-on", "leak", "--fail-on", "no leak").status == 3
     words = ("--quiet", "--rig", "thesis", "--limit", "0.1 mL/min", "--fail-on")
-    for level in ("follow", "plan", "repair"):  # over the limit: as bad as each or worse
+    for level in ("monitor", "plan", "repair"):  # over the limit: as bad as each or worse
         assert call("diagnose", files[0], *words, level).status == 3
-    assert call("diagnose", files[1], *words, "follow").status == 0
+    assert call("diagnose", files[1], *words, "monitor").status == 0
     assert (
         call("diagnose", files[0], "--quiet", "--rig", "thesis", "--limit", "1 L/min", "--fail-on", "plan").status == 0
     )

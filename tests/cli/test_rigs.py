@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from sealscope.parameters import load_rig, rig_names
-from sealscope.physics.rest import initial_state
 from sealscope.physics.rig import rig_numbers
 from sealscope.physics.solvers.limits import longest_step
+from sealscope.physics.standstill import initial_state
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.integrate import LONGEST_STEP, trajectory
 

@@ -78,12 +78,12 @@ def test_a_leak_that_opens_at_once_is_followed_within_three_blocks_and_an_outlie
     G = np.repeat([0.0, 2.6e-12], 5000)
     theta = np.cumsum(G * 3e6) / rate / balance.D
     theta[2500:2600] += 1.0  # a slip of the encoder across the end of a block
-    seen = []
+    observed = []
     for angle in theta:
         observer.update(angle, 0.0, 4e6, 1e6)
-        seen.append(observer.G)
-    assert np.abs(seen[:5000]).max() < 1e-14
-    assert seen[5000 + 3 * 250] == pytest.approx(2.6e-12, rel=0.1)
+        observed.append(observer.G)
+    assert np.abs(observed[:5000]).max() < 1e-14
+    assert observed[5000 + 3 * 250] == pytest.approx(2.6e-12, rel=0.1)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ PI = PositionPI.of(RIG)
 
 @pytest.mark.parametrize(("share", "grows"), [(0.9, False), (1.1, True)])
 def test_the_gain_margin_is_where_the_loop_begins_to_swing(share, grows):
-    """At rest, by an encoder of fine counts; the speed stays within the linear part of the friction."""
+    """At standstill, by an encoder of fine counts; the speed stays within the linear part of the friction."""
     factor = share * margins(RIG, PI).gain
     louder = replace(PI, k_v=factor * PI.k_v, k_i=factor * PI.k_i, dead_band=0.0)
     experiment = Experiment.of(

@@ -56,7 +56,7 @@ def leaky(records: Records) -> Recording:
 
 
 @pytest.fixture(scope="session")
-def sound(records: Records) -> Recording:
+def healthy(records: Records) -> Recording:
     """120 s without a leak, throttles half closed."""
     return records(2, duration=120.0, throttled=True)
 

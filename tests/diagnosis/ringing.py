@@ -15,7 +15,7 @@ RATE, PLATEAU, CHARGE = 500.0, 1e5, 3e5
 
 
 class Ring(NamedTuple):
-    """Frequency [Hz], damping at rest's end and its step at mid-record [1/s], amplitude and noise [Pa], command."""
+    """Frequency [Hz], damping at the start, its step at mid-record [1/s], amplitude and noise [Pa], command."""
 
     frequency: float
     damping: float

@@ -43,31 +43,31 @@ def flow(recording: Recording, share: float = 1.0) -> float:
 
 def test_a_machine_five_times_as_large_gives_the_same_recording_and_no_flow(foreign: Recording) -> None:
     """Displacement, area and leak five times as large: 0.021 L/min was stated as 0.0043."""
-    found = diagnose(foreign)
-    assert found.verdict == "leak"
-    assert found.leak_lpm is found.leak_interval_lpm is None
-    assert found.refuses == {"leak_lpm"}
-    assert "state --rig, or the piston's --area" in str(how_much(found))
-    assert found.measured_ratio == (pytest.approx(1.0, abs=0.01), pytest.approx((1.0, 1.0), abs=0.02))
+    result = diagnose(foreign)
+    assert result.verdict == "leak"
+    assert result.leak_lpm is result.leak_interval_lpm is None
+    assert result.refuses == {"leak_lpm"}
+    assert "state --rig, or the piston's --area" in str(how_much(result))
+    assert result.measured_ratio == (pytest.approx(1.0, abs=0.01), pytest.approx((1.0, 1.0), abs=0.02))
     small = diagnose(foreign, rig=stated(area=f"{AREA} m^2"))
     large = diagnose(foreign, rig=stated(area=f"{5 * AREA} m^2"))
     assert small.leak_lpm == pytest.approx(flow(foreign), rel=0.05)
     assert large.leak_lpm == pytest.approx(5.0 * small.leak_lpm, rel=1e-6)
     for other in (small, large):
         assert other.refuses == frozenset()
-        assert found.severity is not None and other.severity is not None
-        assert other.severity.pump_share == pytest.approx(found.severity.pump_share)
-        assert other.severity.creep_mm_per_min == pytest.approx(found.severity.creep_mm_per_min)
+        assert result.severity is not None and other.severity is not None
+        assert other.severity.pump_share == pytest.approx(result.severity.pump_share)
+        assert other.severity.creep_mm_per_min == pytest.approx(result.severity.creep_mm_per_min)
         assert "as stated" in str(rests_on(other)) and "as stated" in " ".join(short_text(other).split())
 
 
 def test_pump_share_and_creep_are_those_of_the_machine(foreign: Recording) -> None:
-    found = diagnose(foreign).severity
-    assert found is not None and found.pump_share is not None and found.creep_mm_per_min is not None
-    assert found.mL_per_min is None
+    result = diagnose(foreign).severity
+    assert result is not None and result.pump_share is not None and result.creep_mm_per_min is not None
+    assert result.mL_per_min is None
     pump = 4.9e-6 / (2.0 * np.pi) * 12.0 * 2.0 / np.pi * LPM  # mean of the size of 12 sin(4 t) rad/s
-    assert found.pump_share[0] == pytest.approx(flow(foreign) / pump, rel=0.05)
-    assert found.creep_mm_per_min[0] == pytest.approx(flow(foreign) / LPM / AREA * 6.0e4, rel=0.05)
+    assert result.pump_share[0] == pytest.approx(flow(foreign) / pump, rel=0.05)
+    assert result.creep_mm_per_min[0] == pytest.approx(flow(foreign) / LPM / AREA * 6.0e4, rel=0.05)
 
 
 @pytest.mark.parametrize("ratio", [0.5, pytest.param(1.4, marks=pytest.mark.slow)])
@@ -116,13 +116,13 @@ def test_who_states_the_machine() -> None:
 
 
 def test_no_leak_passes_a_share_of_the_pumps_flow() -> None:
-    found = diagnose(machine(1))
-    assert found.verdict == "no leak"
-    assert found.passage is not None and found.passage.lpm is None
+    result = diagnose(machine(1))
+    assert result.verdict == "no leak"
+    assert result.passage is not None and result.passage.lpm is None
     pump = 4.9e-6 / (2.0 * np.pi) * 12.0 * 2.0 / np.pi
-    own = 2.4e-13 * found.passage.pressure / pump
-    assert found.passage.pump_share == pytest.approx(own, rel=0.2)
-    text = " ".join(short_text(found).split())
+    own = 2.4e-13 * result.passage.pressure / pump
+    assert result.passage.pump_share == pytest.approx(own, rel=0.2)
+    text = " ".join(short_text(result).split())
     assert "% of the pump's flow at 0.11 MPa; the smallest step that would have been found" in text
     assert "L/min" not in text
 
@@ -140,17 +140,17 @@ def leak(lpm: float, low: float, high: float, **changed: object) -> Diagnosis:
 
 @pytest.mark.parametrize(
     ("interval", "level", "step_"),
-    [((0.0055, 0.007), "repair", "now"), ((0.002, 0.003), "plan", "plan the"), ((0.001, 0.002), "follow", "urgent")],
+    [((0.0055, 0.007), "repair", "now"), ((0.002, 0.003), "plan", "plan the"), ((0.001, 0.002), "monitor", "urgent")],
 )
 def test_levels_by_the_interval(interval: tuple[float, float], level: str, step_: str) -> None:
     """8 mm/min of a piston of 633 mm^2 are 5.06 mL/min."""
-    found = leak(sum(interval) / 2, *interval)
-    assert found.severity is not None
-    assert found.severity.level == level
-    assert found.severity.pump_share is not None
-    assert found.severity.pump_share[0] == pytest.approx(sum(interval) / 2 / 1000.0 / (60 * 4.9e-6))
-    assert any(step_ in text for text in next_steps(found))
-    assert "8 mm/min of creep, the default" in str(how_bad(found))
+    result = leak(sum(interval) / 2, *interval)
+    assert result.severity is not None
+    assert result.severity.level == level
+    assert result.severity.pump_share is not None
+    assert result.severity.pump_share[0] == pytest.approx(sum(interval) / 2 / 1000.0 / (60 * 4.9e-6))
+    assert any(step_ in text for text in next_steps(result))
+    assert "8 mm/min of creep, the default" in str(how_bad(result))
 
 
 def test_the_repair_limit_is_drawn_in_the_unit_of_the_leak() -> None:
@@ -162,12 +162,12 @@ def test_the_repair_limit_is_drawn_in_the_unit_of_the_leak() -> None:
 
 
 def test_a_limit_as_a_flow() -> None:
-    found = leak(0.006, 0.0055, 0.007, limit=RepairLimit.of("20 mL/min"))
-    assert found.severity is not None and found.severity.of_limit is not None
-    assert found.severity.of_limit[0] == pytest.approx(0.3)
-    assert found.severity.level == "follow"
-    assert found.as_dict()["limit"] == {"mL_per_min": pytest.approx(20.0), "creep_mm_per_min": None, "stated": True}
-    unknown = severity(replace(found, leak_lpm=None, leak_interval_lpm=None), found.limit)
+    result = leak(0.006, 0.0055, 0.007, limit=RepairLimit.of("20 mL/min"))
+    assert result.severity is not None and result.severity.of_limit is not None
+    assert result.severity.of_limit[0] == pytest.approx(0.3)
+    assert result.severity.level == "monitor"
+    assert result.as_dict()["limit"] == {"mL_per_min": pytest.approx(20.0), "creep_mm_per_min": None, "stated": True}
+    unknown = severity(replace(result, leak_lpm=None, leak_interval_lpm=None), result.limit)
     assert unknown is not None and unknown.level is None
 
 

@@ -173,8 +173,8 @@ def test_the_score_grows_with_the_leak() -> None:
 def test_longer_recordings_never_widen_the_interval() -> None:
     deviations = []
     for duration in (20.0, 40.0, 80.0, 160.0):
-        found = [judged(leaking(duration=duration, seed=seed))[0].fitted for seed in (1, 2, 3)]
-        deviations.append(np.mean([deviation for _, deviation in found]))
-        assert np.mean([size for size, _ in found]) == pytest.approx(LEAK, abs=4.0 * deviations[-1] / np.sqrt(3.0))
+        result = [judged(leaking(duration=duration, seed=seed))[0].fitted for seed in (1, 2, 3)]
+        deviations.append(np.mean([deviation for _, deviation in result]))
+        assert np.mean([size for size, _ in result]) == pytest.approx(LEAK, abs=4.0 * deviations[-1] / np.sqrt(3.0))
     assert (np.diff(deviations) < 0.0).all()
     assert deviations[-1] < 0.6 * deviations[0]

@@ -24,17 +24,17 @@ def test_a_leak_from_the_start_needs_a_baseline(records, sound_ones: list[Record
     alone = diagnose(recording)
     assert alone.verdict != "leak"
     for count in (1, 4, 8):
-        found = diagnose(recording, sound_ones[:count])
-        assert found.verdict == "leak" or count == 1, found.reason
-        assert found.onset_s is None
-        assert f"{count} comparable leak-free recording" in found.reason
+        result = diagnose(recording, sound_ones[:count])
+        assert result.verdict == "leak" or count == 1, result.reason
+        assert result.onset_s is None
+        assert f"{count} comparable leak-free recording" in result.reason
 
 
 @pytest.mark.parametrize("count", [1, 3, 7])
 def test_a_sound_one_is_no_leak_beside_sound_ones(count: int, records, sound_ones: list[Recording]) -> None:  # type: ignore[no-untyped-def]
-    found = [diagnose(records(seed, duration=60.0, throttled=True), sound_ones[:count]) for seed in range(8)]
-    assert "leak" not in [one.verdict for one in found]
-    assert all("no fall of the ringing" in one.reason for one in found)
+    result = [diagnose(records(seed, duration=60.0, throttled=True), sound_ones[:count]) for seed in range(8)]
+    assert "leak" not in [one.verdict for one in result]
+    assert all("no fall of the ringing" in one.reason for one in result)
 
 
 @pytest.mark.parametrize("count", [pytest.param(1, marks=pytest.mark.slow), 4])
@@ -44,8 +44,8 @@ def test_more_noise_than_in_the_baseline_is_no_leak(count: int, records, sound_o
         recording = records(seed, duration=60.0, throttled=True)
         random = np.random.default_rng(seed)
         noisy = {name: recording[name] + 16e3 * random.standard_normal(len(recording)) for name in ("p_A", "p_B")}
-        found = diagnose(replace(recording, channels={**recording.channels, **noisy}), sound_ones[:count])
-        alarms += found.verdict == "leak"
+        result = diagnose(replace(recording, channels={**recording.channels, **noisy}), sound_ones[:count])
+        alarms += result.verdict == "leak"
     assert alarms <= 1
 
 
@@ -69,9 +69,9 @@ def test_what_may_not_be_compared_is_not(
         "one chamber": lambda: one.only(["p_A", "u"]),
         "counts": lambda: replace(one, units={**one.units, "p_A": "count", "p_B": "count"}),
     }[change]()
-    found = diagnose(other, sound_ones)
-    assert found.verdict == "cannot tell"
-    assert reason is None or reason in found.reason
+    result = diagnose(other, sound_ones)
+    assert result.verdict == "cannot tell"
+    assert reason is None or reason in result.reason
 
 
 @pytest.mark.parametrize("change", ["other duty", "other level"])
@@ -88,12 +88,12 @@ def test_another_duty_or_load_is_no_leak(change: str, records, sound_ones: list[
 def test_a_baseline_given_twice_counts_once(records, sound_ones: list[Recording]) -> None:  # type: ignore[no-untyped-def]
     recording = records(1, duration=60.0, throttled=True)
     for many, few in ((sound_ones[:1] * 3, sound_ones[:1]), ([*sound_ones[:4], sound_ones[2]], sound_ones[:4])):
-        found, expected = diagnose(recording, many), diagnose(recording, few)
-        assert replace(found, quality=expected.quality) == expected
-        assert "the same samples as another baseline recording" in found.quality[-1].text
+        result, expected = diagnose(recording, many), diagnose(recording, few)
+        assert replace(result, quality=expected.quality) == expected
+        assert "the same samples as another baseline recording" in result.quality[-1].text
 
 
 def test_no_usable_baseline_is_said(sound_ones: list[Recording]) -> None:
-    found = diagnose(sound_ones[0], [sound_ones[1].samples(slice(0, 100))])
-    assert found.verdict == "cannot tell"
-    assert "no baseline recording can be used: needs 226 samples" in found.reason
+    result = diagnose(sound_ones[0], [sound_ones[1].samples(slice(0, 100))])
+    assert result.verdict == "cannot tell"
+    assert "no baseline recording can be used: needs 226 samples" in result.reason

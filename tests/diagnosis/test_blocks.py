@@ -85,13 +85,13 @@ def test_log_rms_is_that_of_the_details() -> None:
     blocks = cut(recording)
     bounds = np.rint((blocks.edges - recording.t[0]) * RATE).astype(int)
     for chamber in ("p_A", "p_B"):
-        found = details(recording[chamber])
-        series = {f"d{level}": found[level] for level in (1, 2, 3, 4)} | {"d3d4": found[3] * found[4]}
+        result = details(recording[chamber])
+        series = {f"d{level}": result[level] for level in (1, 2, 3, 4)} | {"d3d4": result[3] * result[4]}
         for quantity, values in series.items():
             direct = [np.sqrt(np.mean(values[a:b] ** 2)) for a, b in pairwise(bounds)]
             column = blocks.names.index(f"{quantity} of {chamber}")
             np.testing.assert_allclose(np.exp(blocks.log_rms[:, column]), direct, rtol=1e-9)
-            inside = values[found.inside()]
+            inside = values[result.inside()]
             assert whole(recording)[0][column] == pytest.approx(np.log(np.sqrt(np.mean(inside**2))), rel=1e-9)
 
 

@@ -76,7 +76,7 @@ HOPELESS: dict[str, tuple[Change, str]] = {
 }
 
 
-#: A balance of volumes leaves the samples at a rail out, and needs no heed of pressures that rest.
+#: A balance of volumes leaves the samples at a rail out, and needs no heed of constant pressures.
 BY_PRESSURES = ("10 s at the rail", "10 s at zero", "a straight line")
 
 #: The detector of the documentation's example, which keeps the contract as well.
@@ -130,23 +130,23 @@ def alike(one: Evidence, other: Evidence) -> bool:
 
 @pytest.mark.parametrize("change", GOOD)
 def test_judges_what_it_can(change: str, leaky: Recording) -> None:
-    found = diagnose(GOOD[change](leaky))
-    assert found.verdict in ("leak", "no leak"), found.reason
-    assert found.score is not None
-    assert found.threshold is not None
-    assert found.verdict == ("leak" if found.score > found.threshold else "no leak")
+    result = diagnose(GOOD[change](leaky))
+    assert result.verdict in ("leak", "no leak"), result.reason
+    assert result.score is not None
+    assert result.threshold is not None
+    assert result.verdict == ("leak" if result.score > result.threshold else "no leak")
 
 
 @pytest.mark.parametrize("change", HOPELESS)
 @pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning")
 def test_cannot_tell_where_it_must_and_says_why(change: str, leaky: Recording) -> None:
     make, named = HOPELESS[change]
-    found = diagnose(make(leaky.only(["u", "p_A", "p_B"]) if change in BY_PRESSURES else leaky))
-    assert found.verdict == "cannot tell"
-    assert named in found.reason
-    assert "\n" not in found.reason
-    assert found.score is None
-    assert found.onset_s is None
+    result = diagnose(make(leaky.only(["u", "p_A", "p_B"]) if change in BY_PRESSURES else leaky))
+    assert result.verdict == "cannot tell"
+    assert named in result.reason
+    assert "\n" not in result.reason
+    assert result.score is None
+    assert result.onset_s is None
 
 
 def test_unusable_is_one_line(detector, leaky: Recording) -> None:  # type: ignore[no-untyped-def]
@@ -162,7 +162,7 @@ def test_deterministic(detector, leaky: Recording) -> None:  # type: ignore[no-u
     assert alike(first_examined(detector, leaky), examined(detector, leaky))
 
 
-@pytest.mark.parametrize("case", ["leaky", "sound"])
+@pytest.mark.parametrize("case", ["leaky", "healthy"])
 @pytest.mark.parametrize("factor, offset", [(3.0, 0.0), (1.0, 1.0e5), (1.0 / 6894.757, -50.0)])
 def test_neither_unit_nor_zero_matters(  # type: ignore[no-untyped-def]
     detector, factor: float, offset: float, case: str, request: pytest.FixtureRequest
@@ -194,8 +194,8 @@ def test_never_sees_the_flow_meter_or_where_the_data_come_from_or_what_it_does_n
     unread = {name: np.linspace(0.0, 1.0, len(leaky)) for name in leaky.channels if name not in reads}
     assert "q_leak" in unread
     assert alike(examined(detector, with_channels(leaky, **unread)), plain)
-    told = replace(leaky, provenance={"experiment": {"leak": "none"}}, history=("no leak",))
-    assert alike(examined(detector, told), plain)
+    disclosed = replace(leaky, provenance={"experiment": {"leak": "none"}}, history=("no leak",))
+    assert alike(examined(detector, disclosed), plain)
     assert alike(examined(detector, leaky.only(name for name in leaky.channels if name in reads)), plain)
 
 
@@ -218,9 +218,9 @@ def test_holes_in_other_channels_are_no_fault(detector, names: list[str], leaky:
     holes = np.arange(len(leaky)) % 7919 == 100
     recording = with_channels(leaky, **{name: np.where(holes, np.nan, leaky[name]) for name in names})
     if detector.usable(recording) is None:
-        found = detector.examine(recording, [], P)
-        assert found.verdict in VERDICTS
-        assert found.score is None or np.isfinite(found.score)
+        result = detector.examine(recording, [], P)
+        assert result.verdict in VERDICTS
+        assert result.score is None or np.isfinite(result.score)
 
 
 def test_a_smaller_false_alarm_probability_asks_for_more(detector, leaky: Recording) -> None:  # type: ignore[no-untyped-def]
@@ -230,10 +230,10 @@ def test_a_smaller_false_alarm_probability_asks_for_more(detector, leaky: Record
 
 
 def test_methods_state_their_own_evidence(detector, leaky: Recording) -> None:  # type: ignore[no-untyped-def]
-    found = first_examined(detector, leaky)
+    result = first_examined(detector, leaky)
     if detector.name == "rms change":
-        assert found.parts
-    for method in found.parts:
+        assert result.parts
+    for method in result.parts:
         assert method.verdict in VERDICTS
         assert method.score is not None
         assert method.threshold is not None
@@ -242,7 +242,7 @@ def test_methods_state_their_own_evidence(detector, leaky: Recording) -> None:  
             assert method.verdict != "leak"  # noise alone never is a leak
 
 
-@pytest.mark.parametrize("case", ["leaky", "sound"])
+@pytest.mark.parametrize("case", ["leaky", "healthy"])
 @pytest.mark.parametrize("with_baseline", [False, True])
 def test_the_chance_agrees_with_score_and_threshold(
     detector,  # type: ignore[no-untyped-def]
@@ -283,10 +283,10 @@ def test_odds_in_words() -> None:
 def test_odds_are_in_every_output(leaky: Recording) -> None:
     from sealscope.reporting import diagnosis_text
 
-    found = diagnose(leaky)
-    assert found.verdict == "leak"
-    assert found.odds in diagnosis_text(found)
-    assert found.as_dict()["odds"] == found.odds
-    assert found.as_dict()["chance"] <= 0.01
-    stated = [method["odds"] for method in found.as_dict()["methods"]]
+    result = diagnose(leaky)
+    assert result.verdict == "leak"
+    assert result.odds in diagnosis_text(result)
+    assert result.as_dict()["odds"] == result.odds
+    assert result.as_dict()["chance"] <= 0.01
+    stated = [method["odds"] for method in result.as_dict()["methods"]]
     assert any(stated)

@@ -13,7 +13,7 @@ from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording
 
-seen: list[tuple[tuple[str, ...], int]] = []
+observed: list[tuple[tuple[str, ...], int]] = []
 rigs: list[Rig] = []
 
 
@@ -29,7 +29,7 @@ class Looker:
         return None if "p_A" in recording else "needs p_A"
 
     def examine(self, recording: Recording, baseline: object, probability: float) -> Evidence:
-        seen.append((tuple(recording.channels), len(list(baseline))))  # type: ignore[call-overload]
+        observed.append((tuple(recording.channels), len(list(baseline))))  # type: ignore[call-overload]
         assert np.isinf(np.array([1.0]) / 0.0).all()
         return Evidence("no leak", "looked", probability, 1.0)
 
@@ -44,7 +44,7 @@ class Reader(Looker):
 @pytest.fixture
 def recording(monkeypatch: pytest.MonkeyPatch) -> Recording:
     monkeypatch.setattr(registry, "DETECTORS", {"looker": Looker, "reader": Reader})
-    seen.clear()
+    observed.clear()
     channels = {name: np.sin(np.arange(100.0)) for name in ("u", "x", "p_A", "p_B", "q_leak")}
     return Recording(np.arange(100.0), channels, dict.fromkeys(channels, "count"), 1.0)
 
@@ -53,35 +53,35 @@ def test_once_and_again_only_where_it_reads_something_else(recording: Recording)
     whole = Examination(recording, false_alarm_probability=0.05)
     for _ in range(3):
         assert whole.evidence("looker").score == 0.05
-    assert len(seen) == 1
+    assert len(observed) == 1
     few = whole.through(["u", "p_A", "p_B", "omega"])
     assert few.evidence("looker") == few.evidence("looker")
-    assert [channels for channels, _ in seen] == [("u", "x", "p_A", "p_B", "q_leak"), ("u", "p_A", "p_B")]
-    seen.clear()
+    assert [channels for channels, _ in observed] == [("u", "x", "p_A", "p_B", "q_leak"), ("u", "p_A", "p_B")]
+    observed.clear()
     whole.evidence("reader")
     few.evidence("reader")
-    assert len(seen) == 1
+    assert len(observed) == 1
     few.through(["p_A"]).evidence("reader")
-    assert [channels for channels, _ in seen][1:] == [("p_A",)]
+    assert [channels for channels, _ in observed][1:] == [("p_A",)]
 
 
 def test_with_a_baseline_every_view_is_another(recording: Recording) -> None:
     whole = Examination(recording, [recording, recording.only(["u"])], false_alarm_probability=0.05)
     whole.evidence("reader")
     whole.through(["u", "p_A", "p_B"]).evidence("reader")
-    assert seen == [(("u", "x", "p_A", "p_B", "q_leak"), 1), (("u", "p_A", "p_B"), 1)]
+    assert observed == [(("u", "x", "p_A", "p_B", "q_leak"), 1), (("u", "p_A", "p_B"), 1)]
 
 
 def test_who_cannot_look_does_not(recording: Recording) -> None:
     def said(examination: Examination) -> tuple[str, bool]:
-        found = examination.evidence("looker")
-        return found.reason, found.usable
+        result = examination.evidence("looker")
+        return result.reason, result.usable
 
     assert said(Examination(recording.only(["u"]), false_alarm_probability=0.05)) == ("needs p_A", False)
     assert said(Examination(recording, false_alarm_probability=0.05, distrust="stuck")) == ("stuck", False)
     alone = Examination(recording, [recording.only(["u"])], false_alarm_probability=0.05)
     assert said(alone) == ("no baseline recording can be used: needs p_A", False)
-    assert seen == []
+    assert observed == []
 
 
 def test_it_is_made_for_the_rig_given_or_the_thesis_s(recording: Recording) -> None:
@@ -112,7 +112,7 @@ def test_two_at_a_time_and_as_each_by_itself(recording: Recording, monkeypatch: 
     whole = Examination(recording, false_alarm_probability=0.05)
     fused = whole.fused()
     assert [one.detector for one in fused.parts] == ["second", "first"]
-    assert len(seen) == 2
+    assert len(observed) == 2
     assert whole.evidence("first").score == 0.05
 
 
@@ -132,8 +132,8 @@ def test_quick_stops_at_the_detector_that_judges(recording: Recording, monkeypat
         registry, "DETECTORS", {"looker": Looker, "pressure response": Judges, "volume balance": Abstains}
     )
     whole = Examination(recording, false_alarm_probability=0.05).fused()
-    seen.clear()
+    observed.clear()
     quick = Examination(recording, false_alarm_probability=0.05).fused(quick=True)
     assert [part.detector for part in quick.parts] == ["pressure response", "volume balance"]
-    assert len(seen) == 1
+    assert len(observed) == 1
     assert (quick.verdict, quick.score, quick.detector) == (whole.verdict, whole.score, whole.detector)

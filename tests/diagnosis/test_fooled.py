@@ -1,4 +1,4 @@
-"""A sound machine whose sensors, wiring or logger changed is not called leaking: what changed is named instead."""
+"""A healthy machine whose sensors, wiring or logger changed is not called leaking: what changed is named instead."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ FOOLING: dict[str, tuple[Change, str]] = {
 
 
 @pytest.mark.parametrize("kind", FOOLING)
-def test_what_changed_in_the_readings_is_no_leak(kind: str, sound: Recording) -> None:
+def test_what_changed_in_the_readings_is_no_leak(kind: str, healthy: Recording) -> None:
     make, reason = FOOLING[kind]
-    diagnosis = diagnose(make(sound.only(CHAMBERS)))
+    diagnosis = diagnose(make(healthy.only(CHAMBERS)))
     assert diagnosis.verdict == "cannot tell"
     assert reason in diagnosis.reason
     assert diagnosis.cause == "sensor fault"
@@ -56,9 +56,9 @@ def test_what_changed_in_the_readings_is_no_leak(kind: str, sound: Recording) ->
 @pytest.mark.parametrize(
     "names", [CHAMBERS, pytest.param(("u", *CHAMBERS), marks=pytest.mark.slow), ("u", *CHAMBERS, "x", "theta")]
 )
-def test_swapped_chambers_are_no_leak_and_nothing_is_written(names: tuple[str, ...], sound: Recording, capfd) -> None:  # type: ignore[no-untyped-def]
+def test_swapped_chambers_are_no_leak_and_nothing_is_written(names: tuple[str, ...], healthy: Recording, capfd) -> None:  # type: ignore[no-untyped-def]
     """Models of the machine diverge on such a recording: that is no message for the terminal."""
-    diagnosis = diagnose(swapped(sound.only(names)))
+    diagnosis = diagnose(swapped(healthy.only(names)))
     if "theta" in names:  # the balance names what compresses: the sign of the pressures' rates
         assert diagnosis.verdict != "leak"
         assert diagnosis.cause is not None

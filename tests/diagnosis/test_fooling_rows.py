@@ -34,14 +34,14 @@ def monkeypatch_module():  # type: ignore[no-untyped-def]
 
 
 @pytest.fixture(scope="module")
-def short(sound: Recording, records) -> tuple[Recording, Recording]:  # type: ignore[no-untyped-def]
-    """Return 60 s of two sound machines."""
-    return sound.between(0.0, 60.0), records(3, duration=120.0, throttled=True).between(0.0, 60.0)
+def short(healthy: Recording, records) -> tuple[Recording, Recording]:  # type: ignore[no-untyped-def]
+    """Return 60 s of two healthy machines."""
+    return healthy.between(0.0, 60.0), records(3, duration=120.0, throttled=True).between(0.0, 60.0)
 
 
-def judged(fooling, name: str, sound: Recording, other: Recording) -> tuple[str, str]:  # type: ignore[no-untyped-def]
+def judged(fooling, name: str, healthy: Recording, other: Recording) -> tuple[str, str]:  # type: ignore[no-untyped-def]
     row = fooling.ROWS[name]
-    made = row.change(fooling.Sample(sound, np.random.default_rng(0), other))
+    made = row.change(fooling.Sample(healthy, np.random.default_rng(0), other))
     diagnosis = diagnose(made.only(("p_A", "p_B")))
     return row.group, diagnosis.verdict
 
@@ -56,28 +56,28 @@ def judged(fooling, name: str, sound: Recording, other: Recording) -> tuple[str,
         "chambers swapped at half",
     ],
 )
-def test_rows_that_fooled(name: str, fooling, sound: Recording, records) -> None:  # type: ignore[no-untyped-def]
-    _, verdict = judged(fooling, name, sound, records(3, duration=120.0, throttled=True))
+def test_rows_that_fooled(name: str, fooling, healthy: Recording, records) -> None:  # type: ignore[no-untyped-def]
+    _, verdict = judged(fooling, name, healthy, records(3, duration=120.0, throttled=True))
     assert verdict in ("no leak", "cannot tell")
 
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_no_row_is_a_leak_and_garbage_is_no_verdict(fooling, sound: Recording, records) -> None:  # type: ignore[no-untyped-def]
+def test_no_row_is_a_leak_and_garbage_is_no_verdict(fooling, healthy: Recording, records) -> None:  # type: ignore[no-untyped-def]
     other = records(3, duration=120.0, throttled=True)
     names = [name for name, row in fooling.ROWS.items() if row.group not in ("machine", "baseline")]
-    verdicts = {name: judged(fooling, name, sound, other) for name in names}
+    verdicts = {name: judged(fooling, name, healthy, other) for name in names}
     assert len(verdicts) >= 60
     assert {name for name, (_, verdict) in verdicts.items() if verdict == "leak"} == set()
 
 
 def test_verdicts_are_kept_and_an_interrupted_run_goes_on(
-    fooling, sound: Recording, tmp_path: Path, monkeypatch
+    fooling, healthy: Recording, tmp_path: Path, monkeypatch
 ) -> None:  # type: ignore[no-untyped-def]
     """A line cut off by a kill is made again, those that are there are not; equal records are diagnosed once."""
 
     class Machine:
-        record, other = sound.only(("p_A", "p_B", "x")), sound
+        record, other = healthy.only(("p_A", "p_B", "x")), healthy
 
     calls = []
 
@@ -130,14 +130,14 @@ NO_MACHINE = ("p_B copied from p_A", "p_A constant", "p_B in 1e5 of its unit", "
 BASELINES = ("none", "itself", "another machine", "itself, changed")
 
 
-def check_combination(fooling, draw, sound: Recording, other: Recording, views: list[tuple[str, ...]], capfd) -> None:  # type: ignore[no-untyped-def]
+def check_combination(fooling, draw, healthy: Recording, other: Recording, views: list[tuple[str, ...]], capfd) -> None:  # type: ignore[no-untyped-def]
     """Diagnose rows on top of one another: a verdict without error, warning or text; none where no machine is left."""
     rows = {name: row.change for name, row in fooling.ROWS.items() if row.group not in ("machine", "baseline")}
     names = draw(st.lists(st.sampled_from([*rows, *DEGENERATE]), min_size=1, max_size=3), label="changes")
     view = draw(st.sampled_from(views), label="channels")
     against = draw(st.sampled_from(BASELINES), label="baseline")
     random = np.random.default_rng(draw(st.integers(0, 99), label="seed"))
-    begin, made = sound.only(view), sound.only({*view, "u", "x", "p_A", "p_B"})
+    begin, made = healthy.only(view), healthy.only({*view, "u", "x", "p_A", "p_B"})
     for name in names:
         if name in DEGENERATE:
             made = DEGENERATE[name](made)

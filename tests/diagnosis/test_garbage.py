@@ -32,9 +32,9 @@ GARBAGE: dict[str, tuple[Change, str]] = {
 
 
 @pytest.mark.parametrize("kind", GARBAGE)
-def test_garbage_gets_cannot_tell_with_the_true_reason(kind: str, sound: Recording, leaky: Recording, capfd) -> None:  # type: ignore[no-untyped-def]
+def test_garbage_gets_cannot_tell_with_the_true_reason(kind: str, healthy: Recording, leaky: Recording, capfd) -> None:  # type: ignore[no-untyped-def]
     make, reason = GARBAGE[kind]
-    for recording in (sound, leaky):
+    for recording in (healthy, leaky):
         diagnosis = diagnose(make(recording))
         if kind == "bar":  # flows do not depend on the unit of the pressures, and both show in the balance
             assert diagnosis.verdict == diagnose(recording).verdict
@@ -46,8 +46,8 @@ def test_garbage_gets_cannot_tell_with_the_true_reason(kind: str, sound: Recordi
 
 
 @pytest.mark.parametrize("kind", ["white noise", "a copy"])
-def test_a_baseline_of_garbage_is_left_out(kind: str, sound: Recording, leaky: Recording) -> None:
+def test_a_baseline_of_garbage_is_left_out(kind: str, healthy: Recording, leaky: Recording) -> None:
     pressures = ["u", "p_A", "p_B"]
-    diagnosis = diagnose(sound.only(pressures), GARBAGE[kind][0](leaky).only(pressures))
+    diagnosis = diagnose(healthy.only(pressures), GARBAGE[kind][0](leaky).only(pressures))
     assert diagnosis.verdict == "cannot tell"
     assert "no baseline recording can be used: this is no recording of a hydraulic machine" in diagnosis.reason

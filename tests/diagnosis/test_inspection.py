@@ -35,10 +35,10 @@ def verdicts(diagnosis: Diagnosis) -> list[tuple[str, str, str, float | None, fl
 def test_a_baseline_equal_to_the_recording_is_refused(healthy: list[Recording]) -> None:
     recording = healthy[0]
     for baseline in (recording, [recording], [copied(recording)]):
-        found = diagnose(recording, baseline)
-        assert found.verdict == "cannot tell"
-        assert "no baseline recording can be used: the same samples as the recording itself" in found.reason
-        assert found.quality[-1].severity == "warning"
+        result = diagnose(recording, baseline)
+        assert result.verdict == "cannot tell"
+        assert "no baseline recording can be used: the same samples as the recording itself" in result.reason
+        assert result.quality[-1].severity == "warning"
     beside = diagnose(recording, [copied(recording), healthy[1]])
     assert verdicts(beside) == verdicts(diagnose(recording, healthy[1]))
     assert beside.quality[-1].text == (
@@ -47,18 +47,18 @@ def test_a_baseline_equal_to_the_recording_is_refused(healthy: list[Recording]) 
 
 
 def test_a_leak_within_the_recording_is_stated_whatever_the_baseline(leaky: Recording) -> None:
-    found = diagnose(leaky, leaky)
-    assert (found.verdict, found.onset_s) == ("leak", diagnose(leaky).onset_s)
+    result = diagnose(leaky, leaky)
+    assert (result.verdict, result.onset_s) == ("leak", diagnose(leaky).onset_s)
 
 
 @pytest.mark.slow
 def test_copies_count_once_for_every_detector(healthy: list[Recording]) -> None:
     """Three copies have no scatter of their own: they were three baselines."""
     recording, leak_free = healthy[:2]
-    found = diagnose(recording, [leak_free, copied(leak_free), leak_free])
-    assert verdicts(found) == verdicts(diagnose(recording, [leak_free]))
-    assert found.quality[-1].code == "baseline_left_out"
-    assert found.quality[-1].count == 2
+    result = diagnose(recording, [leak_free, copied(leak_free), leak_free])
+    assert verdicts(result) == verdicts(diagnose(recording, [leak_free]))
+    assert result.quality[-1].code == "baseline_left_out"
+    assert result.quality[-1].count == 2
 
 
 def test_of_copies_the_one_with_the_most_channels_is_kept(healthy: list[Recording]) -> None:
@@ -82,10 +82,10 @@ def test_a_baseline_with_a_fault_is_left_out_for_every_detector(fault: str, heal
     faulty = replace(other, channels={**other.channels, "p_A": p_A})
     if fault == "too short":
         faulty = faulty.samples(slice(0, 200))
-    found = diagnose(recording, [faulty, leak_free])
+    result = diagnose(recording, [faulty, leak_free])
     plain = diagnose(recording, [leak_free])
-    assert verdicts(found) == verdicts(plain)
-    assert found.quality[-1].text.startswith("1 of 2 baseline recordings is left out: ")
+    assert verdicts(result) == verdicts(plain)
+    assert result.quality[-1].text.startswith("1 of 2 baseline recordings is left out: ")
     alone = diagnose(recording, faulty)
     assert alone.verdict == "cannot tell"
     assert "no baseline recording can be used: " in alone.reason
@@ -149,9 +149,9 @@ def test_a_built_in_detector_that_fails_costs_its_own_evidence_alone(
     monkeypatch.setattr(Failing, "error", error, raising=False)
     detector._log_once.cache_clear()
     with caplog.at_level(logging.DEBUG, "sealscope.diagnosis.detector"):
-        found = diagnose(healthy[0])
-    assert (found.verdict, found.score, found.reason) == (expected.verdict, expected.score, expected.reason)
-    own = next(own for own in found.parts if own.detector == "pressure response")
+        result = diagnose(healthy[0])
+    assert (result.verdict, result.score, result.reason) == (expected.verdict, expected.score, expected.reason)
+    own = next(own for own in result.parts if own.detector == "pressure response")
     assert own.verdict == "cannot tell"
     assert own.reason == reason
     (record,) = caplog.records

@@ -247,7 +247,7 @@ def test_what_is_believed_of_slope_and_walk_keeps_the_false_alarms_and_finds_mor
     """A slope that is believed is nearly known: a step is found that a free slope would pass for."""
     count, draws = 30, 200
     random, time = np.random.default_rng(11), SPACING * (np.arange(count) + 0.5)
-    false = found = free = 0
+    false = result = free = 0
     for _ in range(draws):
         deviation = 2.0 * np.exp(0.3 * random.standard_normal(count))
         healthy = random.standard_normal() * np.arange(count) / count + walk * np.cumsum(
@@ -259,7 +259,7 @@ def test_what_is_believed_of_slope_and_walk_keeps_the_false_alarms_and_finds_mor
             own = Information(time, np.diag(deviation**-2.0), values / deviation**2, slope=1.0, walk=1.0)
             alarm = judged(own).chance < 0.05
             false += alarm and size == 0.0
-            found += alarm and size > 0.0
+            result += alarm and size > 0.0
             free += size > 0.0 and judged(own._replace(slope=np.inf, walk=np.inf)).chance < 0.05
     assert binom.sf(false - 1, draws, 0.05) > 1e-3
-    assert found > 1.3 * free
+    assert result > 1.3 * free

@@ -38,115 +38,115 @@ def is_pair(value: object) -> bool:
     return value is None or (isinstance(value, list) and len(value) == 2 and all(type(one) is float for one in value))
 
 
-def check(found: Diagnosis) -> None:
+def check(result: Diagnosis) -> None:
     """Everything that another program may rely on, after a way through text."""
-    line = json.dumps(found.as_dict(), allow_nan=False)
+    line = json.dumps(result.as_dict(), allow_nan=False)
     assert "\n" not in line
-    told = json.loads(line)
-    assert list(told) == KEYS
-    assert type(told["file"]) is str
-    assert told["verdict"] in VERDICTS
-    assert told["reason"]
-    assert type(told["reason"]) is str
-    assert "\n" not in told["reason"]
-    assert is_number(told["onset_s"])
-    assert is_number(told["score"])
-    assert is_number(told["threshold"])
-    assert is_number(told["leak_lpm"])
-    assert is_number(told["bound_lpm"])
-    assert told["verdict"] != "leak" or told["bound_lpm"] is None
-    assert is_pair(told["onset_interval_s"])
-    assert is_pair(told["leak_interval_lpm"])
-    assert type(told["false_alarm_probability"]) is float
-    assert told["methods"]
-    for method in told["methods"]:
+    tree = json.loads(line)
+    assert list(tree) == KEYS
+    assert type(tree["file"]) is str
+    assert tree["verdict"] in VERDICTS
+    assert tree["reason"]
+    assert type(tree["reason"]) is str
+    assert "\n" not in tree["reason"]
+    assert is_number(tree["onset_s"])
+    assert is_number(tree["score"])
+    assert is_number(tree["threshold"])
+    assert is_number(tree["leak_lpm"])
+    assert is_number(tree["bound_lpm"])
+    assert tree["verdict"] != "leak" or tree["bound_lpm"] is None
+    assert is_pair(tree["onset_interval_s"])
+    assert is_pair(tree["leak_interval_lpm"])
+    assert type(tree["false_alarm_probability"]) is float
+    assert tree["methods"]
+    for method in tree["methods"]:
         assert list(method) == ["name", "score", "threshold", "verdict", "reason", "chance", "odds"]
         assert type(method["name"]) is str
         assert type(method["reason"]) is str
         assert method["verdict"] in VERDICTS
         assert is_number(method["score"])
         assert is_number(method["threshold"])
-    for finding in told["quality"]:
+    for finding in tree["quality"]:
         assert list(finding) == ["code", "channel", "count", "first_t", "severity", "text"]
         assert type(finding["count"]) is int
         assert finding["severity"] in ("note", "warning", "fatal")
         assert is_number(finding["first_t"])
-    assert told["cause"] is None or told["cause"] in CAUSES
-    assert told["next_check"]
-    assert "\n" not in told["next_check"]
-    assert told["methods"][0]["verdict"] == told["verdict"]
-    if told["onset_s"] is not None:
-        first, last = told["onset_interval_s"]
-        assert told["verdict"] == "leak"
-        assert first <= told["onset_s"] <= last
+    assert tree["cause"] is None or tree["cause"] in CAUSES
+    assert tree["next_check"]
+    assert "\n" not in tree["next_check"]
+    assert tree["methods"][0]["verdict"] == tree["verdict"]
+    if tree["onset_s"] is not None:
+        first, last = tree["onset_interval_s"]
+        assert tree["verdict"] == "leak"
+        assert first <= tree["onset_s"] <= last
 
 
 @pytest.mark.usefixtures("rms_change_alone")
 def test_contract_of_a_leak(leaky: Recording) -> None:
-    found = diagnose(leaky, file="rig.csv")
-    assert (found.verdict, found.file) == ("leak", "rig.csv")
-    check(found)
-    told = found.as_dict()
-    assert told["leak_lpm"] is None
-    assert told["leak_interval_lpm"] is None
-    assert told["false_alarm_probability"] == 0.01
-    assert told["methods"][0] == {
+    result = diagnose(leaky, file="rig.csv")
+    assert (result.verdict, result.file) == ("leak", "rig.csv")
+    check(result)
+    tree = result.as_dict()
+    assert tree["leak_lpm"] is None
+    assert tree["leak_interval_lpm"] is None
+    assert tree["false_alarm_probability"] == 0.01
+    assert tree["methods"][0] == {
         "name": "rms change",
-        "score": told["score"],
-        "threshold": told["threshold"],
+        "score": tree["score"],
+        "threshold": tree["threshold"],
         "verdict": "leak",
-        "reason": told["reason"],
-        "chance": told["chance"],
-        "odds": told["odds"],
+        "reason": tree["reason"],
+        "chance": tree["chance"],
+        "odds": tree["odds"],
     }
-    assert [one["name"] for one in told["methods"][1:]] == [
+    assert [one["name"] for one in tree["methods"][1:]] == [
         f"RMS of {quantity} of {chamber}" for chamber in ("p_A", "p_B") for quantity in ("d1", "d2", "d3", "d4", "d3d4")
     ]
 
 
 def test_contract_of_a_leak_that_every_detector_looked_for(leaky: Recording) -> None:
-    found = diagnose(leaky)
-    assert found.verdict == "leak"
-    check(found)
-    told = found.as_dict()
-    assert (told["score"], told["threshold"]) == (told["methods"][0]["score"], told["methods"][0]["threshold"])
-    assert told["reason"].startswith(told["methods"][0]["reason"])
-    assert set(detectors()) <= {one["name"] for one in told["methods"]}
+    result = diagnose(leaky)
+    assert result.verdict == "leak"
+    check(result)
+    tree = result.as_dict()
+    assert (tree["score"], tree["threshold"]) == (tree["methods"][0]["score"], tree["methods"][0]["threshold"])
+    assert tree["reason"].startswith(tree["methods"][0]["reason"])
+    assert set(detectors()) <= {one["name"] for one in tree["methods"]}
 
 
-def test_contract_of_the_other_verdicts(sound: Recording) -> None:
-    for found, verdict in ((diagnose(sound), "no leak"), (diagnose(sound.between(0, 2)), "cannot tell")):
-        assert found.verdict == verdict
-        check(found)
+def test_contract_of_the_other_verdicts(healthy: Recording) -> None:
+    for result, verdict in ((diagnose(healthy), "no leak"), (diagnose(healthy.between(0, 2)), "cannot tell")):
+        assert result.verdict == verdict
+        check(result)
 
 
 def test_numbers_that_json_does_not_know_become_null() -> None:
-    found = Diagnosis(
+    result = Diagnosis(
         "leak", "r", math.nan, math.inf, math.inf, (-math.inf, 3.0), file="f", false_alarm_probability=0.01
     )
-    told = json.loads(json.dumps(found.as_dict(), allow_nan=False))
-    assert told["onset_s"] is told["score"] is told["threshold"] is None
-    assert told["onset_interval_s"] == [None, 3.0]
+    tree = json.loads(json.dumps(result.as_dict(), allow_nan=False))
+    assert tree["onset_s"] is tree["score"] is tree["threshold"] is None
+    assert tree["onset_interval_s"] == [None, 3.0]
 
 
 def test_a_part_analysed_is_told(leaky: Recording) -> None:
     p_A = np.array(leaky["p_A"])
     p_A[:1001] = np.nan
     p_A[1100] = np.nan
-    found = diagnose(Recording(leaky.t, {**leaky.channels, "p_A": p_A}, leaky.units, leaky.rate))
-    codes = {finding.code: finding for finding in found.quality}
+    result = diagnose(Recording(leaky.t, {**leaky.channels, "p_A": p_A}, leaky.units, leaky.rate))
+    codes = {finding.code: finding for finding in result.quality}
     assert codes["part_analysed"].count == 1001
     assert codes["gaps_bridged"].count == 1
     assert codes["missing"].channel == "p_A"
-    assert found.share < 0.984
-    assert f"this rests on {100 * found.share:.3g} % of the recording" in found.reason
-    check(found)
+    assert result.share < 0.984
+    assert f"this rests on {100 * result.share:.3g} % of the recording" in result.reason
+    check(result)
 
 
 @pytest.mark.parametrize("probability", [0.0, -0.1, 1e-5, 0.21, 1.0, math.nan, math.inf])
-def test_a_probability_no_threshold_can_be_set_for(probability: float, sound: Recording) -> None:
+def test_a_probability_no_threshold_can_be_set_for(probability: float, healthy: Recording) -> None:
     with pytest.raises(InputError, match=r"^false-alarm probability must be 0\.0001 to 0\.2, got "):
-        diagnose(sound, false_alarm_probability=probability)
+        diagnose(healthy, false_alarm_probability=probability)
 
 
 @pytest.mark.slow
@@ -161,7 +161,7 @@ def test_any_recording_gets_a_verdict(data: st.DataObject) -> None:
 
     def channel(n: int) -> np.ndarray:
         kind = data.draw(
-            st.sampled_from(["noise", "sine", "constant", "integers", "holes", "half rest", "huge", "none"])
+            st.sampled_from(["noise", "sine", "constant", "integers", "holes", "half still", "huge", "none"])
         )
         noise = random.standard_normal(n)
         k = np.arange(n)
@@ -171,7 +171,7 @@ def test_any_recording_gets_a_verdict(data: st.DataObject) -> None:
             "constant": np.full(n, 5.0),
             "integers": np.rint(2 * noise),
             "holes": np.where(random.random(n) < 0.01, np.nan, noise),
-            "half rest": np.where(k < n // 2, 0.0, noise),
+            "half still": np.where(k < n // 2, 0.0, noise),
             "huge": noise * 1e160,
             "none": np.full(n, np.nan),
         }[kind]
@@ -183,11 +183,11 @@ def test_any_recording_gets_a_verdict(data: st.DataObject) -> None:
     check(diagnose(one(), [one() for _ in range(data.draw(st.integers(0, 4)))], false_alarm_probability=0.05))
 
 
-def test_every_field_is_documented(sound: Recording) -> None:
+def test_every_field_is_documented(healthy: Recording) -> None:
     """Each key, and each key within it, stands in docs/verdict.md."""
     page = (Path(__file__).parents[2] / "docs" / "verdict.md").read_text(encoding="utf-8")
-    told = diagnose(sound).as_dict()
-    for key, value in told.items():
+    tree = diagnose(healthy).as_dict()
+    for key, value in tree.items():
         assert f"`{key}`" in page, key
         inner = value[0] if isinstance(value, list) and value and isinstance(value[0], dict) else value
         for name in inner if isinstance(inner, dict) and key != "about" else ():

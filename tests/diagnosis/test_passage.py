@@ -74,26 +74,26 @@ def test_the_smallest_step_is_found_and_half_of_it_is_not() -> None:
 
 
 def test_against_what_a_healthy_machine_passes() -> None:
-    sound, worn = machine(1), machine(1, G=WORN)
+    unworn, worn = machine(1), machine(1, G=WORN)
     known = VolumeBalance(rig(2.0 * PUMP))
     evidence = known.examine(worn, [], P)
     assert evidence.verdict == "leak"
     assert evidence.onset_s is None
     assert evidence.leak_lpm == pytest.approx(flow(worn, WORN + PUMP), rel=0.1)
     assert known.examine(worn, [], P).passage.lpm == pytest.approx(flow(worn, WORN + PUMP), rel=0.05)
-    assert known.examine(sound, [], P).verdict == "no leak"
+    assert known.examine(unworn, [], P).verdict == "no leak"
 
 
 def test_only_what_is_known_to_be_healthy_becomes_a_baseline() -> None:
-    sound, worn = machine(1), machine(1, G=WORN)
+    unworn, worn = machine(1), machine(1, G=WORN)
     advice = "keep this recording as a baseline"
-    unknown, known = diagnose(worn, rig=rig(None)), diagnose(sound, rig=rig(2.0 * PUMP))
+    unknown, known = diagnose(worn, rig=rig(None)), diagnose(unworn, rig=rig(2.0 * PUMP))
     assert advice not in unknown.next_check
     assert advice in known.next_check
-    assert advice in diagnose(sound, [machine(2), machine(3)]).next_check
+    assert advice in diagnose(unworn, [machine(2), machine(3)]).next_check
     for diagnosis in (unknown, known):
-        told = diagnosis.as_dict()["passage"]
-        assert set(told) == {
+        tree = diagnosis.as_dict()["passage"]
+        assert set(tree) == {
             "lpm", "interval_lpm", "pressure_Pa", "findable_lpm", "healthy_lpm", "pump_share", "findable_share"
         }  # fmt: skip
         assert total_leakage(diagnosis) is not None

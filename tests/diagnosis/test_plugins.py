@@ -55,7 +55,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
             del sys.modules[name]
 
 
-def told(caplog: pytest.LogCaptureFixture) -> list[str]:
+def reported(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [one.getMessage() for one in caplog.records if one.name.startswith("sealscope")]
 
 
@@ -65,22 +65,22 @@ def test_the_documented_example_is_found_and_heard(install: Install, leaky: Reco
     assert points == {"ringing energy": "ringing_energy:RingingEnergy"}
     install("ringing_energy", (EXAMPLE / "ringing_energy.py").read_text(encoding="utf-8"), points)
     assert list(detectors()) == ["rms change", "ringing energy"]
-    found = {one.detector: one for one in diagnose(leaky).methods}
-    own = found["ringing energy"]
+    result = {one.detector: one for one in diagnose(leaky).methods}
+    own = result["ringing energy"]
     assert own.verdict == "leak"
     assert own.score is not None
     assert own.threshold is not None
     assert own.score > own.threshold
-    assert {"ringing of p_A", "ringing of p_B"} <= set(found)
+    assert {"ringing of p_A", "ringing of p_B"} <= set(result)
 
 
-def test_it_is_made_for_the_rig_that_is_assumed(install: Install, sound: Recording) -> None:
+def test_it_is_made_for_the_rig_that_is_assumed(install: Install, healthy: Recording) -> None:
     from sealscope.parameters import load_rig
 
     install("fine", GOOD, {"good": "fine:Good"})
     for name in ("thesis", "thesis-calibrated"):
         rig = load_rig(name)
-        methods = {one.detector: one for one in diagnose(sound, rig=rig).methods}
+        methods = {one.detector: one for one in diagnose(healthy, rig=rig).methods}
         assert methods["good"].reason == f"assumed {rig.name}"
 
 
@@ -111,27 +111,27 @@ BROKEN = {
 
 @pytest.mark.parametrize("case", BROKEN)
 def test_a_broken_one_costs_one_line_that_names_the_distribution(
-    case: str, install: Install, sound: Recording, caplog: pytest.LogCaptureFixture
+    case: str, install: Install, healthy: Recording, caplog: pytest.LogCaptureFixture
 ) -> None:
     source, points, words = BROKEN[case]
-    expected = diagnose(sound)
+    expected = diagnose(healthy)
     install("broken", source, points)
     with caplog.at_level(logging.WARNING, "sealscope"):
-        found = [diagnose(sound), diagnose(sound)]
-    (line,) = told(caplog)  # once, however often it fails
+        result = [diagnose(healthy), diagnose(healthy)]
+    (line,) = reported(caplog)  # once, however often it fails
     assert "\n" not in line
     assert "of broken is left out" in line
     assert words in line
-    for one in found:
+    for one in result:
         assert (one.verdict, one.score, one.reason) == (expected.verdict, expected.score, expected.reason)
 
 
-def test_two_of_one_name(install: Install, sound: Recording, caplog: pytest.LogCaptureFixture) -> None:
+def test_two_of_one_name(install: Install, healthy: Recording, caplog: pytest.LogCaptureFixture) -> None:
     install("first", GOOD, {"good": "first:Good"})
     install("second", GOOD, {"good": "second:Good"})
     with caplog.at_level(logging.WARNING, "sealscope"):
         assert list(detectors()) == ["rms change", "good"]
-    (line,) = told(caplog)
+    (line,) = reported(caplog)
     assert line == "detector 'good' of second is left out: ValueError: its name is that of a detector of first"
 
 

@@ -48,11 +48,11 @@ def within(stroke: Recording, baseline: list[Recording]) -> str:
 def test_defective_against_healthy(healthy: list[Recording], defective: list[Recording], every: int) -> None:
     """One specimen with a defect, recorded on another day: a change of the ringing or its bound is stated, no L/min."""
     for stroke in defective[::every]:
-        found = diagnose(stroke, healthy)
-        assert found.verdict == "leak" or "(95 %" in found.reason
-        assert f"against {len(healthy)} comparable leak-free" in found.reason
-        assert found.leak_lpm is None  # counts allow no L/min
-        json.dumps(found.as_dict(), allow_nan=False)
+        result = diagnose(stroke, healthy)
+        assert result.verdict == "leak" or "(95 %" in result.reason
+        assert f"against {len(healthy)} comparable leak-free" in result.reason
+        assert result.leak_lpm is None  # counts allow no L/min
+        json.dumps(result.as_dict(), allow_nan=False)
 
 
 @pytest.fixture(scope="module")
@@ -124,5 +124,5 @@ def test_healthy_with_one_left_out(healthy: list[Recording]) -> None:
 
 def test_a_single_stroke_is_too_short_to_be_its_own_baseline(defective: list[Recording]) -> None:
     for stroke in defective:
-        found = diagnose(stroke)
-        assert found.verdict == "cannot tell"
+        result = diagnose(stroke)
+        assert result.verdict == "cannot tell"

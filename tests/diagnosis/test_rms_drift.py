@@ -1,4 +1,4 @@
-"""What a sound machine's details do by themselves: shares of noise in closed form, records that drift or change their
+"""What a healthy machine's details do by themselves: shares of noise in closed form, records that drift or change their
 noise or duty and do not leak, and the rise against recordings in closed form."""
 
 from __future__ import annotations
@@ -67,10 +67,10 @@ def test_a_change_of_the_duty_is_no_step_of_the_machine() -> None:
 )
 def test_the_start_is_left_out(n: int, cycle: float | None, first: int) -> None:
     """10 s (7 blocks), or three cycles, or an eighth of the record, whichever says least."""
-    found = blocks_of(np.zeros((n, len(QUANTITIES))), cycle).settled()
-    assert len(found.log_rms) == n - first
-    assert found.edges[0] == first * BLOCK
-    assert len(found.edges) == n - first + 1
+    result = blocks_of(np.zeros((n, len(QUANTITIES))), cycle).settled()
+    assert len(result.log_rms) == n - first
+    assert result.edges[0] == first * BLOCK
+    assert len(result.edges) == n - first + 1
 
 
 def test_the_rise_against_recordings_is_students() -> None:

@@ -119,25 +119,25 @@ def test_a_log_of_a_test_bench(case: str, own: Recording, tmp_path: Path) -> Non
     recording = read(DIALECTS[case](own, tmp_path))
     assert recording.rate == pytest.approx(own.rate, rel=1e-3)
     assert len(recording) == pytest.approx(len(own), abs=0.02 * len(own))
-    found = diagnose(recording)
-    assert (found.verdict, found.detector) == ("leak", "volume balance"), found.reason
-    assert found.onset_s is not None
-    assert found.onset_s - float(recording.t[0]) == pytest.approx(ONSET, abs=1.5)
-    assert found.cause == "piston or pump leak"
+    result = diagnose(recording)
+    assert (result.verdict, result.detector) == ("leak", "volume balance"), result.reason
+    assert result.onset_s is not None
+    assert result.onset_s - float(recording.t[0]) == pytest.approx(ONSET, abs=1.5)
+    assert result.cause == "piston or pump leak"
 
 
 def test_7_a_cylinder_five_times_as_large_got_the_flow_of_a_small_one(own: Recording) -> None:
     """Its recording is this one: 0.0043 L/min was stated where 0.021 L/min leaked."""
-    found = diagnose(own)
-    assert found.leak_lpm is None
-    assert found.severity is not None and found.severity.pump_share is not None
-    assert "--area" in short_text(found)
+    result = diagnose(own)
+    assert result.leak_lpm is None
+    assert result.severity is not None and result.severity.pump_share is not None
+    assert "--area" in short_text(result)
 
 
 def test_8_a_leak_from_the_start_was_kept_as_the_baseline() -> None:
-    found = diagnose(machine(1, G=1.0e-12).only(CHANNELS))
-    assert found.verdict == "no leak"
-    text = " ".join(diagnosis_text(found).split())
+    result = diagnose(machine(1, G=1.0e-12).only(CHANNELS))
+    assert result.verdict == "no leak"
+    text = " ".join(diagnosis_text(result).split())
     assert "pump and piston together" in text
     assert "keep this recording as a baseline" not in text.lower()
     stated = diagnose(machine(1, G=1.0e-12).only(CHANNELS), rig="thesis")
@@ -147,14 +147,14 @@ def test_8_a_leak_from_the_start_was_kept_as_the_baseline() -> None:
 
 def test_9_no_leak_stood_beside_a_score_far_over_its_threshold() -> None:
     """Side A loses what its pressure drives out; half of that is a motion that no pressure difference explains."""
-    sound = machine(8)
-    lost = np.cumsum(np.where(sound.t < ONSET, 0.0, 4.0e-13 * sound["p_A"])) / sound.rate
-    x = sound["x"] - 0.5 * lost / AREA
-    found = diagnose(Recording(sound.t, {**sound.channels, "x": x}, sound.units, sound.rate))
-    assert found.verdict != "leak"
-    assert (found.cause, found.alarmed) == ("external leak", True)
-    for line in (found.summary, short_text(found).splitlines()[0], diagnosis_text(found).splitlines()[0]):
+    healthy = machine(8)
+    lost = np.cumsum(np.where(healthy.t < ONSET, 0.0, 4.0e-13 * healthy["p_A"])) / healthy.rate
+    x = healthy["x"] - 0.5 * lost / AREA
+    result = diagnose(Recording(healthy.t, {**healthy.channels, "x": x}, healthy.units, healthy.rate))
+    assert result.verdict != "leak"
+    assert (result.cause, result.alarmed) == ("external leak", True)
+    for line in (result.summary, short_text(result).splitlines()[0], diagnosis_text(result).splitlines()[0]):
         assert "external leak" in line
-    assert "external leak" in found.as_dict()["summary"]
-    for line in diagnosis_text(found).splitlines():
+    assert "external leak" in result.as_dict()["summary"]
+    for line in diagnosis_text(result).splitlines():
         assert not ("no leak" in line and "over the threshold" in line)

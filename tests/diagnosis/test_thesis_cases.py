@@ -27,10 +27,10 @@ def altered(recording: Recording, p_A: np.ndarray, p_B: np.ndarray) -> Recording
 @few_and_all(4, 10)
 def test_smallest_leak_with_throttles_half_closed(count: int, records) -> None:  # type: ignore[no-untyped-def]
     """0.0042 L/min, the thesis's smallest, from second 90: found in ten of ten, nine within 10 s."""
-    found = [diagnose(records(seed, leak="0.0042 L/min from 90 s", throttled=True)) for seed in range(count)]
-    assert [one.verdict for one in found] == ["leak"] * count
-    assert sum(abs(one.onset_s - 90.0) <= 10.0 for one in found) >= count - 1
-    for one in found:
+    result = [diagnose(records(seed, leak="0.0042 L/min from 90 s", throttled=True)) for seed in range(count)]
+    assert [one.verdict for one in result] == ["leak"] * count
+    assert sum(abs(one.onset_s - 90.0) <= 10.0 for one in result) >= count - 1
+    for one in result:
         assert one.onset_interval_s is not None
         assert one.onset_interval_s[0] <= one.onset_s <= one.onset_interval_s[1]
         assert one.onset_interval_s[0] <= 90.0 <= one.onset_interval_s[1]
@@ -40,8 +40,8 @@ def test_smallest_leak_with_throttles_half_closed(count: int, records) -> None: 
 @pytest.mark.slow
 def test_larger_leak_without_throttles(records) -> None:  # type: ignore[no-untyped-def]
     """0.015 L/min; of these eight at most three are missed."""
-    found = [diagnose(records(seed, leak="0.015 L/min from 90 s")) for seed in range(8)]
-    alarms = [one for one in found if one.verdict == "leak"]
+    result = [diagnose(records(seed, leak="0.015 L/min from 90 s")) for seed in range(8)]
+    alarms = [one for one in result if one.verdict == "leak"]
     assert len(alarms) >= 5
     assert sum(one.onset_interval_s[0] <= 90.0 <= one.onset_interval_s[1] for one in alarms) >= len(alarms) - 1
 
@@ -49,10 +49,10 @@ def test_larger_leak_without_throttles(records) -> None:  # type: ignore[no-unty
 @few_and_all(3, 8)
 @pytest.mark.parametrize("throttled", [False, True])
 def test_without_a_leak_there_is_none(throttled: bool, count: int, records) -> None:  # type: ignore[no-untyped-def]
-    found = [diagnose(records(seed, throttled=throttled)) for seed in range(count)]
-    assert "leak" not in [one.verdict for one in found]
-    assert sum("no fall of the ringing" in one.reason for one in found) >= count - 1
-    assert all(one.onset_s is None and one.onset_interval_s is None for one in found)
+    result = [diagnose(records(seed, throttled=throttled)) for seed in range(count)]
+    assert "leak" not in [one.verdict for one in result]
+    assert sum("no fall of the ringing" in one.reason for one in result) >= count - 1
+    assert all(one.onset_s is None and one.onset_interval_s is None for one in result)
 
 
 def test_the_call_of_the_readme() -> None:
@@ -63,10 +63,10 @@ def test_the_call_of_the_readme() -> None:
         seed=1,
         set={"orifices": "present", "closed_A": 0.5, "closed_B": 0.5},
     )
-    found = diagnose(recording)
-    assert found.verdict == "leak"
-    assert found.onset_s == pytest.approx(90.0, abs=10.0)
-    assert "RMS of d3 of p_A fell" in found.reason  # leakage damps the ringing
+    result = diagnose(recording)
+    assert result.verdict == "leak"
+    assert result.onset_s == pytest.approx(90.0, abs=10.0)
+    assert "RMS of d3 of p_A fell" in result.reason  # leakage damps the ringing
 
 
 @few_and_all(2, 6)
@@ -79,20 +79,20 @@ def test_a_step_of_the_noise_is_no_leak(kind: str, count: int, records) -> None:
         noise = 16e3 * random.standard_normal((2, len(recording)))
         late = (recording.t < 60.0) if kind == "quieter" else (recording.t >= 60.0)
         other = {"p_A alone": 0.0 * noise[1], "common": noise[0]}.get(kind, noise[1])
-        found = diagnose(altered(recording, recording["p_A"] + late * noise[0], recording["p_B"] + late * other))
-        assert found.verdict != "leak"
-        assert "the noise (d1) changed" in found.reason
+        result = diagnose(altered(recording, recording["p_A"] + late * noise[0], recording["p_B"] + late * other))
+        assert result.verdict != "leak"
+        assert "the noise (d1) changed" in result.reason
 
 
 @pytest.mark.slow
 def test_a_leak_is_found_beyond_a_step_of_the_noise(records) -> None:  # type: ignore[no-untyped-def]
-    found = []
+    result = []
     for seed in range(6):
         recording = records(seed, leak="0.0042 L/min from 60 s", duration=120.0, throttled=True)
         random = np.random.default_rng(seed)
         noise = (recording.t >= 30.0) * 4e3 * random.standard_normal((2, len(recording)))
-        found.append(diagnose(altered(recording, recording["p_A"] + noise[0], recording["p_B"] + noise[1])))
-    alarms = [one for one in found if one.verdict == "leak"]
+        result.append(diagnose(altered(recording, recording["p_A"] + noise[0], recording["p_B"] + noise[1])))
+    alarms = [one for one in result if one.verdict == "leak"]
     assert len(alarms) >= 4
     for one in alarms:
         assert one.onset_s == pytest.approx(60.0, abs=15.0)
@@ -113,8 +113,8 @@ def test_a_slow_drift_is_no_leak(end: float, count: int, records) -> None:  # ty
 
 
 def test_a_duty_without_cycle_is_judged_too(records) -> None:  # type: ignore[no-untyped-def]
-    found = diagnose(records(1, command="prbs 0.8 every 0.5 s seed 1", duration=120.0, throttled=True))
-    assert found.verdict != "leak" and "no fall of the ringing" in found.reason
+    result = diagnose(records(1, command="prbs 0.8 every 0.5 s seed 1", duration=120.0, throttled=True))
+    assert result.verdict != "leak" and "no fall of the ringing" in result.reason
 
 
 @pytest.mark.slow
@@ -130,5 +130,5 @@ def test_white_noise_alarms_as_seldom_as_stated_at_any_rate(rate: float, samples
 @pytest.mark.slow
 def test_white_noise_at_a_low_rate(noise_record) -> None:  # type: ignore[no-untyped-def]
     """The filters' memory must not pass for a change where a second has few samples."""
-    found = [diagnose(noise_record(seed, 6000, 10.0), false_alarm_probability=0.05).verdict for seed in range(30)]
-    assert found.count("leak") <= 5
+    result = [diagnose(noise_record(seed, 6000, 10.0), false_alarm_probability=0.05).verdict for seed in range(30)]
+    assert result.count("leak") <= 5

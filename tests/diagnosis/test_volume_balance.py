@@ -47,28 +47,28 @@ def flow_of(recording: Recording, G: float, start: float = 60.0) -> float:
 
 
 def test_finds_a_leak_its_onset_and_its_size(detector: VolumeBalance, worn: Recording) -> None:
-    found = detector.examine(worn, [], P)
-    assert found.verdict == "leak"
-    assert found.score is not None and found.threshold is not None and found.score > found.threshold
-    assert found.onset_s == pytest.approx(60.0, abs=1.5)
-    assert found.onset_interval_s is not None and found.leak_interval_lpm is not None
-    assert found.onset_interval_s[0] <= 60.0 <= found.onset_interval_s[1]
-    low, high = found.leak_interval_lpm
+    result = detector.examine(worn, [], P)
+    assert result.verdict == "leak"
+    assert result.score is not None and result.threshold is not None and result.score > result.threshold
+    assert result.onset_s == pytest.approx(60.0, abs=1.5)
+    assert result.onset_interval_s is not None and result.leak_interval_lpm is not None
+    assert result.onset_interval_s[0] <= 60.0 <= result.onset_interval_s[1]
+    low, high = result.leak_interval_lpm
     assert low <= flow_of(worn, 3.0e-13) <= high
     assert high - low < 0.3 * high
-    assert found.course is not None
-    after = found.course.t > 63.0
-    assert np.median(found.course.lpm[after]) == pytest.approx(flow_of(worn, 3.0e-13), rel=0.15)
-    assert np.median(found.course.lpm[~after]) == pytest.approx(0.0, abs=0.1 * flow_of(worn, 3.0e-13))
-    assert np.mean(found.course.low <= found.course.lpm) == 1.0
+    assert result.course is not None
+    after = result.course.t > 63.0
+    assert np.median(result.course.lpm[after]) == pytest.approx(flow_of(worn, 3.0e-13), rel=0.15)
+    assert np.median(result.course.lpm[~after]) == pytest.approx(0.0, abs=0.1 * flow_of(worn, 3.0e-13))
+    assert np.mean(result.course.low <= result.course.lpm) == 1.0
 
 
 def test_a_sound_machine_is_sound(detector: VolumeBalance, tight: Recording) -> None:
-    found = detector.examine(tight, [], P)
-    assert found.verdict == "no leak"
-    assert found.leak_lpm is None and found.onset_s is None
-    assert found.bound_lpm is not None and found.bound_lpm < 3e-4
-    assert found.passage is not None and found.passage.lpm is not None
+    result = detector.examine(tight, [], P)
+    assert result.verdict == "no leak"
+    assert result.leak_lpm is None and result.onset_s is None
+    assert result.bound_lpm is not None and result.bound_lpm < 3e-4
+    assert result.passage is not None and result.passage.lpm is not None
 
 
 SIGNS: dict[str, Callable[[Recording], Recording]] = {
@@ -96,12 +96,12 @@ def test_duties_that_do_not_repeat_and_loads(detector: VolumeBalance) -> None:
             machine(seed, G=step(0.0, 3.0e-13), speed=irregular(seed), load=push, p_noise=noise, bias=bias)
             for noise, bias in ((8000.0, 10e3), (0.0, 0.0))
         )
-        found = detector.examine(worn, [], P)
-        assert found.verdict == "leak"
-        assert found.onset_s == pytest.approx(60.0, abs=4.0)
-        assert found.leak_interval_lpm is not None
+        result = detector.examine(worn, [], P)
+        assert result.verdict == "leak"
+        assert result.onset_s == pytest.approx(60.0, abs=4.0)
+        assert result.leak_interval_lpm is not None
         # noise and zero errors of the pressures make their difference look larger or smaller than what leaks
-        assert found.leak_interval_lpm[0] <= flow_of(quiet, 3.0e-13) <= found.leak_interval_lpm[1]
+        assert result.leak_interval_lpm[0] <= flow_of(quiet, 3.0e-13) <= result.leak_interval_lpm[1]
         assert detector.examine(machine(seed, speed=irregular(seed), load=push), [], P).verdict == "no leak"
 
 
@@ -138,29 +138,29 @@ def test_under_a_weight_that_is_held_a_leak_inside_is_none_to_the_outside() -> N
     """What swings alone showed a steady flow of 0.02 L/min to the outside beside it: `no leak` for 14 of 96 leaks."""
     drawn = draw("load", 100, rig="thesis-closed-loop", duration=120.0, family="resting, loop closed")
     leaks = simulate_with_truth(drawn.experiment(seed=100, leak="0.0015 L/min from 60 s"))
-    found = VolumeBalance(load_rig("thesis-closed-loop")).examine(leaks.recording, [], P)
-    assert found.verdict == "leak" and found.cause in ("piston leak", "piston or pump leak"), found.reason
-    assert found.leak_interval_lpm is not None
-    assert found.leak_interval_lpm[0] <= leaks.truth.mean_leak_lpm <= found.leak_interval_lpm[1]
+    result = VolumeBalance(load_rig("thesis-closed-loop")).examine(leaks.recording, [], P)
+    assert result.verdict == "leak" and result.cause in ("piston leak", "piston or pump leak"), result.reason
+    assert result.leak_interval_lpm is not None
+    assert result.leak_interval_lpm[0] <= leaks.truth.mean_leak_lpm <= result.leak_interval_lpm[1]
 
 
 def test_an_encoder_that_slips_is_no_leak(detector: VolumeBalance) -> None:
-    sound = machine(7)
+    healthy = machine(7)
     for factor in (1.01, 0.99):
-        move = np.diff(sound["theta"], prepend=0.0) * np.where(sound.t < 60.0, 1.0, factor)
-        found = detector.examine(with_channels(sound, theta=np.cumsum(move)), [], P)
-        assert found.verdict != "leak"
-        if found.score is not None and found.threshold is not None and found.score > found.threshold:
-            assert found.cause == "sensor fault"
+        move = np.diff(healthy["theta"], prepend=0.0) * np.where(healthy.t < 60.0, 1.0, factor)
+        result = detector.examine(with_channels(healthy, theta=np.cumsum(move)), [], P)
+        assert result.verdict != "leak"
+        if result.score is not None and result.threshold is not None and result.score > result.threshold:
+            assert result.cause == "sensor fault"
 
 
 def test_oil_lost_to_the_outside_is_no_piston_leak(detector: VolumeBalance) -> None:
     """Side A loses what its pressure drives out; half of that is a motion that no pressure difference explains."""
-    sound = machine(8)
-    lost = np.cumsum(np.where(sound.t < 60.0, 0.0, 4.0e-13 * sound["p_A"])) / sound.rate
-    found = detector.examine(with_channels(sound, x=sound["x"] - 0.5 * lost / 633e-6), [], P)
-    assert found.cause == "external leak"
-    assert found.verdict != "leak"
+    healthy = machine(8)
+    lost = np.cumsum(np.where(healthy.t < 60.0, 0.0, 4.0e-13 * healthy["p_A"])) / healthy.rate
+    result = detector.examine(with_channels(healthy, x=healthy["x"] - 0.5 * lost / 633e-6), [], P)
+    assert result.cause == "external leak"
+    assert result.verdict != "leak"
 
 
 MENDED: dict[str, Callable[[Recording], Recording]] = {
@@ -177,10 +177,10 @@ MENDED: dict[str, Callable[[Recording], Recording]] = {
 
 @pytest.mark.parametrize("trouble", MENDED)
 def test_lives_with_what_a_rig_does(detector: VolumeBalance, worn: Recording, tight: Recording, trouble: str) -> None:
-    found = detector.examine(MENDED[trouble](worn), [], P)
-    assert found.verdict == "leak"
-    assert found.onset_s == pytest.approx(60.0, abs=2.0)
-    assert found.leak_lpm == pytest.approx(flow_of(worn, 3.0e-13), rel=0.15)
+    result = detector.examine(MENDED[trouble](worn), [], P)
+    assert result.verdict == "leak"
+    assert result.onset_s == pytest.approx(60.0, abs=2.0)
+    assert result.leak_lpm == pytest.approx(flow_of(worn, 3.0e-13), rel=0.15)
     assert detector.examine(MENDED[trouble](tight), [], P).verdict == "no leak"
 
 
@@ -210,9 +210,9 @@ def test_deterministic_and_on_the_recordings_own_clock(detector: VolumeBalance, 
     assert later.score == pytest.approx(one.score, rel=1e-9)
 
 
-def test_on_the_simulated_rig(detector: VolumeBalance, leaky: Recording, sound: Recording) -> None:
-    found = detector.examine(leaky, [], P)
-    assert found.verdict == "leak"
-    assert found.onset_s == pytest.approx(60.0, abs=1.5)
-    assert found.leak_lpm == pytest.approx(0.0042, rel=0.05)
-    assert detector.examine(sound, [], P).verdict == "no leak"
+def test_on_the_simulated_rig(detector: VolumeBalance, leaky: Recording, healthy: Recording) -> None:
+    result = detector.examine(leaky, [], P)
+    assert result.verdict == "leak"
+    assert result.onset_s == pytest.approx(60.0, abs=1.5)
+    assert result.leak_lpm == pytest.approx(0.0042, rel=0.05)
+    assert detector.examine(healthy, [], P).verdict == "no leak"

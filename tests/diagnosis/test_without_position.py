@@ -121,7 +121,7 @@ def test_an_open_loop_delivers_nothing_of_what_leaks() -> None:
 def test_a_closed_loop_delivers_what_leaks(
     rig: str, command: str, load: str, leak: str, channels: tuple[str, ...]
 ) -> None:
-    """Under a load over cycles; unloaded, where the valves of a single rod settle anew at each rest, while it is held.
+    """Under a load over cycles; unloaded, where the valves of a single rod settle anew at each stop, while it is held.
 
     From the command the drive's own law tells the speed.
     """
@@ -130,9 +130,9 @@ def test_a_closed_loop_delivers_what_leaks(
     assert evidence.verdict == "leak"
     assert evidence.leak_interval_lpm is not None
     assert evidence.leak_interval_lpm[0] <= run.truth.mean_leak_lpm <= evidence.leak_interval_lpm[1]
-    sound = examined(simulated(rig, command, load).recording.only(channels), rig)
-    assert sound.verdict == "no leak"
-    assert sound.bound_lpm is not None and sound.bound_lpm < float(leak)
+    healthy = examined(simulated(rig, command, load).recording.only(channels), rig)
+    assert healthy.verdict == "no leak"
+    assert healthy.bound_lpm is not None and healthy.bound_lpm < float(leak)
 
 
 def held(G: float, feeds: bool = False) -> Recording:

@@ -45,8 +45,8 @@ def test_the_limits_are_those_of_the_two_tails(count, confidence):
 
 def test_the_hourly_interval_covers():
     rng = np.random.default_rng(1)
-    found = [events_per_hour(int(k), 20.0, 0.9) for k in rng.poisson(0.3 * 20.0, 400)]
-    assert np.mean([one.low <= 0.3 <= one.high for one in found]) >= 0.88
+    result = [events_per_hour(int(k), 20.0, 0.9) for k in rng.poisson(0.3 * 20.0, 400)]
+    assert np.mean([one.low <= 0.3 <= one.high for one in result]) >= 0.88
 
 
 # ranks of the 95 % interval of a median, as in Conover, Practical Nonparametric Statistics, 3rd ed. (1999), section 3.2
@@ -69,10 +69,10 @@ def test_the_ranks_hold_their_confidence_and_no_closer_ones_do(n, order, confide
 
 
 def test_quantiles_bear_values_that_were_never_reached():
-    found = quantile_of([3.0, 1.0, math.inf, 2.0, math.inf], 0.5)
-    assert found.value == 3.0
+    result = quantile_of([3.0, 1.0, math.inf, 2.0, math.inf], 0.5)
+    assert result.value == 3.0
     assert quantile_of([3.0, 1.0, math.inf, 2.0, math.inf], 0.9).value == math.inf
-    assert (found.low, found.high) == (-math.inf, math.inf)
+    assert (result.low, result.high) == (-math.inf, math.inf)
     many = quantile_of(np.arange(1.0, 51.0), 0.5)
     assert (many.value, many.low, many.high) == (25.0, 18.0, 33.0)
 
@@ -80,35 +80,35 @@ def test_quantiles_bear_values_that_were_never_reached():
 @settings(deadline=None)
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=40), st.floats(0.05, 0.95))
 def test_a_quantile_follows_its_values(values, order):
-    found, turned = quantile_of(values, order), quantile_of([2 * v + 1 for v in values], order)
-    assert turned.value == 2 * found.value + 1
-    assert found.low <= found.value <= found.high
-    assert np.mean(np.array(values) <= found.value) >= order - 1e-9
+    result, turned = quantile_of(values, order), quantile_of([2 * v + 1 for v in values], order)
+    assert turned.value == 2 * result.value + 1
+    assert result.low <= result.value <= result.high
+    assert np.mean(np.array(values) <= result.value) >= order - 1e-9
 
 
 def test_the_quantile_s_interval_covers():
     rng = np.random.default_rng(2)
-    found = [quantile_of(rng.exponential(size=40), 0.9, 0.9) for _ in range(400)]
-    assert np.mean([one.low <= math.log(10) <= one.high for one in found]) >= 0.88
+    result = [quantile_of(rng.exponential(size=40), 0.9, 0.9) for _ in range(400)]
+    assert np.mean([one.low <= math.log(10) <= one.high for one in result]) >= 0.88
 
 
 def test_student_s_sleep():
     """Student, Biometrika 6 (1908) 1-25: hours gained by ten patients, mean 1.58; 95 % interval 0.70 to 2.46."""
-    found = mean_of([1.2, 2.4, 1.3, 1.3, 0.0, 1.0, 1.8, 0.8, 4.6, 1.4])
-    assert (found.value, found.low, found.high) == pytest.approx((1.58, 0.70, 2.46), abs=5e-3)
+    result = mean_of([1.2, 2.4, 1.3, 1.3, 0.0, 1.0, 1.8, 0.8, 4.6, 1.4])
+    assert (result.value, result.low, result.high) == pytest.approx((1.58, 0.70, 2.46), abs=5e-3)
     assert (mean_of([2.0]).low, mean_of([2.0]).high) == (-math.inf, math.inf)
     assert math.isnan(mean_of([]).value)
 
 
 def test_errors_of_an_estimate_by_hand():
-    found = estimate_error(
+    result = estimate_error(
         [1.0, 2.0, math.nan, 5.0], [1.0, 1.0, 1.0, 4.0], [0.5, 1.5, math.nan, 3.0], [1.5, 2.5, math.nan, 6.0]
     )
-    assert found.without == 1
-    assert found.bias.value == pytest.approx(2 / 3)
-    assert found.rmse.value == pytest.approx(math.sqrt(2 / 3))
-    assert found.rmse.low == 0.0
-    assert (found.coverage.count, found.coverage.n) == (2, 3)
+    assert result.without == 1
+    assert result.bias.value == pytest.approx(2 / 3)
+    assert result.rmse.value == pytest.approx(math.sqrt(2 / 3))
+    assert result.rmse.low == 0.0
+    assert (result.coverage.count, result.coverage.n) == (2, 3)
     assert estimate_error([1.0, 2.0], [1.0, 2.5]).coverage.n == 0
 
 
@@ -116,16 +116,16 @@ def test_errors_of_an_estimate_by_hand():
 @given(st.lists(st.floats(-50, 50), min_size=2, max_size=30), st.floats(-5, 5))
 def test_a_constant_error_is_bias(errors, shift):
     truth = np.arange(len(errors), dtype=float)
-    found = estimate_error(truth + errors, truth)
+    result = estimate_error(truth + errors, truth)
     moved = estimate_error(truth + errors + shift, truth)
-    assert moved.bias.value == pytest.approx(found.bias.value + shift, abs=1e-9)
-    assert found.rmse.value >= abs(found.bias.value) - 1e-9
-    assert found.rmse.low <= found.rmse.value <= found.rmse.high
+    assert moved.bias.value == pytest.approx(result.bias.value + shift, abs=1e-9)
+    assert result.rmse.value >= abs(result.bias.value) - 1e-9
+    assert result.rmse.low <= result.rmse.value <= result.rmse.high
 
 
 def test_errors_of_an_onset():
-    found = onset_errors([92.0, math.nan, 85.0, 90.0], [90.0] * 4, [88, math.nan, 80, 91], [95, math.nan, 89, 93])
-    assert (found.n, found.without) == (3, 1)
-    assert found.median.value == 0.0
-    assert (found.median_size.value, found.ninety_size.value) == (2.0, 5.0)
-    assert (found.coverage.count, found.coverage.n) == (1, 3)
+    result = onset_errors([92.0, math.nan, 85.0, 90.0], [90.0] * 4, [88, math.nan, 80, 91], [95, math.nan, 89, 93])
+    assert (result.n, result.without) == (3, 1)
+    assert result.median.value == 0.0
+    assert (result.median_size.value, result.ninety_size.value) == (2.0, 5.0)
+    assert (result.coverage.count, result.coverage.n) == (1, 3)

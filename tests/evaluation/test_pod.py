@@ -135,8 +135,8 @@ def test_firth_s_fit_and_bound_are_those_of_the_penalised_likelihood():
         assert penalised(fit, fit.intercept + a, fit.slope + b) < best
     assert fit.null == pytest.approx(max(penalised(fit, a, 0.0) for a in np.linspace(-3, 3, 6001)), abs=1e-6)
     x = math.log(fit.a90_95)
-    found = max(penalised(fit, math.log(9) - b * x, b) for b in np.linspace(0.05, 30, 6001))
-    assert best - found == pytest.approx(1.6448536**2 / 2, abs=1e-5)
+    result = max(penalised(fit, math.log(9) - b * x, b) for b in np.linspace(0.05, 30, 6001))
+    assert best - result == pytest.approx(1.6448536**2 / 2, abs=1e-5)
 
 
 def test_detection_that_does_not_rise_has_no_size():

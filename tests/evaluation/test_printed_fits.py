@@ -26,9 +26,9 @@ BEETLES = (
 )
 
 
-def trials(size, tested, found) -> tuple[np.ndarray, np.ndarray]:
+def trials(size, tested, result) -> tuple[np.ndarray, np.ndarray]:
     """Counts as single trials."""
-    hits = [one for n, k in zip(tested, found, strict=True) for one in [1] * k + [0] * (n - k)]
+    hits = [one for n, k in zip(tested, result, strict=True) for one in [1] * k + [0] * (n - k)]
     return np.repeat(np.asarray(size, dtype=float), tested), np.array(hits)
 
 
@@ -85,6 +85,6 @@ def test_the_beetles():
 def test_twenty_nine_of_twenty_nine():
     """The rule of the inspection standards: 29 finds of 29, 45 of 46 or 59 of 61 show 90 % with 95 % confidence, and
     one trial less does not (Rummel, Mater. Eval. 40 (1982) 922-932)."""
-    for found, tested in ((29, 29), (45, 46), (59, 61)):
-        assert proven_size(by_size(*trials([1.0], [tested], [found]))) == 1.0
-        assert proven_size(by_size(*trials([1.0], [tested - 1], [found - 1]))) == math.inf
+    for result, tested in ((29, 29), (45, 46), (59, 61)):
+        assert proven_size(by_size(*trials([1.0], [tested], [result]))) == 1.0
+        assert proven_size(by_size(*trials([1.0], [tested - 1], [result - 1]))) == math.inf

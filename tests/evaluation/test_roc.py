@@ -61,8 +61,8 @@ def test_hanley_and_mcneil_s_ct_images():
     ids=["albumin", "K-G score", "total protein"],
 )
 def test_delong_s_ovarian_cancer_patients(column, sign, area, error, low, high):
-    found = auc(*delong_pair(column, sign))
-    assert (found.value, found.standard_error, found.low, found.high) == pytest.approx(
+    result = auc(*delong_pair(column, sign))
+    assert (result.value, result.standard_error, result.low, result.high) == pytest.approx(
         (area, error, low, high), abs=5.1e-5
     )
 
@@ -84,12 +84,12 @@ def test_the_area_is_the_count_over_pairs_and_of_the_curve(a, b):
 def test_the_area_turns_with_the_score_and_is_blind_to_its_scale(a, b):
     a, b = np.array(a), np.array(b)
     area = auc(a, b)
-    turned, swapped, bent = auc(-a, -b), auc(b, a), auc(np.exp(a) + 3, np.exp(b) + 3)
+    turned, swapped, distorted = auc(-a, -b), auc(b, a), auc(np.exp(a) + 3, np.exp(b) + 3)
     assert turned.value == pytest.approx(1 - area.value)
     assert turned.standard_error == pytest.approx(area.standard_error, abs=1e-12)
     assert swapped.value == pytest.approx(1 - area.value)
-    assert bent.value == pytest.approx(area.value)
-    assert bent.standard_error == pytest.approx(area.standard_error, abs=1e-12)
+    assert distorted.value == pytest.approx(area.value)
+    assert distorted.standard_error == pytest.approx(area.standard_error, abs=1e-12)
 
 
 def test_delong_s_error_is_the_jackknife_s():
@@ -124,8 +124,8 @@ def test_the_interval_of_the_area_covers():
     rng = np.random.default_rng(11)
     held = 0
     for _ in range(400):
-        found = auc(rng.normal(size=40), rng.normal(1.0, 1.0, 40), 0.9)
-        held += found.low <= truth <= found.high
+        result = auc(rng.normal(size=40), rng.normal(1.0, 1.0, 40), 0.9)
+        held += result.low <= truth <= result.high
     assert 0.86 <= held / 400 <= 0.94
 
 

@@ -19,12 +19,12 @@ names = st.lists(st.tuples(st.sampled_from(FAULTS), st.sampled_from([*FAULTS, CA
 def test_a_confusion_by_hand():
     truth = ["none"] * 4 + ["piston leak"] * 5 + ["pump leak"]
     said = ["none", "none", "none", "piston leak", *["piston leak"] * 3, CANNOT_TELL, "pump leak", CANNOT_TELL]
-    found = confusion_matrix(truth, said, FAULTS)
-    assert found.rows == tuple(FAULTS)
-    assert found.columns == (*FAULTS, CANNOT_TELL)
-    assert found.counts.tolist() == [[3, 1, 0, 0], [0, 3, 1, 1], [0, 0, 0, 1]]
-    assert (found.accuracy.count, found.accuracy.n) == (6, 10)
-    assert found.shares[0][1].high == pytest.approx(0.8059, abs=5e-5)
+    result = confusion_matrix(truth, said, FAULTS)
+    assert result.rows == tuple(FAULTS)
+    assert result.columns == (*FAULTS, CANNOT_TELL)
+    assert result.counts.tolist() == [[3, 1, 0, 0], [0, 3, 1, 1], [0, 0, 0, 1]]
+    assert (result.accuracy.count, result.accuracy.n) == (6, 10)
+    assert result.shares[0][1].high == pytest.approx(0.8059, abs=5e-5)
 
 
 def test_a_fault_without_records_has_an_empty_row():
@@ -38,14 +38,14 @@ def test_a_fault_without_records_has_an_empty_row():
 @given(names, st.randoms())
 def test_counts_add_up_in_any_order(pairs, random):
     truth, said = zip(*pairs, strict=True)
-    found = confusion_matrix(truth, said, FAULTS)
-    assert found.counts.sum() == len(pairs)
+    result = confusion_matrix(truth, said, FAULTS)
+    assert result.counts.sum() == len(pairs)
     for i, fault in enumerate(FAULTS):
-        shares = [share.value for share in found.shares[i]]
+        shares = [share.value for share in result.shares[i]]
         assert fault not in truth or sum(shares) == pytest.approx(1.0)
     random.shuffle(pairs)
     again = confusion_matrix(*zip(*pairs, strict=True), FAULTS)
-    assert np.array_equal(again.counts, found.counts)
+    assert np.array_equal(again.counts, result.counts)
 
 
 SIZES = (0.0, 0.0042, 0.015)

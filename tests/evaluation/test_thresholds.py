@@ -51,26 +51,26 @@ def at_most(threshold, false_alarm):
 
 def test_the_rank_by_hand():
     scores = np.random.default_rng(1).permutation(np.arange(1.0, 200.0))
-    found = quantile_threshold(scores, 0.05)
-    assert (found.value, found.rank, found.n) == (190.0, 10, 199)
-    assert found.expected == pytest.approx(0.05)
-    assert np.count_nonzero(scores > found.value) == 9
+    result = quantile_threshold(scores, 0.05)
+    assert (result.value, result.rank, result.n) == (190.0, 10, 199)
+    assert result.expected == pytest.approx(0.05)
+    assert np.count_nonzero(scores > result.value) == 9
     sure = quantile_threshold(scores, 0.05, promise="bound")
     assert sure.rank == 5
-    assert at_most(sure, 0.05) >= 0.95 > at_most(found, 0.05)
+    assert at_most(sure, 0.05) >= 0.95 > at_most(result, 0.05)
 
 
 def test_the_true_probability_is_beta_distributed():
     """Uniform scores have the true rate 1 - threshold: moments of Beta(k, n + 1 - k), and its interval covers."""
     rng = np.random.default_rng(7)
-    found = [quantile_threshold(rng.random(99), 0.05, 0.9) for _ in range(2000)]
-    true = np.array([1.0 - one.value for one in found])
-    k, n = found[0].rank, 99
-    assert (k, found[0].expected) == (5, 0.05)
+    result = [quantile_threshold(rng.random(99), 0.05, 0.9) for _ in range(2000)]
+    true = np.array([1.0 - one.value for one in result])
+    k, n = result[0].rank, 99
+    assert (k, result[0].expected) == (5, 0.05)
     assert true.mean() == pytest.approx(0.05, abs=0.002)
     assert true.var() == pytest.approx(k * (n + 1 - k) / ((n + 1) ** 2 * (n + 2)), rel=0.1)
-    assert np.mean((found[0].low <= true) & (true <= found[0].high)) == pytest.approx(0.9, abs=0.02)
-    assert np.mean(true <= 0.05) == pytest.approx(at_most(found[0], 0.05), abs=0.03)
+    assert np.mean((result[0].low <= true) & (true <= result[0].high)) == pytest.approx(0.9, abs=0.02)
+    assert np.mean(true <= 0.05) == pytest.approx(at_most(result[0], 0.05), abs=0.03)
 
 
 def test_the_bound_is_held_as_often_as_promised():
@@ -82,17 +82,17 @@ def test_the_bound_is_held_as_often_as_promised():
 @settings(deadline=None)
 @given(distinct, st.floats(0.05, 0.5), st.integers(1, 9), st.integers(-100, 100))
 def test_a_threshold_moves_with_its_scores_and_falls_with_the_probability(scores, false_alarm, scale, shift):
-    found = quantile_threshold(scores, false_alarm)
-    assert found.value in scores
+    result = quantile_threshold(scores, false_alarm)
+    assert result.value in scores
     moved = quantile_threshold([scale * s + shift for s in scores], false_alarm)
-    assert moved.value == scale * found.value + shift
-    assert found.low < found.expected < found.high
-    assert found.expected <= false_alarm + 1e-12
-    assert quantile_threshold(scores, min(0.9, 1.5 * false_alarm)).value <= found.value
-    assert quantile_threshold(scores[::-1], false_alarm) == found
+    assert moved.value == scale * result.value + shift
+    assert result.low < result.expected < result.high
+    assert result.expected <= false_alarm + 1e-12
+    assert quantile_threshold(scores, min(0.9, 1.5 * false_alarm)).value <= result.value
+    assert quantile_threshold(scores[::-1], false_alarm) == result
 
 
 def test_ties_never_raise_the_probability():
-    found = quantile_threshold([0.0] * 50 + [1.0] * 50, 0.1)
-    assert found.value == 1.0
-    assert math.isclose(found.expected, 10 / 101)
+    result = quantile_threshold([0.0] * 50 + [1.0] * 50, 0.1)
+    assert result.value == 1.0
+    assert math.isclose(result.expected, 10 / 101)

@@ -295,7 +295,7 @@ def test_a_master_in_c_runs_the_unit(kind, given, value, span, steps, outputs, f
     numbers, refusal = done.stdout.splitlines()
     ours = [float(word) for word in numbers.split()]
     assert ours == list(unit.get(*outputs))
-    assert any(ours) == (kind == "machine")  # of a machine at rest a sensor estimates no block
+    assert any(ours) == (kind == "machine")  # of a machine at standstill a sensor estimates no block
     assert refusal.startswith("c: a value must be finite")
     unit.free()
 

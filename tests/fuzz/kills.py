@@ -122,9 +122,9 @@ def attack(call: str, folder: Path, kills: int, seed: int) -> Kills:
                 damaged = [name for name, data in results(place / "out").items() if data != expected.get(name)]
                 if call == "report" and any(not name.endswith(".part") for name in damaged):
                     count.differences.append(f"half-written after a kill: {damaged}")
-        found = results(place / "out")
-        if found != expected:
-            names = sorted(name for name in found.keys() | expected if found.get(name) != expected.get(name))
+        result = results(place / "out")
+        if result != expected:
+            names = sorted(name for name in result.keys() | expected if result.get(name) != expected.get(name))
             count.differences.append(f"{place.name}: {', '.join(names)}")
     return count
 

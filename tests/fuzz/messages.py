@@ -33,7 +33,7 @@ from .mutations import change_tree, changed_bytes
 from .targets import Use, taken
 
 SAMPLES = [0.001 * k for k in range(20)]
-SOUND: dict[str, Any] = {
+VALID: dict[str, Any] = {
     "actuator": "press 1",
     "t": 1.0,
     "rate": 50.0,
@@ -69,14 +69,14 @@ def messages(folder: Path) -> Use:
     """JSON and CBOR."""
 
     def use(draw: random.Random) -> bool:
-        tree = deepcopy(SOUND)
+        tree = deepcopy(VALID)
         change_tree(tree, draw)
         if draw.random() < 0.5:
-            tree[draw.choice([*SOUND, "no such"])] = deep(draw)
+            tree[draw.choice([*VALID, "no such"])] = deep(draw)
         try:
             whole = cbor2.dumps(tree) if draw.random() < 0.5 else json.dumps(tree, default=str).encode()
         except Exception:  # what cannot be written is no message
-            whole = cbor2.dumps(SOUND)
+            whole = cbor2.dumps(VALID)
         message = changed_bytes(whole, draw) if whole and draw.random() < 0.3 else whole
 
         def work() -> None:

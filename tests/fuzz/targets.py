@@ -273,7 +273,7 @@ count = 3
 """
 
 
-def _unmade(plan: SimulatedPlan, case: CampaignCase, keep: Path | None) -> CaseRow:
+def _unmade(plan: SimulatedPlan, case: CampaignCase, folder: Path | None) -> CaseRow:
     return CaseRow.of(case, error="not carried out")
 
 
@@ -347,7 +347,7 @@ def _products() -> tuple[Any, ...]:
 def kept(folder: Path) -> Use:
     """What a reproduction keeps: products and notes, changed in their bytes or in their structure."""
     results = ResultsFolder(folder / "results")
-    results.keep("fig-1", "k", _products(), ("figures/a.svg",))
+    results.save("fig-1", "k", _products(), ("figures/a.svg",))
     path = next((folder / "results" / "kept" / "items").glob("*.npz"))
     whole = path.read_bytes()
     with np.load(path) as file:

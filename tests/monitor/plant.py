@@ -68,8 +68,8 @@ def lines_of(recordings: dict[str, Recording], size: int) -> bytes:
 
 
 WORN = machine(1, G=step(0.0, 3.0e-13, at=100.0), duration=130.0, rate=50.0)
-SOUND = machine(2, duration=130.0, rate=50.0)
-LINES = lines_of({"press 1": WORN, "press 2": SOUND}, 150)
+HEALTHY = machine(2, duration=130.0, rate=50.0)
+LINES = lines_of({"press 1": WORN, "press 2": HEALTHY}, 150)
 
 
 def served(settings: MonitorSettings, lines: bytes = b"") -> tuple[Service, str]:

@@ -63,7 +63,7 @@ class Broker:
             time.sleep(0.05)
         raise RuntimeError("mosquitto does not answer")
 
-    def keep(self, client_id: str, topics: Iterable[str]) -> None:
+    def open_session(self, client_id: str, topics: Iterable[str]) -> None:
         """Make a client's session, so that what is published from now on is kept for it."""
         client = Client(CallbackAPIVersion.VERSION2, client_id, protocol=MQTTProtocolVersion.MQTTv5)
         properties = Properties(PacketTypes.CONNECT)

@@ -51,7 +51,7 @@ def port(broker: Broker) -> int:
 
 def kept(broker: Broker) -> None:
     """Let the broker keep what comes for the monitor of `SETTINGS` from now on."""
-    broker.keep("sealscope-monitor", ("plant/press 1", "plant/press 2"))
+    broker.open_session("sealscope-monitor", ("plant/press 1", "plant/press 2"))
 
 
 class Running:

@@ -42,7 +42,7 @@ from .servers import MOSQUITTO, Broker
 from .test_broker import SETTINGS, Running, send
 from .test_outputs import LINES, WORN
 
-SOUND = WORN.between(0.0, 62.0)
+HEALTHY = WORN.between(0.0, 62.0)
 
 
 def nested(key: str, depth: int) -> bytes:
@@ -81,9 +81,9 @@ def test_a_message_that_cannot_be_decoded_is_acknowledged_and_kept(tmp_path: Pat
     broker = Broker(tmp_path)
     (tmp_path / "monitor.toml").write_text(SETTINGS.format(port=broker.port))
     settings = read_settings(tmp_path / "monitor.toml")
-    broker.keep("sealscope-monitor", ("plant/press 1", "plant/press 2"))
+    broker.open_session("sealscope-monitor", ("plant/press 1", "plant/press 2"))
     try:
-        sound = LINES.splitlines()[:6]
+        valid = LINES.splitlines()[:6]
         from paho.mqtt import publish
         from paho.mqtt.enums import MQTTProtocolVersion
 
@@ -96,10 +96,10 @@ def test_a_message_that_cannot_be_decoded_is_acknowledged_and_kept(tmp_path: Pat
                 port=broker.port,
                 protocol=MQTTProtocolVersion.MQTTv5,
             )
-        send(broker.port, sound)
+        send(broker.port, valid)
         first = Running(settings)
         try:
-            first.until(len(sound))
+            first.until(len(valid))
             until(lambda: len(first.service.store.refused()) == 3)  # they are stored after the blocks
             assert first.service.store.refused()[-1]["beginning"] == nested("actuator", 1000)[:4000]
         finally:
@@ -131,7 +131,7 @@ def blocks_of(service: Service) -> list[tuple[str, str]]:
 def test_names_are_bytes(tmp_path: Path):
     settings = settings_in(tmp_path, folder_settings(tmp_path, "press 3", "press 4"))
     for folder in ("press 3", "press 4"):
-        write(SOUND.only(CHANNELS), tmp_path / folder / "a.csv")
+        write(HEALTHY.only(CHANNELS), tmp_path / folder / "a.csv")
     os.rename(tmp_path / "press 3" / "a.csv", os.fsencode(tmp_path / "press 3") + b"/pr\xe9sse.csv")  # noqa: PTH104
     for _ in range(2):  # the second time after a restart
         service, _ = served(settings)
@@ -148,7 +148,7 @@ def test_a_file_that_cannot_be_read_is_named_once_and_not_read_again(tmp_path: P
         reads.append(path.name)
         if path.name.startswith("b"):
             raise {"b1.csv": MemoryError(), "b2.csv": RuntimeError("the reader crashed")}[path.name]
-        return SOUND
+        return HEALTHY
 
     monkeypatch.setattr("sealscope.monitor.sources.folder.read", read)
     settings = settings_in(tmp_path, folder_settings(tmp_path, "press 3"))
@@ -191,7 +191,7 @@ def test_a_file_that_fails_is_read_twice_at_most(tmp_path: Path, monkeypatch):
 
 
 def test_a_file_of_the_future_is_read_and_named(tmp_path: Path, caplog):
-    write(SOUND.only(CHANNELS), tmp_path / "a.csv")
+    write(HEALTHY.only(CHANNELS), tmp_path / "a.csv")
     os.utime(tmp_path / "a.csv", (4e9, 4e9))
     blocks = watched_folder(tmp_path, 0.05)
     assert blocks() == []
@@ -210,7 +210,7 @@ def test_a_link_to_a_foreign_file_is_not_followed(tmp_path: Path, caplog):
     folder.mkdir()
     (folder / "link.csv").symlink_to(secret)
     (folder / "circle.csv").symlink_to(folder / "circle.csv")
-    write(SOUND.only(CHANNELS), folder / "a.csv")
+    write(HEALTHY.only(CHANNELS), folder / "a.csv")
     (folder / "within.csv").symlink_to(folder / "a.csv")
     blocks = watched_folder(folder)
     assert len([block for block in blocks() if isinstance(block, SourceBlock) and block.samples is not None]) == 2
@@ -224,7 +224,7 @@ def test_a_removed_folder_is_one_outage_and_the_others_go_on(tmp_path: Path, mon
     settings = settings_in(tmp_path, folder_settings(tmp_path, "press 3", "press 4"))
     settings = settings.model_copy(update={"lines": False})
     (tmp_path / "press 3").rmdir()
-    write(SOUND.only(CHANNELS), tmp_path / "press 4" / "a.csv")
+    write(HEALTHY.only(CHANNELS), tmp_path / "press 4" / "a.csv")
     running = Running(settings)
     try:
         until(lambda: len(blocks_of(running.service)) == 1)
@@ -233,7 +233,7 @@ def test_a_removed_folder_is_one_outage_and_the_others_go_on(tmp_path: Path, mon
         assert outage["part"] == "folder of press 3"
         assert len([record for record in caplog.records if "press 3" in record.getMessage()]) == 1
         (tmp_path / "press 3").mkdir()
-        write(SOUND.only(CHANNELS), tmp_path / "press 3" / "a.csv")
+        write(HEALTHY.only(CHANNELS), tmp_path / "press 3" / "a.csv")
         until(lambda: len(blocks_of(running.service)) == 2 and not running.service.outages.plain())
     finally:
         running.end()
@@ -434,7 +434,7 @@ def test_a_workbook_and_a_bomb_that_end_their_reader_are_named_once(tmp_path: Pa
     workbook(folder / "corner.xlsx", [rows([("A1", 1), ("XFD1048576", 2)])])
     (folder / "bomb.csv.gz").write_bytes(gzip.compress(bytes(4_000_000), 9) * 250)
     for where in (folder, tmp_path / "press 4"):
-        write(SOUND.only(CHANNELS), where / "sound.csv")
+        write(HEALTHY.only(CHANNELS), where / "healthy.csv")
     service, _ = served(settings)
     assert service.actuators.counters == {UNREADABLE_FILE: 2}
     assert len(blocks_of(service)) == 4

@@ -1,6 +1,6 @@
 """A running service under malformed, oversized, late, replayed and forged messages: each is counted by its reason.
 
-What the sound messages among them leave in the database is what they leave without the others.
+What the valid messages among them leave in the database is what they leave without the others.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from sealscope.monitor.sources.source_block import (
     WRONG_UNITS,
 )
 
-from .plant import LINES, SOUND, message, rows_of, served, settings_in
+from .plant import HEALTHY, LINES, message, rows_of, served, settings_in
 
 UNKNOWN = "blocks of an actuator that is not in the settings"
 REPEATED = "blocks stored already"
-BRIEF = message("press 1", SOUND.samples(slice(0, 5)))
+BRIEF = message("press 1", HEALTHY.samples(slice(0, 5)))
 #: Messages of one wrong value, by the reason they are counted under.
 FORGED: list[tuple[str, dict[str, object]]] = [
     (NO_MAPPING, {"valve": 3}),
@@ -78,14 +78,14 @@ FORGED: list[tuple[str, dict[str, object]]] = [
 
 
 class HostileWire:
-    """A stream of lines: those of `sound` in their order, and `count` hostile ones between them.
+    """A stream of lines: those of `valid` in their order, and `count` hostile ones between them.
 
     `sent`: hostile ones by the reason they must be counted under; `odd`: those whose samples are for the stream of
     "press 3" to judge; `memory`: resident bytes after a fifth of the lines, and after all.
     """
 
-    def __init__(self, sound: list[bytes], count: int, largest: int) -> None:
-        self._random, self._sound, self._count, self._largest = np.random.default_rng(count), sound, count, largest
+    def __init__(self, valid: list[bytes], count: int, largest: int) -> None:
+        self._random, self._valid, self._count, self._largest = np.random.default_rng(count), valid, count, largest
         self.sent: Counter[str] = Counter()
         self.odd = 0
         self.memory: list[int] = []
@@ -102,13 +102,13 @@ class HostileWire:
         return part
 
     def _mixed(self) -> Iterator[bytes]:
-        every = self._count // len(self._sound)
+        every = self._count // len(self._valid)
         before_reading = 9 * self._count // 10  # the last line is read when no large one is under way
         large = set(self._random.choice(before_reading, self._largest, replace=False).tolist())
         for number in range(self._count):
-            if number % every == 0 and (at := number // every) < len(self._sound):
-                yield self._sound[at] + b"\n"
-                self._passed.append(self._sound[at])
+            if number % every == 0 and (at := number // every) < len(self._valid):
+                yield self._valid[at] + b"\n"
+                self._passed.append(self._valid[at])
             if number in (self._count // 5, self._count - 1):
                 self.memory.append(_resident())
             reason, line = self._large(number) if number in large else self._hostile(number)
@@ -141,7 +141,7 @@ class HostileWire:
     def _odd_samples(self, number: int) -> bytes:
         """Samples of "press 3" that are early, late, repeated, out of order, huge, missing or at an odd rate."""
         start = 5 * int(self._random.integers(0, 1200))
-        values = message("press 3", SOUND.samples(slice(start, start + 5)))
+        values = message("press 3", HEALTHY.samples(slice(start, start + 5)))
         kind = self._random.integers(6)
         if kind == 0:
             values["t"] += float(self._random.choice([-1e9, 1e9, 1e15, -1e300, 1e300]))
@@ -231,7 +231,7 @@ def flooded(tmp_path: Path, count: int, largest: int) -> None:
     assert len(passed_over) < 20
     before, after = wire.memory
     print(f"{count} messages: {(after - before) / 1e6:.1f} MB more after four fifths of them")
-    assert after - before < 20_000_000 or count < 10_000  # a brief run does not come to rest
+    assert after - before < 20_000_000 or count < 10_000  # a brief run does not stop
     ours, theirs = rows_of(service.settings.database), rows_of(str(plain / "monitor.db"))
     for table, rows in theirs.items():
         assert [row for row in ours[table] if "press 3" not in row] == rows, table

@@ -123,15 +123,15 @@ def test_mutated_messages_are_blocks_or_refused(count: int):
 
 
 def test_no_samples_raise_or_warn():
-    """Infinite, huge and missing values, times out of order, rates of any size, between sound samples."""
-    random, sound = np.random.default_rng(5), machine(1, duration=120.0, rate=50.0)
+    """Infinite, huge and missing values, times out of order, rates of any size, between valid samples."""
+    random, healthy = np.random.default_rng(5), machine(1, duration=120.0, rate=50.0)
     watch = ss.watch("thesis", learn_hours=0.02)
-    watch.update(sound)
+    watch.update(healthy)
     blocks = watch.blocks
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for number in range(150):
-            part = sound.samples(slice(0, 400))
+            part = healthy.samples(slice(0, 400))
             channels = {name: values.copy() for name, values in part.channels.items()}
             t, rate = part.t + 120.0 + 8.0 * number, 50.0
             name = list(channels)[random.integers(len(channels))]

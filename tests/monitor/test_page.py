@@ -23,7 +23,7 @@ from sealscope.monitor.service import Service
 from sealscope.monitor.settings import MonitorSettings, PageSettings
 from sealscope.recordings.recording import Recording
 
-from .plant import SOUND, WORN, lines_of, until
+from .plant import HEALTHY, WORN, lines_of, until
 
 HOSTILE = '<img src=x onerror="document.title=1">\\ \n&amp;'
 #: A browser that draws two frames a second, as where many look at many pages.
@@ -53,10 +53,10 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
             "database": str(tmp_path_factory.mktemp("page") / "monitor.db"),
             "lines": True,
             "defaults": {"learn_hours": 0.02, "warning_lpm": 0.0005},
-            "actuator": [{"name": "a sound one"}, {"name": HOSTILE}],
+            "actuator": [{"name": "a healthy one"}, {"name": HOSTILE}],
         }
     )
-    lines = lines_of({HOSTILE: WORN, "a sound one": SOUND}, 500)
+    lines = lines_of({HOSTILE: WORN, "a healthy one": HEALTHY}, 500)
     service = Service(settings, once=True, stdin=io.BytesIO(lines), stdout=io.StringIO())
     service.run()
     return service
@@ -89,7 +89,7 @@ def test_everything_is_served_and_nothing_comes_from_elsewhere(page: TestClient)
 
 def test_the_leaking_one_comes_first_with_its_life(page: TestClient):
     rows = page.get("/api/fleet").json()["actuators"]
-    assert [row["name"] for row in rows] == [HOSTILE, "a sound one"]
+    assert [row["name"] for row in rows] == [HOSTILE, "a healthy one"]
     assert rows[0]["alarm"]["level"] == "warning"
     life = page.get(of(HOSTILE)).json()
     assert life["name"] == HOSTILE
@@ -100,19 +100,19 @@ def test_the_leaking_one_comes_first_with_its_life(page: TestClient):
 
 
 def test_a_course_of_many_blocks_is_means(service: Service):
-    whole = service.store.course("a sound one")
-    few = service.store.course("a sound one", most=10)
+    whole = service.store.course("a healthy one")
+    few = service.store.course("a healthy one", most=10)
     assert len(few) <= 11
     assert few[5]["total_lpm"] == pytest.approx(sum(row["total_lpm"] for row in whole[24:29]) / 5, rel=0.05)
 
 
 def test_a_mark_needs_the_page_and_an_alarm(page: TestClient):
-    address, header = mark_of("a sound one"), {"X-Sealscope": "mark"}
+    address, header = mark_of("a healthy one"), {"X-Sealscope": "mark"}
     assert page.post(address, json={"mark": "acknowledged"}).status_code == 403
     answer = page.post(address, json={"mark": "acknowledged"}, headers=header)
     assert (answer.status_code, answer.json()) == (
         400,
-        {"error": "a sound one must have an alarm to be acknowledged, got none"},
+        {"error": "a healthy one must have an alarm to be acknowledged, got none"},
     )
     for body in (b"{", b"[]", b'{"mark": 3}', b'{"mark": "' + b"x" * 20_000 + b'"}', b'{"mark": "away"}'):
         assert page.post(address, content=body, headers=header).status_code == 400
@@ -153,7 +153,7 @@ def test_prometheus_reads_the_metrics(page: TestClient):
     leaks = {sample.labels["actuator"]: sample.value for sample in families["sealscope_leak_lpm"].samples}
     assert leaks[HOSTILE] == pytest.approx(0.00195, rel=0.1)
     words = {sample.labels["actuator"]: sample.value for sample in families["sealscope_status_word"].samples}
-    assert words == {HOSTILE: 5.0, "a sound one": 0.0}
+    assert words == {HOSTILE: 5.0, "a healthy one": 0.0}
     assert families["sealscope_blocks"].type == "counter"
 
 
@@ -224,8 +224,11 @@ def test_the_page_in_a_browser(service: Service, tmp_path: Path):
                 view = browser.new_page(viewport={"width": width, "height": 900})
                 view.add_init_script(SLOW_FRAMES)
                 errors: list[str] = []
-                view.on("pageerror", lambda error, seen=errors: seen.append(str(error)))
-                view.on("console", lambda line, seen=errors: seen.append(line.text) if line.type == "error" else None)
+                view.on("pageerror", lambda error, observed=errors: observed.append(str(error)))
+                view.on(
+                    "console",
+                    lambda line, observed=errors: observed.append(line.text) if line.type == "error" else None,
+                )
                 view.goto(server.address)
                 view.wait_for_selector("#alarm:not([hidden])")
                 assert view.text_content("#life-title") == HOSTILE
@@ -316,14 +319,14 @@ def test_silence_and_a_duty_that_is_not_known_have_delays_of_their_own(tmp_path:
         service.run()
         return service.states()["a"]
 
-    t, other = SOUND.t, SOUND.t > 90.0
-    channels = {name: np.where(other, SOUND[name][0], SOUND[name]) for name in SOUND.channels}
-    resting = Recording(t, channels, SOUND.units, SOUND.rate)  # from 90 s on it stands still
-    assert state("sound", SOUND)["condition"] == "watched"
+    t, other = HEALTHY.t, HEALTHY.t > 90.0
+    channels = {name: np.where(other, HEALTHY[name][0], HEALTHY[name]) for name in HEALTHY.channels}
+    resting = Recording(t, channels, HEALTHY.units, HEALTHY.rate)  # from 90 s on it stands still
+    assert state("healthy", HEALTHY)["condition"] == "watched"
     assert state("patient", resting, not_comparable_s=1e4)["condition"] == "watched"
     own = state("impatient", resting, not_comparable_s=20.0)
     assert (own["condition"], own["name"]) == ("not comparable", "out of specification")
     assert own["since_s"] == pytest.approx(90.0, abs=4.0)
-    silent = state("silent", SOUND, no_data_s=1e-6)
+    silent = state("silent", HEALTHY, no_data_s=1e-6)
     assert (silent["condition"], silent["name"], silent["since_s"] > 120.0) == ("no data", "check function", True)
     assert state("leaking", WORN, no_data_s=1e-6)["condition"] == "leak"  # which silence does not take back

@@ -27,7 +27,7 @@ from sealscope.monitor.page.site import site
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import PageSettings
 
-from .plant import LINES, SOUND, WORN, kill_often, lines_of, rows_of, served, settings_in, until
+from .plant import HEALTHY, LINES, WORN, kill_often, lines_of, rows_of, served, settings_in, until
 from .servers import NO_POSTGRESQL, PostgreSQL
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(NO_POSTGRESQL is not None, reason=NO_POSTGRESQL or "")]
@@ -59,7 +59,7 @@ def test_kills_change_no_row_in_postgresql(undisturbed, url: str, tmp_path: Path
 
 
 SHARED = '\n[share]\nname = "{name}"\nlease_s = 2.0\n'
-FOUR = {"press 1": WORN, "press 2": SOUND, "press 3": SOUND, "press 4": WORN}
+FOUR = {"press 1": WORN, "press 2": HEALTHY, "press 3": HEALTHY, "press 4": WORN}
 
 
 def test_three_monitors_share_the_actuators_and_take_over_those_of_a_killed_one(url: str, tmp_path: Path):

@@ -92,7 +92,7 @@ def test_the_page_behind_a_proxy_with_tls(proxy: http.client.HTTPSConnection):
     assert "sealscope_reached" in asked(proxy, "/metrics", Authorization="Bearer the token")[2]
     proxy.request("GET", "/api/changes", headers={"Cookie": session})
     stream = proxy.getresponse()
-    assert stream.readline().startswith(b"data: ")  # it is not held back
+    assert stream.readline().startswith(b"data: ")  # it is sent at once
     assert stream.getheader("Strict-Transport-Security") is not None
     proxy.close()
     guesses = [

@@ -36,7 +36,7 @@ from sealscope.monitor.sources.sparkplug_host import GAPS, SparkplugHost
 from sealscope.monitor.sparkplug import SparkplugMetric, SparkplugPayload, decoded_payload, encoded
 from sealscope.recordings.recording import Recording
 
-from .plant import CHANNELS, SOUND, WORN, message, rows_of, settings_in
+from .plant import CHANNELS, HEALTHY, WORN, message, rows_of, settings_in
 
 DOUBLES = 31
 UNITS = {"p_A": "Pa", "p_B": "Pa", "x": "m", "theta": "rad"}
@@ -196,9 +196,9 @@ def as_source(samples: dict[str, Recording], size: int) -> Callable[[BlockReceiv
                 part = recording.samples(slice(start, start + size))
                 if len(part):
                     metrics = arrays(part, round(1000.0 * float(part.t[0])))
-                    told = message(device, part)
-                    if "T_oil" in told:  # of a time of its own
-                        metrics.append(SparkplugMetric("T_oil", told["T_oil"], sparkplug.DOUBLE, timestamp=1))
+                    readings = message(device, part)
+                    if "T_oil" in readings:  # of a time of its own
+                        metrics.append(SparkplugMetric("T_oil", readings["T_oil"], sparkplug.DOUBLE, timestamp=1))
                     messages.append(("DDATA", device, metrics))
         for seq, (kind, device, metrics) in enumerate(messages):
             wire = encoded(SparkplugPayload(1, tuple(metrics), seq % 256))
@@ -217,7 +217,7 @@ def test_samples_by_sparkplug_are_samples(undisturbed, tmp_path):
         for actuator in settings.actuator
     ]
     settings = settings.model_copy(update={"actuator": actuators})
-    source = as_source({"press 1": WORN, "press 2": SOUND}, 150)
+    source = as_source({"press 1": WORN, "press 2": HEALTHY}, 150)
     service = Service(settings, once=True, stdin=io.BytesIO(), stdout=io.StringIO(), sources=[source])
     service.run()
     assert service.actuators.counters == {}
@@ -281,12 +281,12 @@ def test_a_node_may_be_the_actuator_itself():
     plant = Plant(device=None)
     number = SparkplugMetric("bdSeq", 1, sparkplug.INT64)
     assert plant.send("NBIRTH", number, *births()) is None
-    block = plant.send("NDATA", *arrays(SOUND.samples(slice(0, 5)), 40))
+    block = plant.send("NDATA", *arrays(HEALTHY.samples(slice(0, 5)), 40))
     assert (block.actuator, len(block.samples)) == ("press 1", 5)
 
 
 def test_a_missing_number_asks_for_a_birth_and_aliases_wait_for_it(monkeypatch):
-    part = arrays(SOUND.samples(slice(0, 5)), 40)
+    part = arrays(HEALTHY.samples(slice(0, 5)), 40)
     by_alias = [SparkplugMetric(None, metric.value, DOUBLES, alias=k, timestamp=40) for k, metric in enumerate(part)]
     plant = Plant()
     assert plant.refused("DDATA", *part) == UNBORN  # the host has just begun
@@ -372,12 +372,12 @@ def test_times_in_whole_milliseconds_make_no_gap(rate, rounded):
 def test_mutated_payloads_are_blocks_or_refused(count):
     random, plant = np.random.default_rng(count), Plant()
     plant.born(*births())
-    sound = encoded(SparkplugPayload(1, tuple(arrays(SOUND.samples(slice(0, 20)), 40)), 2))
+    valid = encoded(SparkplugPayload(1, tuple(arrays(HEALTHY.samples(slice(0, 20)), 40)), 2))
     birth = encoded(SparkplugPayload(1, tuple(births()), 1))
     outcomes: Counter[str] = Counter()
     for _ in range(count):
         kind = ("DDATA", "DDATA", "DBIRTH", "NBIRTH", "NDEATH")[random.integers(5)]
-        data = bytearray(birth if kind.endswith("BIRTH") else sound)
+        data = bytearray(birth if kind.endswith("BIRTH") else valid)
         for _ in range(random.integers(0, 4)):
             at = int(random.integers(len(data)))
             if random.integers(2):

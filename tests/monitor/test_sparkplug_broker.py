@@ -21,7 +21,7 @@ from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import read_settings
 
-from .plant import CHANNELS, SOUND, WORN, rows_of, until
+from .plant import CHANNELS, HEALTHY, WORN, rows_of, until
 from .servers import MOSQUITTO, NO_POSTGRESQL, Broker, PostgreSQL
 from .test_broker import Running
 
@@ -171,13 +171,13 @@ def test_samples_and_alarms_over_sparkplug(
         running.until(blocks)
         assert len(rows_of(settings.database)["blocks"]) == blocks
 
-        def told(event: str) -> bool:
+        def said(event: str) -> bool:
             sent = [values(payload) for payload in wire.of("Sealscope/DDATA/monitor/press 1")]
             return any(each.get("Alarm/Event") == event for each in sent)
 
-        until(lambda: told("raised"))
+        until(lambda: said("raised"))
         running.service.actuators.mark("press 1", "acknowledged", by_whom="Ada")
-        until(lambda: told("acknowledged"))
+        until(lambda: said("acknowledged"))
         rebirth = spb.Metric(timestamp=1, name="Node Control/Rebirth", datatype=spb.DataType.BOOLEAN, value=True)
         wire.publish("spBv1.0/Sealscope/NCMD/monitor", spb.NCmd(timestamp=1, metrics=(rebirth,)))
         births = wire.until("Sealscope/NBIRTH/monitor", 2)
@@ -218,7 +218,7 @@ def test_samples_and_alarms_over_sparkplug(
 def told_in_parts(node: EdgeNode, start: int, stop: int) -> None:
     """Let the node tell samples of both devices, 150 at a time."""
     for at in range(start, stop, 150):
-        for k, (device, recording) in enumerate((("press 1", WORN), ("press 2", SOUND))):
+        for k, (device, recording) in enumerate((("press 1", WORN), ("press 2", HEALTHY))):
             node.tell(k, device, recording.samples(slice(at, at + 150)))
         time.sleep(0.02)  # of QoS 0 a broker keeps none
 

@@ -37,7 +37,7 @@ def supervisor(stopping: threading.Event) -> tuple[Supervisor, Outages]:
 @pytest.mark.parametrize("error", [KeyError("no such thing"), RecursionError(), SystemExit(3), Panic("unwrap")])
 def test_a_part_that_fails_is_an_outage_and_starts_again(monkeypatch, caplog, error):
     monkeypatch.setattr("sealscope.monitor.supervisor.FIRST_PAUSE_S", 0.05)
-    monkeypatch.setattr("sealscope.monitor.supervisor._SOUND_S", 1.0)
+    monkeypatch.setattr("sealscope.monitor.supervisor._WORKING_S", 1.0)
     stopping = threading.Event()
     supervised, outages = supervisor(stopping)
     starts: list[float] = []
@@ -140,11 +140,11 @@ def test_an_error_while_blocks_are_at_hand_loses_and_repeats_none(tmp_path, monk
     served(settings_in(plain), FEW)
     store, calls = Service._store, iter(range(1000))
 
-    def failing(self: Service, blocks: Any, keep: Any) -> None:
+    def failing(self: Service, blocks: Any, write: Any) -> None:
         number = next(calls)
         if number == 0:
             raise Panic("before")
-        store(self, blocks, keep)
+        store(self, blocks, write)
         if number == 2:
             raise Panic("after")
 

@@ -170,20 +170,20 @@ def test_a_level_is_stated_with_what_warm_oil_may_have_of_it():
     assert baseline.rise(1e5, 3.9e-13, 1e-15, 1e-6) is None
 
 
-def test_a_machine_at_rest_is_not_judged():
+def test_a_machine_at_standstill_is_not_judged():
     still = machine(4, speed=lambda t: np.where(t < 130.0, 12.0 * np.sin(4.0 * t), 0.0), duration=170.0, rate=50.0)
     watch, estimates = run(still, [1000])
-    assert estimates[-1].status == "at rest"
+    assert estimates[-1].status == "at standstill"
     assert watch.leak is None
-    assert watch.counters["blocks: at rest"] > 5
+    assert watch.counters["blocks: at standstill"] > 5
 
 
 def test_a_repair_begins_a_new_baseline():
     watch = Watch.from_state(WHOLE[0].state())
     watch.relearn()
     assert watch.leak is None and watch.baseline is None
-    sound = machine(5, duration=90.0, rate=50.0)
-    _, estimates = run(moved(sound, 400.0), [900], watch)
+    healthy = machine(5, duration=90.0, rate=50.0)
+    _, estimates = run(moved(healthy, 400.0), [900], watch)
     assert watch.baseline is not None and watch.baseline.version == 2
     assert watch.leak is None
     assert estimates[-1].status == "watched"

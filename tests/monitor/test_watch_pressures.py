@@ -47,8 +47,8 @@ def whole() -> tuple[Watch, list[BlockEstimate]]:
     return run(worn(), len(worn()))
 
 
-#: Seconds of sound running, after which the baseline is known, and the state then.
-SOUND = 500.0
+#: Seconds of healthy running, after which the baseline is known, and the state then.
+HEALTHY = 500.0
 
 
 def part(first: float, last: float) -> Recording:
@@ -67,9 +67,9 @@ def test_a_leak_is_stated_in_litres_per_minute_with_its_onset():
     assert low_lpm <= LEAK <= high_lpm
     assert estimates[-1].leak_lpm == pytest.approx(LEAK, rel=0.3)
     assert watch.leak.cause == "leak inside or outside"
-    sound = [estimate for estimate in estimates if estimate.status == "watched" and estimate.t < OPENS]
-    assert len(sound) > 20
-    assert all(estimate.leak_interval_lpm[0] == 0.0 for estimate in sound)
+    healthy = [estimate for estimate in estimates if estimate.status == "watched" and estimate.t < OPENS]
+    assert len(healthy) > 20
+    assert all(estimate.leak_interval_lpm[0] == 0.0 for estimate in healthy)
     assert all(estimate.total_lpm is None for estimate in estimates)  # the level is not known well enough
     assert watch.baseline.lpm is None
     assert watch.baseline.level == pytest.approx(2e-13, abs=1.5e-12)
@@ -92,7 +92,7 @@ def test_cuts_and_restarts_change_nothing(size: int, stop: int):
 
 @pytest.fixture(scope="module")
 def learned() -> str:
-    return json.dumps(run(part(0, SOUND), 50_000)[0].state())
+    return json.dumps(run(part(0, HEALTHY), 50_000)[0].state())
 
 
 def moved(recording: Recording, seconds: float) -> Recording:
@@ -107,7 +107,7 @@ def test_a_short_gap_is_bridged_and_after_a_pause_nothing_before_counts(learned:
     shown = [estimate.leak_lpm for estimate in bridged if estimate.leak_lpm is not None]
     assert abs(np.mean(shown)) < 0.004
     _, paused = run(moved(part(640, 780), 3600.0), 5_000, watch)  # it leaks, and the onset lies within the pause
-    assert {estimate.status for estimate in paused} <= {"settling", "at rest"}  # too little is known, or nothing
+    assert {estimate.status for estimate in paused} <= {"settling", "at standstill"}  # too little is known, or nothing
     assert watch.leak is None and watch.baseline.level == level
     assert watch.counters["gap"] == 2
 
@@ -166,6 +166,6 @@ def test_a_damaged_state_is_refused_in_one_line(damage: str):
 
 def test_a_rig_of_assumptions_states_no_litres():
     watch = ss.watch(ss.load_rig("thesis").as_assumed("for this test"), learn_hours=LEARN)
-    _, estimates = run(part(0, SOUND), 50_000, watch)
+    _, estimates = run(part(0, HEALTHY), 50_000, watch)
     assert watch.baseline is not None
     assert all(replace(estimate, status="") == BlockEstimate(estimate.number, estimate.t, "") for estimate in estimates)

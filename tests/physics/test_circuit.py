@@ -1,4 +1,4 @@
-"""A single-rod cylinder: its valves and accumulator against closed forms, oil, rest, an independent program."""
+"""A single-rod cylinder: its valves and accumulator against closed forms, oil, standstill, an independent program."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.physics.external import pilot_opening, pilot_valve_flow, polytropic_pressure
 from sealscope.physics.fluid import P_ATM
-from sealscope.physics.rest import initial_state, rest_pressures
+from sealscope.physics.standstill import initial_state, standstill_pressures
 from sealscope.simulation.experiment import Experiment
 
 #: Constant volumes: volume flows are balanced.
@@ -144,7 +144,7 @@ def test_a_run_starts_in_equilibrium_whatever_the_load(drive, force, x_0):
 
 def test_a_closed_circuit_carries_a_load_with_the_oil_it_has(check_rig):
     rig = check_rig(F_l=200.0)
-    p_A, p_B = rest_pressures(rig, 200.0)
+    p_A, p_B = standstill_pressures(rig, 200.0)
     assert p_A + p_B == pytest.approx(2 * rig.fluid.p_charge)
     assert (p_A - p_B) * rig.cylinder.A_A == pytest.approx(200.0)
     unloaded = initial_state(check_rig(), 0.1)
@@ -154,10 +154,12 @@ def test_a_closed_circuit_carries_a_load_with_the_oil_it_has(check_rig):
 
 def test_a_load_that_nothing_can_hold_is_refused_in_a_line(check_rig):
     with pytest.raises(
-        InputError, match=r"a load of 2000 N must be carried at rest .* above vacuum.*p_charge.*make-up"
+        InputError, match=r"a load of 2000 N must be carried at standstill .* above vacuum.*p_charge.*make-up"
     ):
         initial_state(check_rig(F_l=2000.0), 0.0)
-    with pytest.raises(InputError, match=r"drive must hold the load of 4e\+04 N at rest, which takes .* at most 23 A"):
+    with pytest.raises(
+        InputError, match=r"drive must hold the load of 4e\+04 N at standstill, which takes .* at most 23 A"
+    ):
         initial_state(single_rod(F_l=4e4), 0.0)
 
 

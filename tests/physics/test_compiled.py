@@ -58,9 +58,9 @@ def ask(source: Path, code: str, cache: Path | str, **more: str) -> tuple[float,
         "SEALSCOPE_CACHE_DIR": str(cache),
         "PYTHONDONTWRITEBYTECODE": "1",
     }
-    told = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
-    assert told.returncode == 0, told.stderr
-    value, hits, folder = told.stdout.split(maxsplit=2)
+    process = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    assert process.returncode == 0, process.stderr
+    value, hits, folder = process.stdout.split(maxsplit=2)
     return float(value), int(hits), folder.strip()
 
 

@@ -165,6 +165,6 @@ def test_other_laws_in_lanes_are_what_they_are_alone(check_rig, throttled, value
     batch = simulate_batch(experiments, bounds=[0.0, 4.0])
     for k, one in enumerate(experiments):
         alone = simulate_with_truth(one).recording
-        found = details(alone["p_A"])
-        rms = np.sqrt(np.mean(found.values[:, found.inside()] ** 2, axis=1))
+        result = details(alone["p_A"])
+        rms = np.sqrt(np.mean(result.values[:, result.inside()] ** 2, axis=1))
         np.testing.assert_allclose(batch.rms[k, 0, 0, :4], rms, rtol=1e-3)

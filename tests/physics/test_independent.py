@@ -12,7 +12,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from sealscope.parameters import load_rig
-from sealscope.physics.rest import initial_state
+from sealscope.physics.standstill import initial_state
 from sealscope.physics.state import STATES
 from sealscope.simulation.courses import parse_force
 from sealscope.simulation.experiment import Experiment

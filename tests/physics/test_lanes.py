@@ -24,10 +24,10 @@ from sealscope.physics.lanes import (
     store,
 )
 from sealscope.physics.motor import winding_current_rate
-from sealscope.physics.rest import initial_state
 from sealscope.physics.restrictors import implicit_orifice_flow, orifice_flow
 from sealscope.physics.rig import CHOICES, NUMBERS, OUTPUTS, RigNumbers, rig_numbers
 from sealscope.physics.solvers.rk4 import RK4_NODES
+from sealscope.physics.standstill import initial_state
 from sealscope.physics.vector.runs import (
     ACCOUNTS,
     CHANNELS,

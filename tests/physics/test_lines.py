@@ -21,7 +21,6 @@ from sealscope.physics.cylinder import opposing_force
 from sealscope.physics.fluid import kinematic_viscosity, thermal_density, thermal_stiffness
 from sealscope.physics.lanes import WIDTH
 from sealscope.physics.pump import friction_torque, loss_coefficients, turbulent_slip
-from sealscope.physics.rest import initial_state
 from sealscope.physics.restrictors import (
     behind_shut_off,
     behind_valve,
@@ -33,6 +32,7 @@ from sealscope.physics.restrictors import (
 )
 from sealscope.physics.rig import NUMBERS, rig_numbers
 from sealscope.physics.solvers.imex import IMEX_NODES
+from sealscope.physics.standstill import initial_state
 from sealscope.physics.vector.runs import ACCOUNTS, CHANNELS, LEAK_ROWS, advance_lanes_imex
 from sealscope.simulation.batch.run import in_lanes
 from sealscope.simulation.experiment import Experiment

@@ -40,9 +40,9 @@ def test_rk4_is_of_order_four_on_the_linear_rig(check_rig, drive):
     for h in steps:
         run = drive(rig, 0.5, u=lambda t: np.full_like(t, 2.0), G=5e-13, rate=100.0, step=h)
         truth = exact(rig, 2.0, 5e-13, run.t)
-        found = np.column_stack([run[name] for name in names])
+        result = np.column_stack([run[name] for name in names])
         scale = np.abs(truth).max(axis=0)
-        errors.append(np.sqrt(np.mean(((found - truth) / scale) ** 2, axis=0)))
+        errors.append(np.sqrt(np.mean(((result - truth) / scale) ** 2, axis=0)))
     assert np.all(errors[0] < 1e-5)
     orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
     np.testing.assert_allclose(orders, 4.0, atol=0.1, err_msg=f"columns {names}")

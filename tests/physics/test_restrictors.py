@@ -62,7 +62,7 @@ def test_a_one_way_throttle_has_a_coefficient_for_each_direction():
 @example(total=-1e-9, g=1e14, c_forward=1e-3, c_reverse=1e-3, dp_0=1.0)
 def test_the_implicit_flow_is_that_of_the_root_that_brentq_finds(total, g, c_forward, c_reverse, dp_0):
     c = c_forward if total > 0 else c_reverse
-    found = implicit_orifice_flow(total, g, c_forward, c_reverse, dp_0)
+    result = implicit_orifice_flow(total, g, c_forward, c_reverse, dp_0)
     # in d = dp_0 sinh(s) the root is well scaled whatever the decade
     size = abs(total)
 
@@ -74,7 +74,7 @@ def test_the_implicit_flow_is_that_of_the_root_that_brentq_finds(total, g, c_for
     if size > 0:
         s = brentq(residual, 0.0, 1.001 * math.asinh(size / dp_0), xtol=1e-300, rtol=8.9e-16, maxiter=1000)
     expected = flow(math.copysign(dp_0 * math.sinh(s), total), c, dp_0)
-    assert found == pytest.approx(expected, rel=1e-10, abs=2e-12 * c / math.sqrt(dp_0))
+    assert result == pytest.approx(expected, rel=1e-10, abs=2e-12 * c / math.sqrt(dp_0))
 
 
 def test_without_coupling_the_flow_is_that_of_the_whole_difference():

@@ -14,7 +14,7 @@ from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.physics.external import accumulator_compliance, gas_volume, polytropic_pressure
 from sealscope.physics.fluid import P_ATM
-from sealscope.physics.rest import initial_state
+from sealscope.physics.standstill import initial_state
 from sealscope.physics.valve import edge_flow
 from sealscope.simulation.experiment import Experiment
 
@@ -26,7 +26,7 @@ def valve_rig(**values):
 
 
 def spool_step(t, target, omega, zeta, v_max):
-    """Position of a spool from rest towards `target` > 0: a lag of the second order, straight at v_max, a lag again."""
+    """Position of a spool from standstill towards `target` > 0: a lag of order 2, straight at v_max, a lag again."""
     damped = omega * math.sqrt(1.0 - zeta**2)
 
     def free(t, e, v):  # from a distance e short of the target, at speed v
@@ -97,14 +97,14 @@ def test_an_overlap_is_a_dead_band_and_an_underlap_leaks_at_null(drive):
     assert moves["x"][-1] > 1e-4
     # both chambers halve the supply's pressure, and the edges pass what the root says
     rig = valve_rig(**dict.fromkeys(EDGES, "-25[um]"))
-    rest = drive(rig, 0.3, u=0.0)
-    v, s, p_1 = rig.valve, rig.supply, rest["p_1"][0]
+    standstill = drive(rig, 0.3, u=0.0)
+    v, s, p_1 = rig.valve, rig.supply, standstill["p_1"][0]
     half = 0.5 * (p_1 - s.p_return)
     null = 2.0 * v.Q_N * 25e-6 / v.x_max * math.sqrt(half / v.dp_N)
     relief = s.G_set * (p_1 - s.p_return - s.p_set)
     assert null > 1e-5
-    assert rest["Q_1"][0] == pytest.approx(null + relief, rel=0.02)  # the oil expands by a hundredth
-    assert np.ptp(rest["p_1"]) < 1e-4 * p_1  # the chambers are not quite at rest: they expand the oil, too
+    assert standstill["Q_1"][0] == pytest.approx(null + relief, rel=0.02)  # the oil expands by a hundredth
+    assert np.ptp(standstill["p_1"]) < 1e-4 * p_1  # the chambers are not quite at standstill: they expand the oil, too
 
 
 @pytest.mark.parametrize("force", [0.0, 1500.0, -2500.0])

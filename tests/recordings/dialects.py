@@ -399,7 +399,7 @@ def log(
     return write
 
 
-def spoilt(word: str) -> Writer:
+def unreadable(word: str) -> Writer:
     """Return what writes a log in which one sample is a word."""
 
     def write(folder: Path) -> Path:
@@ -529,9 +529,9 @@ TEXTS: dict[str, Dialect] = {
     ),
     "text, ISO 8601": Dialect(log("Time," + HEADS, [f"{m:%Y-%m-%dT%H:%M:%S.%f}Z" for m in MOMENTS])),
     "text, seconds since 1970": Dialect(log("t [s]," + HEADS, [f"{1717199999.9 + t:.3f}" for t in T])),
-    "text, OVERLOAD in a cell": Dialect(spoilt("OVERLOAD")),
-    "text, #N/A in a cell": Dialect(spoilt("#N/A")),
-    "text, an empty cell": Dialect(spoilt("")),
+    "text, OVERLOAD in a cell": Dialect(unreadable("OVERLOAD")),
+    "text, #N/A in a cell": Dialect(unreadable("#N/A")),
+    "text, an empty cell": Dialect(unreadable("")),
     "text, German names": Dialect(log("Zeit [s],Druck A [bar],Druck B [bar],Weg [mm]\n"), {"map": "auto"}),
     "text, units as suffixes": Dialect(log("time_s,PA_bar,PB_bar,Weg_mm\n"), {"map": "auto"}),
     "text, English names": Dialect(log("Time (s),Cyl_P_Cap (bar),Cyl_P_Rod (bar),Position (mm)\n"), {"map": "auto"}),

@@ -57,13 +57,13 @@ def test_a_file_whose_library_crashes_is_refused(tmp_path: Path, monkeypatch: py
 def test_hdf5_with_our_own_mark_is_read_apart_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, kinds = tmp_path / "run.nc", []
 
-    def seen(work: object, file: Path, kind: str, *arguments: object, **limits: Any) -> object:
+    def observed(work: object, file: Path, kind: str, *arguments: object, **limits: Any) -> object:
         kinds.append(kind)
         return apart(work, file, kind, *arguments, **limits)  # type: ignore[arg-type]
 
     t = np.arange(100) / 100.0
     write(Recording(t, {"p_A": np.sin(t)}, {"p_A": "Pa"}, 100.0), path)
-    monkeypatch.setattr("sealscope.recordings.files.file_apart", seen)
+    monkeypatch.setattr("sealscope.recordings.files.file_apart", observed)
     assert (read(path)["p_A"] == np.sin(t)).all()
     assert kinds == ["netcdf"]  # anybody can write the mark
 

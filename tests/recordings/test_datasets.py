@@ -73,8 +73,8 @@ def test_a_recording_does_not_know_its_labels(strokes):
     """What is known of the machine is for evaluation alone: no detector and no page can see it."""
     made, folder = strokes
     for recording, labels in datasets.read(made, folder):
-        told = repr((dict(recording.provenance), recording.history, list(recording.channels)))
-        assert not [value for value in labels.values() if str(value) in told]
+        disclosed = repr((dict(recording.provenance), recording.history, list(recording.channels)))
+        assert not [value for value in labels.values() if str(value) in disclosed]
         assert recording.provenance["licence"] == "MIT"
 
 
@@ -84,8 +84,8 @@ def test_an_altered_file_is_refused_and_named(strokes):
     path.write_bytes(path.read_bytes().replace(b"\n2\t", b"\n2\t1", 1))
     with pytest.raises(InputError, match=rf"{STROKES[1]} of vtnsi-actuator must have the checksum [0-9a-f]{{64}}, got"):
         datasets.read(made, folder)
-    found = datasets.check(made, folder)
-    assert (list(found.right), list(found.wrong)) == ([STROKES[0], STROKES[2]], [STROKES[1]])
+    result = datasets.check(made, folder)
+    assert (list(result.right), list(result.wrong)) == ([STROKES[0], STROKES[2]], [STROKES[1]])
     assert len(list(datasets.read(made, folder, check_files=False))) == 3
 
 
@@ -191,8 +191,8 @@ def test_matrices_that_do_not_fit_are_refused(cycles, tmp_path_factory):
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="../shared/data/real is absent")
 def test_the_real_strokes():
-    found = datasets.check("vtnsi-actuator", REAL)
-    assert (len(found.right), found.wrong, found.missing) == (239, {}, ())
+    result = datasets.check("vtnsi-actuator", REAL)
+    assert (len(result.right), result.wrong, result.missing) == (239, {}, ())
     name = "Leak_000_0_303_9-10-2019-4-37-01_PM.txt"
     own = ss.read(REAL / "vtnsi_actuator" / "act_4_seal_defect" / name, map={"p_A": "PG_1", "p_B": "PG_2"}, rate=1000)
     strokes = datasets.read("vtnsi-actuator", REAL / "vtnsi_actuator" / "act_4_seal_defect")

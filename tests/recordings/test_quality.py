@@ -48,8 +48,8 @@ SQUARE = np.sign(np.sin(np.arange(20_000) / 125 + 0.1))
 RAMP = np.clip(np.arange(20_000) / 5000.0, 1, 2)
 
 
-def codes(found: tuple[Finding, ...], channel: str | None = None) -> list[str]:
-    return [finding.code for finding in found if finding.channel == channel]
+def codes(result: tuple[Finding, ...], channel: str | None = None) -> list[str]:
+    return [finding.code for finding in result if finding.channel == channel]
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -101,10 +101,10 @@ def test_missing_runs() -> None:
 def test_mixed_rates(every: int) -> None:
     p = healthy()["p_A"]
     p[np.arange(p.size) % every != 0] = np.nan
-    found = inspect(recording({"p_A": p, "p_B": healthy()["p_B"]}))
-    assert codes(found, "p_A") == ["mixed_rate"]
-    assert f"({RATE / every:g} Hz among 500 Hz)" in found[0].text
-    assert codes(found, "p_B") == []
+    result = inspect(recording({"p_A": p, "p_B": healthy()["p_B"]}))
+    assert codes(result, "p_A") == ["mixed_rate"]
+    assert f"({RATE / every:g} Hz among 500 Hz)" in result[0].text
+    assert codes(result, "p_B") == []
 
 
 def changed(change) -> np.ndarray:
@@ -125,8 +125,8 @@ def changed(change) -> np.ndarray:
     ],
 )
 def test_faults_of_the_time(t: np.ndarray, rate: float, expected: tuple) -> None:
-    found = inspect(replace(recording({"p_A": healthy()["p_A"][:5000]}, t), rate=rate))
-    named = {finding.code: (finding.code, finding.severity, finding.count, finding.first_t) for finding in found}
+    result = inspect(replace(recording({"p_A": healthy()["p_A"][:5000]}, t), rate=rate))
+    named = {finding.code: (finding.code, finding.severity, finding.count, finding.first_t) for finding in result}
     assert named[expected[0]][:3] == expected[:3]
     assert named[expected[0]][3] == pytest.approx(expected[3], abs=1.1 / RATE)
 
@@ -134,21 +134,21 @@ def test_faults_of_the_time(t: np.ndarray, rate: float, expected: tuple) -> None
 def test_all_missing_and_infinite() -> None:
     p, q = healthy()["p_A"], healthy()["p_B"]
     p[:], q[77] = np.nan, np.inf
-    found = inspect(recording({"p_A": p, "p_B": q}))
-    assert (codes(found, "p_A"), codes(found, "p_B")) == (["missing"], ["infinite"])
+    result = inspect(recording({"p_A": p, "p_B": q}))
+    assert (codes(result, "p_A"), codes(result, "p_B")) == (["missing"], ["infinite"])
 
 
 @pytest.mark.parametrize(("jitter", "expected"), [(0.001, []), (0.02, []), (0.1, ["warning"]), (0.5, ["fatal"])])
 def test_irregular_sampling(jitter: float, expected: list[str]) -> None:
     rng = np.random.default_rng(0)
     t = (np.arange(5000) + jitter * rng.uniform(-0.9, 0.9, 5000)) / RATE
-    found = [f for f in inspect(recording({"p_A": healthy()["p_A"][:5000]}, t)) if f.code == "irregular_sampling"]
-    assert [f.severity for f in found] == expected
+    result = [f for f in inspect(recording({"p_A": healthy()["p_A"][:5000]}, t)) if f.code == "irregular_sampling"]
+    assert [f.severity for f in result] == expected
 
 
 def test_constant() -> None:
-    found = inspect(recording({"p_A": np.full(1000, 3e5), "u": np.zeros(1000), "q_leak": np.zeros(1000)}))
-    assert [(f.code, f.severity, f.channel) for f in found] == [
+    result = inspect(recording({"p_A": np.full(1000, 3e5), "u": np.zeros(1000), "q_leak": np.zeros(1000)}))
+    assert [(f.code, f.severity, f.channel) for f in result] == [
         ("constant", "warning", "p_A"),
         ("constant", "note", "u"),
         ("constant", "note", "q_leak"),
@@ -163,10 +163,10 @@ def test_clipped(seed: int, noise: float, step: float, side: str) -> None:
     p = np.sin(2 * np.pi * np.arange(20_000) / 777) + noise * rng.normal(size=20_000)
     p = quantised(p, step) if step else p
     cut = np.minimum(p, 0.8) if side == "high" else np.maximum(p, -0.8)
-    found = inspect(recording({"p_A": cut}))
-    assert codes(found, "p_A") == ["clipped"]
-    assert f"at the {side} end" in found[0].text
-    assert found[0].count == np.sum(p >= 0.8) if side == "high" else np.sum(p <= -0.8)
+    result = inspect(recording({"p_A": cut}))
+    assert codes(result, "p_A") == ["clipped"]
+    assert f"at the {side} end" in result[0].text
+    assert result[0].count == np.sum(p >= 0.8) if side == "high" else np.sum(p <= -0.8)
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -175,10 +175,10 @@ def test_stuck(seed: int, name: str) -> None:
     values = healthy(20_000, seed)[name]
     start = 7000 + 371 * seed
     values[start : start + 400] = values[start]
-    found = [f for f in inspect(recording({name: values})) if f.code == "stuck"]
-    assert len(found) == 1
-    assert abs(found[0].first_t * RATE - start) <= 6
-    assert 395 <= found[0].count <= 420
+    result = [f for f in inspect(recording({name: values})) if f.code == "stuck"]
+    assert len(result) == 1
+    assert abs(result[0].first_t * RATE - start) <= 6
+    assert 395 <= result[0].count <= 420
 
 
 @pytest.mark.parametrize("mains", [50.0, 60.0])
@@ -256,8 +256,8 @@ def test_pressures_that_creep_as_in_no_sealed_circuit_are_remarked():
 
     def codes(mean):
         channels = {"p_A": 3e5 + mean + stroke, "p_B": 3e5 + mean - stroke}
-        found = inspect(Recording(t, channels, dict.fromkeys(channels, "Pa"), rate=100.0))
-        return [(f.code, f.severity) for f in found if f.code == "creeping_pressures"]
+        result = inspect(Recording(t, channels, dict.fromkeys(channels, "Pa"), rate=100.0))
+        return [(f.code, f.severity) for f in result if f.code == "creeping_pressures"]
 
     assert codes(6e3 * t) == codes(-6e3 * t) == [("creeping_pressures", "note")]
     assert codes(0.0 * t) == codes(500.0 * t) == codes(np.where(t > 45, 6e5, 0.0)) == []

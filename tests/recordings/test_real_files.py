@@ -36,7 +36,7 @@ def test_every_twelfth_stroke_reads_as_numpy_reads_it() -> None:
 
 
 def test_ports_are_clean_but_for_the_strokes_that_fall_below_zero() -> None:
-    found = Counter()
+    result = Counter()
     for path in FILES[::6]:
         recording = stroke(path)
         findings = inspect(recording)
@@ -45,8 +45,8 @@ def test_ports_are_clean_but_for_the_strokes_that_fall_below_zero() -> None:
             assert finding.code == "clipped"
             at_zero = np.flatnonzero(recording[finding.channel] == 0)
             assert finding.count == at_zero.size > 300
-            found[finding.code] += 1
-    assert 0 < found["clipped"] < len(FILES)
+            result[finding.code] += 1
+    assert 0 < result["clipped"] < len(FILES)
 
 
 def test_what_is_not_connected_is_seen_as_hum() -> None:

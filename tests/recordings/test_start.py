@@ -31,9 +31,9 @@ def named(name: str, t0: float = 0.0, start: str | None = None) -> Recording:
     ],
 )
 def test_start_of_a_recording(name: str, start: str | None, stamp: str | None) -> None:
-    found = start_seconds(named(name, start=start))
+    result = start_seconds(named(name, start=start))
     if stamp is None:
-        assert found is None
+        assert result is None
     else:
-        assert found == np.datetime64(stamp, "ms").astype(np.int64) / 1e3
-        assert start_seconds(named(name, 2.0, start)) == found + 2.0
+        assert result == np.datetime64(stamp, "ms").astype(np.int64) / 1e3
+        assert start_seconds(named(name, 2.0, start)) == result + 2.0

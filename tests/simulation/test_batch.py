@@ -30,15 +30,15 @@ COMMON = {"step": 5e-4, "allow_unresolved": True}
 
 def rms_of(recording, bounds):
     """RMS of d1..d4 and d3d4 of both chambers between bounds [s], straight from the transform: (2, segments, 5)."""
-    found = np.empty((2, len(bounds) - 1, 5))
+    result = np.empty((2, len(bounds) - 1, 5))
     for channel, name in enumerate(NAMES):
         one = details(recording[name])
         inside = one.inside()
         at = np.clip(np.round(np.asarray(bounds) * recording.rate).astype(int), inside.start, inside.stop)
         rows = np.vstack([one.values, one.product()[None]])
         for k in range(len(bounds) - 1):
-            found[channel, k] = np.sqrt(np.mean(rows[:, at[k] : at[k + 1]] ** 2, axis=1))
-    return found
+            result[channel, k] = np.sqrt(np.mean(rows[:, at[k] : at[k + 1]] ** 2, axis=1))
+    return result
 
 
 @pytest.mark.parametrize(
@@ -72,9 +72,9 @@ def test_each_run_is_what_it_is_by_itself(check_rig, throttled, volumes):
     assert np.all(batch.steps == 5e-4)
     # the anti-alias filter, gain, offset, hum and saturation too
     values = {"sensors.p_A.gain_error": 0.01, "sensors.p_A.offset": 4000.0, "sensors.p_B.range_hi": 4.9e5}
-    seen = replace(experiments[1], rig=experiments[1].rig.with_overrides(values))
-    changed = simulate_batch([seen], bounds=bounds)
-    np.testing.assert_allclose(changed.rms[0], rms_of(simulate_with_truth(seen).recording, bounds), rtol=1e-6)
+    observed = replace(experiments[1], rig=experiments[1].rig.with_overrides(values))
+    changed = simulate_batch([observed], bounds=bounds)
+    np.testing.assert_allclose(changed.rms[0], rms_of(simulate_with_truth(observed).recording, bounds), rtol=1e-6)
     assert np.abs(changed.rms[0] / batch.rms[1] - 1.0).max() > 1e-3
 
 
@@ -114,16 +114,16 @@ def test_other_commands_and_drifting_machines_are_what_they_are_by_themselves():
             simulate_batch([one], bounds=bounds).rms[0], rms_of(simulate_with_truth(one).recording, bounds), rtol=3e-2
         )
     noisy = Experiment.of(command="prbs 1 every 0.5 s seed 4", set=QUIET, duration=8.0, **COMMON)
-    found = simulate_batch([noisy], bounds=[0.0, 8.0]).rms[0]
-    np.testing.assert_allclose(found, rms_of(simulate_with_truth(noisy).recording, [0.0, 8.0]), rtol=1e-6)
+    result = simulate_batch([noisy], bounds=[0.0, 8.0]).rms[0]
+    np.testing.assert_allclose(result, rms_of(simulate_with_truth(noisy).recording, [0.0, 8.0]), rtol=1e-6)
 
 
 def test_a_fault_of_the_machine_comes_in_when_it_does_by_itself():
     one = Experiment.of(fault="friction x1.5 from 5.13 s", set=QUIET, duration=10.0, **COMMON)
     bounds = [0.0, 5.0, 10.0]
-    found = simulate_batch([one], bounds=bounds).rms[0]
-    np.testing.assert_allclose(found, rms_of(simulate_with_truth(one).recording, bounds), rtol=1e-6)
-    assert np.abs(found[0, 1] / found[0, 0] - 1.0).max() > 0.05
+    result = simulate_batch([one], bounds=bounds).rms[0]
+    np.testing.assert_allclose(result, rms_of(simulate_with_truth(one).recording, bounds), rtol=1e-6)
+    assert np.abs(result[0, 1] / result[0, 0] - 1.0).max() > 0.05
 
 
 def test_valves_in_the_lines_move_as_they_do_by_themselves(check_rig):
@@ -258,9 +258,9 @@ def test_memory_does_not_grow_with_the_length_of_the_runs(check_rig):
         experiments = [Experiment.of(rig=check_rig(), duration=duration, seed=k, step=1e-3) for k in range(16)]
         tracemalloc.start()
         simulate_batch(experiments, threads=1)
-        found = tracemalloc.get_traced_memory()[1]
+        result = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
-        return found
+        return result
 
     peak(10.0)
     assert peak(80.0) < 1.1 * peak(20.0)

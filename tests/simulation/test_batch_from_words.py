@@ -22,9 +22,9 @@ def test_a_batch_of_words_is_what_each_recording_is():
     ]
     batch = ss.simulate_batch([ss.Experiment.of(**one) for one in words], bounds=[1.0, 3.5, 7.5])
     for k, one in enumerate(words):
-        found = details(ss.simulate(**one)["p_A"])
+        result = details(ss.simulate(**one)["p_A"])
         for part, (start, stop) in enumerate([(500, 1750), (1750, 3750)]):
-            expected = np.sqrt(np.mean(found.values[:, start:stop] ** 2, axis=1))
+            expected = np.sqrt(np.mean(result.values[:, start:stop] ** 2, axis=1))
             np.testing.assert_allclose(batch.rms[k, 0, part, :4], expected, rtol=1e-6)
     changes = batch.changes("p_A", "d3")
     np.testing.assert_array_equal(changes, 100.0 * (batch.rms[:, 0, -1, 2] / batch.rms[:, 0, 0, 2] - 1.0))

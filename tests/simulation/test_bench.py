@@ -116,10 +116,10 @@ def test_every_duty_is_drawn(machines):
 def test_a_drift_of_the_bench_moves_less_than_its_resolution_from_block_to_block(machines):
     for machine in machines[:12]:
         experiment = machine.experiment()
-        found = Schedule(experiment.effects(), rig_numbers(experiment.rig), 360_000, 2000.0)
-        assert np.diff(found.bounds).max() <= LONGEST_BLOCK * 2000
+        result = Schedule(experiment.effects(), rig_numbers(experiment.rig), 360_000, 2000.0)
+        assert np.diff(result.bounds).max() <= LONGEST_BLOCK * 2000
         for field in ("K_oil", "F_v", "G_pump"):
-            values = np.array([getattr(one, field) for one in found.numbers])
+            values = np.array([getattr(one, field) for one in result.numbers])
             assert np.ptp(values) > 0.02 * values[0]
             assert np.abs(np.diff(values) / values[1:]).max() <= 1.05 * RESOLUTION
 
@@ -258,7 +258,7 @@ def test_a_profile_with_a_slip_is_refused_in_one_line_with_its_place(tmp_path, o
 
 def test_an_unknown_or_unreadable_profile_is_refused(tmp_path):
     with pytest.raises(
-        InputError, match=r"'banch' is no packaged profile \(bench, closed-loop, load, single-rod, strangers, valve\)"
+        InputError, match=r"'banch' is no packaged profile \(bench, closed-loop, load, single-rod, unmodelled, valve\)"
     ):
         load_profile("banch")
     with pytest.raises(InputError, match="profile must be readable, got: No such file"):

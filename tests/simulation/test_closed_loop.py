@@ -11,9 +11,9 @@ import pytest
 from sealscope.control import Measured, PositionPI
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.parameters import load_rig
-from sealscope.physics.rest import initial_state
 from sealscope.physics.rig import rig_numbers
 from sealscope.physics.solvers.advance import EXPLICIT, advance
+from sealscope.physics.standstill import initial_state
 from sealscope.simulation.batch.batch import simulate_batch
 from sealscope.simulation.closed_loop import outputs_per_sample
 from sealscope.simulation.courses import parse_force, parse_position
@@ -76,16 +76,16 @@ def test_without_feed_forward_and_integral_it_lags():
 class Ladder:
     """Gives 0.1 V more at each sample, and notes what it measured."""
 
-    seen: list
+    observed: list
     rate: float = 250.0
     delay: int = 2
 
     def start(self):
-        self.seen.clear()
+        self.observed.clear()
 
         def voltage(measured: Measured) -> float:
-            self.seen.append(measured)
-            return 0.1 * len(self.seen)
+            self.observed.append(measured)
+            return 0.1 * len(self.observed)
 
         return voltage
 
@@ -96,17 +96,17 @@ def test_a_voltage_acts_after_its_delay_until_the_next_and_the_encoder_counts():
     run = simulate_with_truth(Experiment.of(controller=ladder, **options))
     steps = np.maximum(np.arange(200) // 2 - 1, 0)  # samples at 500 Hz, two a sample of the controller, late by two
     np.testing.assert_allclose(run.recording["u"], np.minimum(0.1 * steps, 10.0), atol=1e-12)
-    x = np.array([measured.x for measured in ladder.seen])
+    x = np.array([measured.x for measured in ladder.observed])
     counts = x / 20e-6
     np.testing.assert_allclose(counts, np.round(counts), atol=1e-6)
     behind = run.truth.outputs["x"][::2][:100] - x[:100]
     assert behind.min() > -1e-12
     assert behind.max() < 20e-6 + 1e-12
-    t = np.array([measured.t for measured in ladder.seen])
-    np.testing.assert_allclose([measured.target for measured in ladder.seen], 0.01 * np.sin(10.0 * t), atol=1e-12)
+    t = np.array([measured.t for measured in ladder.observed])
+    np.testing.assert_allclose([measured.target for measured in ladder.observed], 0.01 * np.sin(10.0 * t), atol=1e-12)
     speed = 0.01 * (np.sin(10.0 * (t + 0.012)) - np.sin(10.0 * (t + 0.008))) / 0.004  # while the voltage acts
-    np.testing.assert_allclose([measured.target_speed for measured in ladder.seen], speed, atol=1e-9)
-    noise = np.array([measured.p_A for measured in ladder.seen])[:100] - run.truth.outputs["p_A"][::2][:100]
+    np.testing.assert_allclose([measured.target_speed for measured in ladder.observed], speed, atol=1e-9)
+    noise = np.array([measured.p_A for measured in ladder.observed])[:100] - run.truth.outputs["p_A"][::2][:100]
     assert 0.5 < noise.std() / load_rig("thesis").sensors.p_A.noise < 1.5
 
 
@@ -133,7 +133,7 @@ def test_a_closed_loop_is_the_same_again_whatever_the_steps():
 
 
 def test_a_load_moves_the_piston_by_the_give_of_oil_and_drive(check_rig):
-    """Linear at rest: dx = (D dtheta - V dp/(2 K))/A with dp = F/A and K_i dtheta = -R D dp/C_m."""
+    """Linear at standstill: dx = (D dtheta - V dp/(2 K))/A with dp = F/A and K_i dtheta = -R D dp/C_m."""
     values = {"F_pr": 0.0, "F_cfr": 0.0, "F_v": 4000.0, "p_charge": "3 MPa", "K_i": 10.0, "K_brk": 1.0}
     rig = check_rig(**values)
     experiment = Experiment.of(rig=rig, command="0 sin(t)", load="ramp 1 kN from 0.5 s to 0.6 s", duration=3.0)

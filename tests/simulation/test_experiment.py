@@ -41,8 +41,8 @@ def test_the_key_tells_experiments_apart_to_the_last_digit():
     nudged = u.copy()
     nudged[2500] += 1e-9
     opening = np.linspace(0.0, 1.0, 5001)
-    bent = opening.copy()
-    bent[2500] += 1e-9
+    distorted = opening.copy()
+    distorted[2500] += 1e-9
     common = {"duration": 2.0}
     experiments = [
         Experiment.of(**common),
@@ -50,7 +50,7 @@ def test_the_key_tells_experiments_apart_to_the_last_digit():
         Experiment.of(**common, command=Recorded(t, u, "log.csv")),
         Experiment.of(**common, command=Recorded(t, nudged, "log.csv")),
         Experiment.of(**common, leak=Leak(coefficient=1e-13, opening=Tabulated(t, opening))),
-        Experiment.of(**common, leak=Leak(coefficient=1e-13, opening=Tabulated(t, bent))),
+        Experiment.of(**common, leak=Leak(coefficient=1e-13, opening=Tabulated(t, distorted))),
         Experiment.of(**common, leak=["G = 1e-13", "C = 1e-10"]),
         Experiment.of(**common, seed=1),
         Experiment.of(**common, step=1e-4),
@@ -67,14 +67,14 @@ def test_the_key_tells_experiments_apart_to_the_last_digit():
 
 
 def test_a_run_is_told_in_its_provenance():
-    found = simulate_with_truth(Experiment.of(duration=1.0, set={"V": "200[cm^3]"}, seed=9)).recording
-    told = found.provenance
-    assert told["origin"] == "simulation"
-    found_error = told["solver"].pop("error_found_pa")
+    result = simulate_with_truth(Experiment.of(duration=1.0, set={"V": "200[cm^3]"}, seed=9)).recording
+    reported = result.provenance
+    assert reported["origin"] == "simulation"
+    found_error = reported["solver"].pop("error_found_pa")
     assert 0.0 < found_error < 100.0
-    assert told["solver"] == {"method": "rk4", "step_s": 5e-4, "allow_unresolved": False, "error_pa": 100.0}
-    assert told["experiment"]["seed"] == 9
-    assert "cylinder.V" in told["experiment"]["overrides"]
+    assert reported["solver"] == {"method": "rk4", "step_s": 5e-4, "allow_unresolved": False, "error_pa": 100.0}
+    assert reported["experiment"]["seed"] == 9
+    assert "cylinder.V" in reported["experiment"]["overrides"]
 
 
 @pytest.mark.parametrize("values", [{}, THROTTLED], ids=["free", "throttled"])
@@ -92,9 +92,9 @@ def test_a_smaller_error_is_a_finer_and_a_truer_run(values):
         steps.append(path.step)
         assert error(path) < (100.0 if allowed is None else allowed)
     assert steps[0] > steps[1] > steps[2]
-    told = simulate_with_truth(replace(experiment, duration=1.0, error=3.0)).recording.provenance["solver"]
-    assert told["error_pa"] == 3.0
-    assert told["error_found_pa"] < 3.0
+    reported = simulate_with_truth(replace(experiment, duration=1.0, error=3.0)).recording.provenance["solver"]
+    assert reported["error_pa"] == 3.0
+    assert reported["error_found_pa"] < 3.0
     assert (
         "error_pa"
         not in simulate_with_truth(replace(experiment, duration=1.0, step=5e-4)).recording.provenance["solver"]
@@ -138,12 +138,12 @@ def test_a_chattering_run_cannot_prove_itself():
 @pytest.mark.parametrize(("leak", "words"), [("0.01 L/min", "sizing the leak"), (None, "simulating")])
 def test_progress_is_told_from_nothing_to_all(leak, words):
     """The last run that sizes a leak is the run."""
-    told: list[tuple[str, float]] = []
+    reported: list[tuple[str, float]] = []
     simulate_with_truth(
-        Experiment.of(duration=10.0, leak=leak), progress=lambda words, share: told.append((words, share))
+        Experiment.of(duration=10.0, leak=leak), progress=lambda words, share: reported.append((words, share))
     )
-    assert {words for words, _ in told} == {words}
-    shares = [share for _, share in told]
+    assert {words for words, _ in reported} == {words}
+    shares = [share for _, share in reported]
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
     assert all(0.0 <= share <= 1.0 for share in shares)

@@ -24,39 +24,39 @@ from sealscope.simulation.simulate import simulate
 
 
 @pytest.fixture(scope="module")
-def strangers():
-    return load_profile("strangers")
+def unmodelled():
+    return load_profile("unmodelled")
 
 
-def test_each_family_is_either_for_development_or_held_back(strangers):
+def test_each_family_is_either_for_development_or_held_out(unmodelled):
     """What is judged was not developed on, and nothing is left out."""
-    halves = [load_plan(name).factors["family"] for name in ("bench-strangers-development", "bench-strangers")]
+    halves = [load_plan(name).factors["family"] for name in ("bench-unmodelled-development", "bench-unmodelled")]
     assert not set(halves[0]) & set(halves[1])
-    assert {*halves[0], *halves[1]} == {family.name for family in strangers.families}
+    assert {*halves[0], *halves[1]} == {family.name for family in unmodelled.families}
     assert abs(len(halves[0]) - len(halves[1])) <= 2
 
 
-def test_a_family_departs_in_what_it_says_and_in_nothing_else(strangers):
-    base, heavy = draw(strangers, 5), draw(strangers, 5, family="moving mass")
-    assert base == replace(draw("bench", 5), profile="strangers")
+def test_a_family_departs_in_what_it_says_and_in_nothing_else(unmodelled):
+    base, heavy = draw(unmodelled, 5), draw(unmodelled, 5, family="moving mass")
+    assert base == replace(draw("bench", 5), profile="unmodelled")
     assert {**heavy.overrides, **base.overrides} == heavy.overrides
     assert set(heavy.overrides) - set(base.overrides) == {"cylinder.M_eq"}
     assert (heavy.command, heavy.drifts) == (base.command, base.drifts)
     mass = load_rig("thesis").cylinder.M_eq
-    drawn = [draw(strangers, seed, family="moving mass").overrides["cylinder.M_eq"] / mass for seed in range(60)]
+    drawn = [draw(unmodelled, seed, family="moving mass").overrides["cylinder.M_eq"] / mass for seed in range(60)]
     assert 0.7 <= min(drawn) < 0.75
     assert 1.25 < max(drawn) <= 1.3
 
 
-def test_values_are_drawn_from_a_list_and_replace_the_profiles(strangers):
-    machines = [draw(strangers, seed, family="clock and converter") for seed in range(60)]
+def test_values_are_drawn_from_a_list_and_replace_the_profiles(unmodelled):
+    machines = [draw(unmodelled, seed, family="clock and converter") for seed in range(60)]
     assert {machine.overrides["daq.bits"] for machine in machines} == {12, 13, 14, 16}
     assert max(machine.overrides["sensors.p_A.delay"] for machine in machines) > 1e-3
 
 
-def test_warming_oil_warms(strangers):
+def test_warming_oil_warms(unmodelled):
     for seed in range(10):
-        machine = draw(strangers, seed, family="warming oil")
+        machine = draw(unmodelled, seed, family="warming oil")
         at_end = {drift.parameter: float(drift.shape.at(np.array(180.0))) for drift in machine.drifts}
         assert at_end["friction.F_v"] < -0.3
         assert at_end["pump.G_pump"] > 0.9
@@ -64,7 +64,7 @@ def test_warming_oil_warms(strangers):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ('[[family]]\nname = "a"\n', "family[1].why is missing"),
         ('[[family]]\nname = "a"\nwhy = "b"\nwarm = true\n', "family[1].warm is not known"),
@@ -81,18 +81,18 @@ def test_warming_oil_warms(strangers):
         ),
     ],
 )
-def test_a_family_that_breaks_a_rule_is_one_line(tmp_path, text, told):
+def test_a_family_that_breaks_a_rule_is_one_line(tmp_path, text, message):
     path = tmp_path / "odd.toml"
     path.write_text('[profile]\nname = "odd"\ntitle = "Odd"\nextends = "bench"\n' + text, encoding="utf-8")
     with pytest.raises(InputError, match=r"odd\.toml") as error:
         load_profile(path)
-    assert told in str(error.value)
+    assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_an_unknown_family_is_named(strangers):
+def test_an_unknown_family_is_named(unmodelled):
     with pytest.raises(InputError, match=r"must be one of its own .*hoses.*, got 'pipes'"):
-        draw(strangers, 1, family="pipes")
+        draw(unmodelled, 1, family="pipes")
 
 
 def test_a_rig_written_down_before_a_parameter_was_known_loads():
@@ -156,10 +156,10 @@ def test_a_jittering_clock_samples_where_it_says():
     f, interval = 60.0, 1.0 / 2000.0
     t = np.arange(4000) * interval
     late = np.clip(0.4 * np.random.default_rng(1).standard_normal(1000), -1.0, 1.0)
-    found = at_jittered(lambda values: values[::4], np.sin(2 * np.pi * f * t), late)
+    result = at_jittered(lambda values: values[::4], np.sin(2 * np.pi * f * t), late)
     exact = np.sin(2 * np.pi * f * (t[::4] + late * interval))
     punctual = np.sin(2 * np.pi * f * t[::4])
-    assert np.abs(found - exact)[1:].max() < 0.01 * np.abs(punctual - exact).max()
+    assert np.abs(result - exact)[1:].max() < 0.01 * np.abs(punctual - exact).max()
 
 
 def test_harmonics_stand_beside_the_hum():

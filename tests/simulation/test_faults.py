@@ -46,13 +46,13 @@ LEAKING_PUMP = {"G_pump": 2.4e-13}
     ],
 )
 def test_faults_are_read_from_words_and_their_own_words_read_back(text, fault):
-    found = parse_fault(text)
-    again = parse_fault(str(found))
-    for one in (found, again):
+    result = parse_fault(text)
+    again = parse_fault(str(result))
+    for one in (result, again):
         assert type(one) is type(fault)
         assert str(one) == str(fault)
         assert one.onset() == fault.onset()
-    assert Experiment.of(set=LEAKING_PUMP, duration=1.0, fault=found).faults[0].kind == fault.kind
+    assert Experiment.of(set=LEAKING_PUMP, duration=1.0, fault=result).faults[0].kind == fault.kind
 
 
 def test_no_fault_is_none():
@@ -103,8 +103,8 @@ def pair(fault: str, *, values: dict | None = None, duration: float = 8.0, **oth
     )
 
 
-def halves(found) -> tuple[np.ndarray, np.ndarray]:
-    t = found.truth.t
+def halves(result) -> tuple[np.ndarray, np.ndarray]:
+    t = result.truth.t
     return t < 0.5 * t[-1] - 0.01, t > 0.5 * t[-1] + 0.5
 
 
@@ -216,9 +216,9 @@ def test_the_truth_lists_the_faults_and_the_recording_does_not(tmp_path):
         )
     )
     write_truth(made.truth, tmp_path / "truth.json")
-    told = json.loads((tmp_path / "truth.json").read_text())
-    assert told["onset_s"] == 3.0
-    assert told["faults"] == [
+    tree = json.loads((tmp_path / "truth.json").read_text())
+    assert tree["onset_s"] == 3.0
+    assert tree["faults"] == [
         {"kind": "friction", "words": "friction x1.3 from 2 s", "onset_s": 2.0},
         {"kind": "sensor stuck", "words": "sensor p_A stuck from 1 s", "onset_s": 1.0},
     ]

@@ -46,8 +46,8 @@ def demo():
 @pytest.mark.parametrize(("name", "psi"), [("p_A", 1.23), ("p_B", 1.50)])
 def test_the_finest_detail_has_the_rms_of_the_measured_records(demo, name, psi):
     for recording in (demo, read(90_000)):
-        found = details(recording[name])
-        assert rms(found[1][found.inside(1)]) / PSI == pytest.approx(psi, rel=0.015)
+        result = details(recording[name])
+        assert rms(result[1][result.inside(1)]) / PSI == pytest.approx(psi, rel=0.015)
 
 
 def test_chambers_share_a_part_of_their_noise():
@@ -126,9 +126,9 @@ def test_the_anti_alias_filter_passes_and_stops(hertz, low, high):
     n = 4000
     t = np.arange((n + FILTER_REACH) * FACTOR) / (RATE * FACTOR)
     inside = slice(100, n)
-    seen = decimate(np.cos(2 * np.pi * hertz * t), FACTOR, n)[inside]
+    observed = decimate(np.cos(2 * np.pi * hertz * t), FACTOR, n)[inside]
     quadrature = decimate(np.sin(2 * np.pi * hertz * t), FACTOR, n)[inside]
-    turned = (seen + 1j * quadrature) * np.exp(-2j * np.pi * hertz * np.arange(n)[inside] / RATE)
+    turned = (observed + 1j * quadrature) * np.exp(-2j * np.pi * hertz * np.arange(n)[inside] / RATE)
     assert low <= np.abs(turned).mean() <= high
     if low > 0:
         np.testing.assert_allclose(turned.imag, 0.0, atol=1e-9)
@@ -198,8 +198,8 @@ def test_no_channel_s_noise_depends_on_another_s_settings():
 def test_a_recording_holds_no_truth(demo):
     recording = simulate(command="3 sin(4t)", leak="0.02 L/min from 1 s", duration=3.0)
     assert set(recording.channels) == {"u", "omega", "theta", "x", *PRESSURES, "q_leak"}
-    told = str(dict(recording.provenance)) + str(recording.history)
-    assert "leak" not in told
-    assert "0.02" not in told
+    disclosed = str(dict(recording.provenance)) + str(recording.history)
+    assert "leak" not in disclosed
+    assert "0.02" not in disclosed
     assert (len(demo), demo.rate, demo.t[0], demo.t[-1]) == (90_000, 500.0, 0.0, 89_999 / 500)
     np.testing.assert_allclose(demo["u"], 3.0 * np.sin(4.0 * demo.t), rtol=0, atol=1e-12)

@@ -29,7 +29,7 @@ def test_both_caps_hold_the_piston(check_rig, drive, throttled, volumes, side):
     push = rig.motor.C_m * rig.motor.i_max * 2 * np.pi / rig.pump.q_b * c.A_A
     assert np.abs(run["x"]).max() - half < 2.0 * push / c.k_stop
     assert side * run["x"][-1] - half == pytest.approx(push / c.k_stop, rel=0.1)
-    assert np.abs(run["v"][-500:]).max() < 0.02  # and it came to rest
+    assert np.abs(run["v"][-500:]).max() < 0.02  # and it came to a standstill
 
 
 def test_current_and_voltage_stay_within_the_drive_s_limits(check_rig, drive):

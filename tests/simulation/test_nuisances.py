@@ -108,18 +108,18 @@ def test_blocks_are_short_where_it_changes_fast_and_long_where_nothing_changes()
     step = [
         replace(e, jumps=(2.2001,), change=lambda t: np.where(t >= 2.2001, 1.5, 1.0)) for e in fault.effects(load_rig())
     ]
-    found = Schedule(step, base, 10_000, rate)
-    np.testing.assert_array_equal(found.bounds, [0, 4401, 10_000])  # the next output instant
-    assert [one.F_v for one in found.numbers] == [300.0, 450.0]
+    result = Schedule(step, base, 10_000, rate)
+    np.testing.assert_array_equal(result.bounds, [0, 4401, 10_000])  # the next output instant
+    assert [one.F_v for one in result.numbers] == [300.0, 450.0]
     slow = Effect("F_v", lambda t: 1.0 + 1e-4 * t, RESOLUTION)
     quick = Effect("K_oil", lambda t: 1.0 + np.where(t > 3.0, 1e-2 * (t - 3.0), 0.0), RESOLUTION, jumps=(3.0,))
-    found = Schedule([slow, quick], base, 10_000, rate)
-    lengths = np.diff(found.bounds) / rate
+    result = Schedule([slow, quick], base, 10_000, rate)
+    lengths = np.diff(result.bounds) / rate
     assert lengths.max() == LONGEST_BLOCK
-    assert lengths[found.bounds[:-1] / rate >= 3.0].max() <= 0.05 + 1e-9
-    moved = np.abs(np.diff([one.K_oil for one in found.numbers])) / base.K_oil
+    assert lengths[result.bounds[:-1] / rate >= 3.0].max() <= 0.05 + 1e-9
+    moved = np.abs(np.diff([one.K_oil for one in result.numbers])) / base.K_oil
     assert moved.max() <= RESOLUTION * 1.001
-    covered = [part for first in range(0, 10_000, 700) for part in found.within(first, min(first + 700, 10_000))]
+    covered = [part for first in range(0, 10_000, 700) for part in result.within(first, min(first + 700, 10_000))]
     assert covered[0][0] == 0
     assert covered[-1][1] == 10_000
     assert all(one[1] == other[0] for one, other in pairwise(covered))
@@ -190,9 +190,9 @@ def test_noise_bias_and_hum_drift_at_the_instruments_alone():
 def test_a_delayed_channel_shows_the_past(factor, delay):
     rate, n = 500.0 * factor, 600
     t = np.arange((n + FILTER_REACH) * factor) / rate
-    seen = decimate(np.sin(2 * np.pi * 40.0 * t), factor, n, delay)
+    observed = decimate(np.sin(2 * np.pi * 40.0 * t), factor, n, delay)
     expected = np.sin(2 * np.pi * 40.0 * (np.arange(n) / 500.0 - delay / rate))
-    np.testing.assert_allclose(seen[60:], expected[60:], atol=2e-4)
+    np.testing.assert_allclose(observed[60:], expected[60:], atol=2e-4)
 
 
 def test_skew_and_scale_are_seen_in_the_channel_that_has_them():

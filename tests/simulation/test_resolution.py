@@ -34,7 +34,7 @@ def test_the_error_that_is_asked_for_comes_out(check_rig, throttled, command):
         steps.append(run.step)
         for name in ("p_A", "p_B"):
             noise = experiment.rig.sensors.p_A.noise
-            one, other = (details(found[name]) for found in (run, truth))
+            one, other = (details(result[name]) for result in (run, truth))
             for level in range(1, 5):
                 a, b = (np.hypot(rms(x[level][x.inside(level)]), noise) for x in (one, other))
                 assert abs(a / b - 1.0) < 1.5e-3, (error, name, level)
@@ -66,10 +66,10 @@ def test_a_change_late_in_the_run_is_seen(check_rig, drive):
 
 def test_the_windows_lie_within_the_run_and_apart():
     for n, rate in ((1, 500.0), (40, 10.0), (1000, 500.0), (2600, 500.0), (90_000, 500.0), (360_000, 2000.0)):
-        found = windows(n, rate)
-        assert found[0][0] == 0
-        assert all(0 <= start < stop <= n for start, stop in found)
-        assert all(a[1] <= b[0] for a, b in itertools.pairwise(found))
+        result = windows(n, rate)
+        assert result[0][0] == 0
+        assert all(0 <= start < stop <= n for start, stop in result)
+        assert all(a[1] <= b[0] for a, b in itertools.pairwise(result))
     assert windows(90_000, 500.0)[-1][0] >= 0.85 * 90_000
 
 

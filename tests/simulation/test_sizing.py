@@ -111,9 +111,9 @@ def test_no_leak_and_a_leak_of_nothing_have_no_onset():
     ],
 )
 def test_leaks_are_read_from_words(text, leak):
-    found = parse_leak(text)
-    assert (found.law, found.coefficient, found.opening) == (leak.law, leak.coefficient, leak.opening)
-    assert found.mean == (None if leak.mean is None else pytest.approx(leak.mean, rel=1e-12))
+    result = parse_leak(text)
+    assert (result.law, result.coefficient, result.opening) == (leak.law, leak.coefficient, leak.opening)
+    assert result.mean == (None if leak.mean is None else pytest.approx(leak.mean, rel=1e-12))
 
 
 @pytest.mark.parametrize(

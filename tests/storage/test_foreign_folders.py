@@ -101,8 +101,8 @@ def test_a_kept_file_or_failure_is_no_link(outside: Path, tmp_path: Path) -> Non
     kept = ResultsFolder(tmp_path / "thesis")
     for place in ("failed/tab-1.txt", "items/tab-1.npz"):
         (tmp_path / "thesis" / "kept" / place).symlink_to(outside / "diary.txt")
-    kept.keep_failure("tab-1", "trace")
-    kept.keep("tab-2", "key", ())
+    kept.save_failure("tab-1", "trace")
+    kept.save("tab-2", "key", ())
     assert kept.products("tab-1", "key") is None
     assert kept.files("tab-1", "key") is None
     assert (tmp_path / "thesis" / "kept" / "failed" / "tab-1.txt").read_text() == "trace"

@@ -74,7 +74,7 @@ def test_what_no_path_can_be_is_no_file(name: str) -> None:
 
 def test_a_kept_note_of_drawn_files_with_such_a_name(tmp_path: Path) -> None:
     kept = ResultsFolder(tmp_path)
-    kept.keep("fig-1", "k", (), ("x" * 500,))
+    kept.save("fig-1", "k", (), ("x" * 500,))
     assert kept.files("fig-1", "k") is None
 
 

@@ -84,8 +84,8 @@ def table(context, item):
 
 def doubled(context, item):
     _note(item)
-    found = context.product(item.needs[0])
-    return (ThesisTable(item.id, item.title, ("a",), ((2 * found[0].rows[0][0],),)),)
+    tables = context.product(item.needs[0])
+    return (ThesisTable(item.id, item.title, ("a",), ((2 * tables[0].rows[0][0],),)),)
 
 
 def slow(context, item):

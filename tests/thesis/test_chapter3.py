@@ -23,10 +23,10 @@ from .conftest import Kept
 
 @pytest.fixture(scope="module")
 def made() -> dict[str, tuple[Figure | Claim, ...]]:
-    context, found = Kept(), {}
+    context, result = Kept(), {}
     for item in (*chapter3.ITEMS, *chapter3_claims.ITEMS):
-        found[item.id] = item.make(context, item)
-    return found
+        result[item.id] = item.make(context, item)
+    return result
 
 
 def numbers(product: Figure) -> dict[str, float]:
@@ -51,12 +51,12 @@ def test_spectrum_is_the_sum_of_equation_3_2(size: int) -> None:
 
 def test_two_tones_are_found_where_the_equation_puts_them(made: dict) -> None:
     (figure,) = made["fig-3.2"]
-    found = numbers(figure)
-    assert found["amplitude at 100 Hz"] == pytest.approx(1.0)
-    assert found["amplitude at 30 Hz"] == pytest.approx(0.5)
-    assert found["phase at 100 Hz (cosine 0)"] == pytest.approx(0.0, abs=1e-9)
-    assert found["phase at 30 Hz (cosine 0)"] == pytest.approx(-90.0)
-    assert found["largest amplitude elsewhere"] < 1e-12
+    result = numbers(figure)
+    assert result["amplitude at 100 Hz"] == pytest.approx(1.0)
+    assert result["amplitude at 30 Hz"] == pytest.approx(0.5)
+    assert result["phase at 100 Hz (cosine 0)"] == pytest.approx(0.0, abs=1e-9)
+    assert result["phase at 30 Hz (cosine 0)"] == pytest.approx(-90.0)
+    assert result["largest amplitude elsewhere"] < 1e-12
 
 
 def test_db8_has_eight_vanishing_moments_and_db4_four() -> None:
@@ -117,17 +117,17 @@ def test_scalogram_finds_the_resonance_of_the_oil_columns_and_its_damping(made: 
     rig = load_rig("thesis")
     stiffness = 2.0 * rig.cylinder.A_A**2 * rig.fluid.K_oil / rig.cylinder.V
     resonance = np.sqrt(stiffness / rig.cylinder.M_eq) / (2 * np.pi)
-    found = numbers(figure)
-    assert found["frequency of the ringing"] == pytest.approx(resonance, rel=0.25)
-    assert found["rms at the ringing, leak / no leak"] < 0.7
-    assert found["mean leak"] == pytest.approx(0.0163, rel=0.02)
+    result = numbers(figure)
+    assert result["frequency of the ringing"] == pytest.approx(resonance, rel=0.25)
+    assert result["rms at the ringing, leak / no leak"] < 0.7
+    assert result["mean leak"] == pytest.approx(0.0163, rel=0.02)
     assert figure.resolved is True
 
 
 def test_every_view_of_one_signal_tells_what_it_should(made: dict) -> None:
     (figure,) = made["fig-3.4"]
-    found = numbers(figure)
-    assert found["width of the pulse at 300 Hz in (d)"] < found["width of the pulse at 300 Hz in (c)"] / 2
+    result = numbers(figure)
+    assert result["width of the pulse at 300 Hz in (d)"] < result["width of the pulse at 300 Hz in (c)"] / 2
     assert [panel.image is not None for panel in figure.panels] == [False, False, True, True]
     short, wavelet = figure.panels[2].image, figure.panels[3].image
     early, late = short.x < 0.4, short.x > 0.6
@@ -157,8 +157,8 @@ def test_a_pressure_that_drops_makes_claim_3_6_hold(monkeypatch: pytest.MonkeyPa
                 return run
             return replace(run, outputs={name: 0.5 * values for name, values in run.outputs.items()})
 
-    found = {claim.id: claim.verdict for claim in chapter3_claims.claims(Dropping(), chapter3_claims.ITEMS[0])}
-    assert found["claim-3.6"] == "holds"
+    result = {claim.id: claim.verdict for claim in chapter3_claims.claims(Dropping(), chapter3_claims.ITEMS[0])}
+    assert result["claim-3.6"] == "holds"
 
 
 @pytest.mark.parametrize(

@@ -311,8 +311,8 @@ def test_claims_on_the_orifice_follow_their_numbers(kept: Kept, claims: dict[str
             outputs["p_2"] = outputs["p_2"] + 2.0 * visible_pressure()
             return replace(run, outputs=outputs)
 
-    found = make(AsClaimed(runs=kept.runs), ALL["chapter-4-claims"])
-    verdicts = {one.id: one.verdict for one in found if isinstance(one, Claim)}
+    result = make(AsClaimed(runs=kept.runs), ALL["chapter-4-claims"])
+    verdicts = {one.id: one.verdict for one in result if isinstance(one, Claim)}
     assert verdicts["claim-4.8"] != "holds"
     assert claims["claim-4.8"].verdict == "holds"
     for name in ("claim-4.10", "claim-4.11", "claim-4.12", "claim-4.15", "claim-4.16"):
@@ -322,10 +322,10 @@ def test_claims_on_the_orifice_follow_their_numbers(kept: Kept, claims: dict[str
 
 def test_the_sweep_of_the_line_volumes_shows_where_the_step_fails(kept: Kept) -> None:
     (figure,) = make(kept, ALL["chapter-4-volumes"])
-    found = numbers(figure)
-    gaps = [abs(found[f"mean of p_1 - p_A at {v} cm3, RK4, 1e-4 s"]) for v in (10, 44, 234)]
+    result = numbers(figure)
+    gaps = [abs(result[f"mean of p_1 - p_A at {v} cm3, RK4, 1e-4 s"]) for v in (10, 44, 234)]
     assert gaps[0] > gaps[1] > gaps[2] > 5e-3
-    assert all(abs(found[f"mean of p_1 - p_A at {v} cm3, converged"]) < 1e-3 for v in (10, 44, 234))
+    assert all(abs(result[f"mean of p_1 - p_A at {v} cm3, converged"]) < 1e-3 for v in (10, 44, 234))
 
 
 def test_transducer_s_noise_is_the_measure_of_what_can_be_seen() -> None:

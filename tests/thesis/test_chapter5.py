@@ -73,7 +73,7 @@ def test_each_number_shows_what_the_thesis_s_caption_says() -> None:
         number = int(text)
         if number > 89:
             continue
-        source = int(found[1]) if (found := re.search(r"Fig\. ?5\.(\d+)\.?$", caption)) else 0
+        source = int(result[1]) if (result := re.search(r"Fig\. ?5\.(\d+)\.?$", caption)) else 0
         if caption.startswith("Close-up"):
             start, stop = map(int, re.search(r"from (\d+)th to (\d+)th", caption).groups())  # type: ignore[union-attr]
             views[number] = (*views[source][:2], True)
@@ -132,8 +132,8 @@ def test_a_close_up_holds_its_twenty_seconds_alone(context: Direct) -> None:
 
 def test_the_leak_is_the_sheet_s_and_none_before_it_opens(context: Direct) -> None:
     made = drawn(context, 3)
-    told = numbers(made)
-    assert told["mean leak while open (true)"] == pytest.approx(APPENDIX_C[38].mean_leak_lpm, rel=2e-3)
+    by_name = numbers(made)
+    assert by_name["mean leak while open (true)"] == pytest.approx(APPENDIX_C[38].mean_leak_lpm, rel=2e-3)
     flow = made.panels[0].curves[0]
     before, after = flow.y[flow.x < 59.9], flow.y[flow.x > 60.1]
     assert np.abs(before).max() < 0.002  # ten deviations of the flow meter's noise
@@ -215,10 +215,10 @@ def noise(values: np.ndarray, rate: float = 500.0) -> Recording:
 
 def test_detail_rms_of_white_noise_is_its_deviation_in_psi() -> None:
     values = 1.5 * PSI * np.random.default_rng(1).standard_normal(60_000)
-    found = detail_rms(noise(values), ((5.0, 60.0), (60.0, 120.0)))
+    result = detail_rms(noise(values), ((5.0, 60.0), (60.0, 120.0)))
     for level in range(1, 5):
-        assert found["p_A"][f"d{level}"] == pytest.approx((1.5, 1.5), rel=0.04)
-        assert found["p_B"][f"d{level}"] == pytest.approx((3.0, 3.0), rel=0.04)
+        assert result["p_A"][f"d{level}"] == pytest.approx((1.5, 1.5), rel=0.04)
+        assert result["p_B"][f"d{level}"] == pytest.approx((3.0, 3.0), rel=0.04)
 
 
 def test_a_part_sees_nothing_outside_of_itself() -> None:

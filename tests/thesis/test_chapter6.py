@@ -15,8 +15,8 @@ from sealscope.thesis.engine.products import Figure, ThesisTable
 def test_an_amplitude_is_found_beside_a_drift():
     t = np.arange(4000) / 500.0
     values = 3.0 * np.sin(2 * math.pi * 0.5 * t + 0.4) + 7.0 - 2.0 * t
-    found = chapter6.amplitude_at(t, values, 0.5)
-    assert abs(found) == pytest.approx(3.0, rel=1e-9)
+    result = chapter6.amplitude_at(t, values, 0.5)
+    assert abs(result) == pytest.approx(3.0, rel=1e-9)
 
 
 def test_a_leak_has_its_size_under_the_load():
@@ -108,11 +108,11 @@ def test_oil_that_leaves_past_a_rod_seal_lowers_pressure_and_stiffness():
 
     (table,) = chapter6.outside_table(Quick(), next(item for item in chapter6.ITEMS if item.id == "sec-6.2-outside"))
     by = {row[0]: row[3:] for row in table.rows}
-    sound = chapter6.stiffness("pi", 0.0)
+    intact = chapter6.stiffness("pi", 0.0)
     for side in ("A", "B"):
         error, stiff, made_good, fallen = by[side]
         assert error < 0.1
-        assert stiff < 0.6 * sound
+        assert stiff < 0.6 * intact
         assert made_good == 0.0
         assert fallen < -50.0
     assert by["A"][1] < 0.6 * by["B"][1]

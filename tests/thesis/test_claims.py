@@ -59,13 +59,13 @@ def evidence(measured: DataSheet | None, leak: DataSheet | None = None) -> Claim
 
 
 def every_claim(of: ClaimEvidence) -> dict[str, Claim]:
-    found = (
+    result = (
         *claims_sheet.claims(of),
         *claims_sheet.curves(of),
         claims_sheet.consistent(of),
         *claims_rig.claims(of),
     )
-    return {claim.id: claim for claim in found}
+    return {claim.id: claim for claim in result}
 
 
 @pytest.fixture(scope="module")
@@ -132,11 +132,11 @@ def test_verdicts_on_the_thesis_s_own_sheet(measured: dict[str, Claim]) -> None:
 
 def test_leak_sizes_are_judged_by_the_conditions() -> None:
 
-    found = {claim.id: claim for claim in claims_sheet.levels()}
-    assert found["claim-5.1.2"].verdict == "does not hold"
-    assert found["claim-5.1.3"].verdict == "does not hold"
-    assert "0.0163" in found["claim-5.1.3"].sheet
-    assert "row 19" in found["claim-5.1.3"].why
+    result = {claim.id: claim for claim in claims_sheet.levels()}
+    assert result["claim-5.1.2"].verdict == "does not hold"
+    assert result["claim-5.1.3"].verdict == "does not hold"
+    assert "0.0163" in result["claim-5.1.3"].sheet
+    assert "row 19" in result["claim-5.1.3"].why
 
 
 def test_the_drift_of_the_piston_is_laid_to_the_leak_only_where_the_control_drifts_on() -> None:
@@ -159,8 +159,8 @@ def test_throttles_raise_the_range_where_they_do() -> None:
     assert every_claim(evidence(None))["claim-6.1.3"].verdict == "holds"
     flat = evidence(None)
     rows = tuple((*row[:5], 0.12, 0.12, *row[7:]) for row in flat.table.rows)
-    told = every_claim(replace(flat, table=replace(flat.table, rows=rows)))["claim-6.1.3"]
-    assert told.verdict != "holds"
+    weakened = every_claim(replace(flat, table=replace(flat.table, rows=rows)))["claim-6.1.3"]
+    assert weakened.verdict != "holds"
 
 
 def test_correlations_of_41_points_differ_from_zero_above_0_31() -> None:

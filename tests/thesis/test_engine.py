@@ -168,7 +168,7 @@ def test_products_and_runs_survive_the_file(tmp_path: Path) -> None:
     claim = Claim("claim-1", "section 1", "It is.", "so", "so", "holds", "why")
     table = ThesisTable("t-1", "T", ("a", "b"), ((1, 2.5), ("x", None), (np.float64(0.5), True)))
     kept = ResultsFolder(tmp_path)
-    kept.keep("one", "key", (figure, claim, table))
+    kept.save("one", "key", (figure, claim, table))
     again: Any = kept.products("one", "key")
     assert kept.products("one", "other key") is None
     assert again[1] == claim
@@ -184,7 +184,7 @@ def test_products_and_runs_survive_the_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize("odd", [object(), np.array([object()])])
 def test_what_cannot_be_kept_is_refused_and_leaves_no_file(odd: Any, tmp_path: Path) -> None:
     with pytest.raises(TypeError, match="must hold texts, numbers and arrays"):
-        ResultsFolder(tmp_path).keep("one", "key", (odd,))
+        ResultsFolder(tmp_path).save("one", "key", (odd,))
     assert list((tmp_path / "kept" / "items").iterdir()) == []
 
 

@@ -22,7 +22,7 @@ from sealscope.thesis.claims.evidence import (
     condition_columns,
     left_out_r2,
     partial_correlation,
-    told_apart_by_levels,
+    separation_by_levels,
 )
 from sealscope.thesis.sheet import DataSheet, mean_leaks
 
@@ -68,8 +68,8 @@ def test_the_condition_tells_more_of_the_leak_than_the_features_do(measured_shee
 
 @needs_sheet
 def test_absolute_levels_of_both_chambers_tell_leak_from_none(measured_sheet: DataSheet) -> None:
-    accuracy, auc = told_apart_by_levels(measured_sheet, "test")
-    accuracy_by_condition, auc_by_condition = told_apart_by_levels(measured_sheet, "condition")
+    accuracy, auc = separation_by_levels(measured_sheet, "test")
+    accuracy_by_condition, auc_by_condition = separation_by_levels(measured_sheet, "condition")
     assert accuracy > 0.9
     assert auc > 0.95
     assert auc_by_condition <= auc
@@ -132,5 +132,5 @@ def test_partial_correlation_takes_the_common_cause_out() -> None:
 
 
 def test_levels_without_information_tell_nothing() -> None:
-    _, auc = told_apart_by_levels(made_sheet(8, scatter=0.4), "test")
+    _, auc = separation_by_levels(made_sheet(8, scatter=0.4), "test")
     assert 0.3 < auc < 0.7

@@ -7,7 +7,7 @@ which step of the leak's conductance `diagnose` finds in them, by the same test 
 
 s the deviation of a step at the median onset, the threshold that of the likelihood ratio at the false-alarm
 probability. A seal is a conductance: duties are compared by it, and sizes stated as the flow that it passes under the
-first duty. Whether a step of the piston's leak can be told from one of the pump's is the Fisher information of both at
+first duty. Whether a step of the piston's leak is separable from one of the pump's is the Fisher information of both at
 once, all other terms free.
 """
 
@@ -56,14 +56,14 @@ USUAL = PlannedDuty(COMMANDS[0])
 class Findable(NamedTuple):
     """What recordings of a duty and a `duration` [s] find.
 
-    `conductance` of the smallest step of the leak that is found, and of that which is told from the pump's [m^3/(s
+    `conductance` of the smallest step of the leak that is found, and of that which is separable from the pump's [m^3/(s
     Pa)], infinite where none is; `pressure`: mean |p_A - p_B| [Pa]; `note`: why there are no figures.
     """
 
     duty: PlannedDuty
     duration: float
     conductance: float
-    told_apart: float
+    separable: float
     pressure: float
     note: str = ""
 
@@ -71,14 +71,14 @@ class Findable(NamedTuple):
 class RecordingPlan(NamedTuple):
     """The recording to make, and all duties that were compared; `wanted` conductance [m^3/(s Pa)], None for none.
 
-    `chosen`: of the shortest duration that finds it, or the best that was tried; `telling`: the same of what is told
-    from the pump; `usual` pressure [Pa], at which flows are stated.
+    `chosen`: of the shortest duration that finds it, or the best that was tried; `separating`: the same of what is
+    separable from the pump; `usual` pressure [Pa], at which flows are stated.
     """
 
     rig: str
     wanted: float | None
     chosen: Findable
-    telling: Findable
+    separating: Findable
     compared: tuple[Findable, ...]
     usual: float
     false_alarm: float
@@ -97,7 +97,7 @@ class RecordingPlan(NamedTuple):
         """Return the plan as plain JSON values, sizes in L/min at the usual pressure."""
 
         def plain(own: Findable) -> dict[str, Any]:
-            sizes = {"smallest_leak_lpm": self.lpm(own.conductance), "told_from_pump_lpm": self.lpm(own.told_apart)}
+            sizes = {"smallest_leak_lpm": self.lpm(own.conductance), "separable_from_pump_lpm": self.lpm(own.separable)}
             driving = own.pressure if np.isfinite(own.pressure) else None
             return {**own.duty._asdict(), "duration_s": own.duration, **sizes, "pressure_Pa": driving, "note": own.note}
 
@@ -109,30 +109,28 @@ class RecordingPlan(NamedTuple):
             "false_alarm_probability": self.false_alarm,
             "detection_probability": self.detection,
             "recording": plain(self.chosen),
-            "telling_from_pump": plain(self.telling),
+            "separating_from_pump": plain(self.separating),
             "compared": [plain(own) for own in self.compared],
         }
 
     def text(self) -> str:
         """Return the plan as lines of text, the answer first."""
-        own, telling, at = self.chosen, self.telling, f"at {self.usual / 1e6:.2g} MPa"
+        own, separating, at = self.chosen, self.separating, f"at {self.usual / 1e6:.2g} MPa"
         wanted = "" if self.wanted is None else f"{self.lpm(self.wanted):.2g} L/min {at}: "
         doubt = "" if self.finds else "not found; the best is "
         lines = [
             f"{wanted}{doubt}{own.duty} for {own.duration:g} s finds {self._size(own.conductance)} {at}",
             f"  in {100 * self.detection:g} % of recordings, {100 * self.false_alarm:g} % false alarms; rig {self.rig}",
-            "  told from a leak of the pump: "
+            "  separated from a leak of the pump: "
             + (
-                f"{telling.duty} for {telling.duration:g} s, {self._size(telling.told_apart)}"
-                if np.isfinite(telling.told_apart)
+                f"{separating.duty} for {separating.duration:g} s, {self._size(separating.separable)}"
+                if np.isfinite(separating.separable)
                 else "no; record the pump's ports p_1 and p_2 behind throttles"
             ),
-            f"  {'other duties, ' + f'{self.compared[0].duration:g} s':<34}{'found':>14}{'told from pump':>18}",
+            f"  {'other duties, ' + f'{self.compared[0].duration:g} s':<34}{'found':>14}{'separable':>18}",
         ]
         able = [row for row in self.compared if not row.note]
-        lines += [
-            f"  {row.duty!s:<34}{self._size(row.conductance):>14}{self._size(row.told_apart):>18}" for row in able
-        ]
+        lines += [f"  {row.duty!s:<34}{self._size(row.conductance):>14}{self._size(row.separable):>18}" for row in able]
         notes = [row for row in self.compared if row.note]
         lines += [f"  left out: {row.duty}: {row.note}"[:120] for row in notes[:1]]
         return "\n".join(lines)
@@ -156,22 +154,22 @@ def findable(
     rig: Rig, duty: PlannedDuty, duration: float, *, false_alarm: float = 0.01, detection: float = 0.9
 ) -> Findable:
     """Return what leak-free recordings of a duty say they find; what cannot be simulated or judged is its note."""
-    steps, told, pressures = [], [], []
+    steps, separable_steps, pressures = [], [], []
     try:
         for seed in range(RECORDS):
             recording = simulate_with_truth(experiment_of(rig, duty, duration, seed)).recording
-            step, apart, pressure = _found_in(recording, rig, false_alarm, detection)
+            step, apart, pressure = _detectable_in(recording, rig, false_alarm, detection)
             steps.append(step)
-            told.append(apart)
+            separable_steps.append(apart)
             pressures.append(pressure)
     except SealscopeError as error:
         return Findable(duty, duration, np.inf, np.inf, np.nan, str(error))
-    step, apart, pressure = (float(np.median(own)) for own in (steps, told, pressures))
+    step, apart, pressure = (float(np.median(own)) for own in (steps, separable_steps, pressures))
     return Findable(duty, duration, step, apart, pressure)
 
 
-def _found_in(recording: Recording, rig: Rig, false_alarm: float, detection: float) -> tuple[float, float, float]:
-    """Return the conductance found, that told from the pump, and the mean pressure, of a leak-free recording."""
+def _detectable_in(recording: Recording, rig: Rig, false_alarm: float, detection: float) -> tuple[float, float, float]:
+    """Return the conductance found, that separable from the pump, and the mean pressure, of a leak-free recording."""
     detector = VolumeBalance(rig)
     if reason := detector.usable(recording):
         raise InputError(f"no balance: {reason}")
@@ -181,11 +179,11 @@ def _found_in(recording: Recording, rig: Rig, false_alarm: float, detection: flo
     share = false_alarm * (1.0 - SECOND if rig.pump.G_healthy > 0.0 else 1.0)
     size = balance.size.scale
     step = balance.test.findable(share, detection) * size
-    ratio = _told_over_known(balance.blocks, balance.columns)
+    ratio = _free_over_known(balance.blocks, balance.columns)
     return step, step * ratio, balance.mean(0)
 
 
-def _told_over_known(blocks: Blocks, columns: Sequence[Columns]) -> float:
+def _free_over_known(blocks: Blocks, columns: Sequence[Columns]) -> float:
     """Return the deviation of a step of the leak at mid-record with the pump's step free, over that with it known.
 
     Infinite where no term of the pump is in the balance.
@@ -227,7 +225,7 @@ def plan_recording(
     pressure = compared[0].pressure
     wanted = None if find is None else find / pressure
     best = []
-    for name in ("conductance", "told_apart"):
+    for name in ("conductance", "separable"):
         own = min(compared, key=lambda own: float(getattr(own, name)))
         if wanted is not None and np.isfinite(getattr(own, name)):
             guess = COMPARED * (getattr(own, name) / wanted) ** 2  # a deviation falls with the root of the duration

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 #: Exit status where a verdict is one of those that `--fail-on` names; verdicts; levels of severity, the worst last.
 FAILED_ON = 3
-VERDICTS, LEVELS = ("leak", "no leak", "cannot tell"), ("follow", "plan", "repair")
+VERDICTS, LEVELS = ("leak", "no leak", "cannot tell"), ("monitor", "plan", "repair")
 #: Stands for standard input.
 STANDARD_INPUT = Path("-")
 _log = logging.getLogger(__name__)

@@ -112,8 +112,8 @@ class Drive:
         """Return the flow (n,) [m^3/s] of voltages (n,) [V] at `rate` [Hz] against p_A - p_B (n,) [Pa].
 
         The drive's law above, solved for omega: with y, omega_d + droop dp after a `lag`, omega = (omega_d + shortfall
-        (y - droop dp))/(1 + shortfall). It starts from rest, where it carries the first dp; or so that y is the same
-        after the first `settled` samples as before them.
+        (y - droop dp))/(1 + shortfall). It starts from standstill, where it carries the first dp; or so that y is the
+        same after the first `settled` samples as before them.
         """
         commanded, lift = self.omega_per_volt * u, self.droop * dp
         wanted, late = commanded + lift, np.empty_like(commanded)

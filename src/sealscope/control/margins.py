@@ -50,19 +50,18 @@ class Margins:
 def margins(rig: Rig, controller: Controller, speed: float = 0.0, load: float = 0.0) -> Margins:
     """Return the margins of the loop of a rig and a controller, cut at the voltage.
 
-    The rig is linearised over one sample of the controller, about a piston that moves at `speed` [m/s], 0: that rests,
-    under `load` [N] beside the rig's own: y(k+1) = A y(k) + B u(k), by differences of the solver's own steps. The
-    controller is what its answers to an impulse of each measurement say: C_j(z). Loop:
-    L(z) = -z^-delay sum_j C_j(z) c_j (z I - A)^-1 B, j = x, p_A, p_B, theta. Raises InputError for a speed beyond the
-    drive.
+    The rig is linearised over one sample of the controller, about a piston that moves at `speed` [m/s], 0: at
+    standstill, under `load` [N] beside the rig's own: y(k+1) = A y(k) + B u(k), by differences of the solver's own
+    steps. The controller is what its answers to an impulse of each measurement say: C_j(z). Loop: L(z) = -z^-delay
+    sum_j C_j(z) c_j (z I - A)^-1 B, j = x, p_A, p_B, theta. Raises InputError for a speed beyond the drive.
 
     Examples
     --------
     >>> import sealscope as ss
     >>> from sealscope.control import PositionPI, margins
     >>> rig = ss.load_rig("thesis-closed-loop")
-    >>> found = margins(rig, PositionPI.of(rig), speed=0.05)
-    >>> found.gain > 2.0 and found.phase > 0.7
+    >>> loop = margins(rig, PositionPI.of(rig), speed=0.05)
+    >>> loop.gain > 2.0 and loop.phase > 0.7
     True
     """
     A, B, about = _linearised(rig, controller.rate, speed, load)
@@ -79,10 +78,10 @@ def margins(rig: Rig, controller: Controller, speed: float = 0.0, load: float = 
 
 
 def _linearised(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array, Array, Array]:
-    from sealscope.physics.rest import initial_state
     from sealscope.physics.rig import rig_numbers
     from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, advance, nodes_of
     from sealscope.physics.solvers.limits import longest_step
+    from sealscope.physics.standstill import initial_state
     from sealscope.physics.state import OUTPUTS, POSITION, VELOCITY
 
     p = rig_numbers(rig) if load == 0.0 else rig_numbers(rig)._replace(pushed=(True,))
@@ -130,21 +129,21 @@ def _answers(controller: Controller, about: Array) -> list[tuple[int, Array]]:
     """Return, for each state that is measured, its row and the controller's answer to a unit impulse of it."""
     from sealscope.physics.state import P_A, P_B, POSITION, THETA
 
-    rest = Measured(0.0, 0.0, 0.0, 0.0, float(about[P_A]), float(about[P_B]), 0.0)
+    standstill = Measured(0.0, 0.0, 0.0, 0.0, float(about[P_A]), float(about[P_B]), 0.0)
     n = round(_MEMORY * controller.rate)
 
     def answer(first: Measured) -> Array:
         voltage = controller.start()
         for _ in range(round(controller.rate)):
-            voltage(rest)
-        return np.array([voltage(first), *(voltage(rest) for _ in range(n - 1))])
+            voltage(standstill)
+        return np.array([voltage(first), *(voltage(standstill) for _ in range(n - 1))])
 
-    quiet = answer(rest)
+    quiet = answer(standstill)
     asked = (
-        (POSITION, _IMPULSE_X, rest._replace(x=_IMPULSE_X)),
-        (P_A, _IMPULSE_P, rest._replace(p_A=rest.p_A + _IMPULSE_P)),
-        (P_B, _IMPULSE_P, rest._replace(p_B=rest.p_B + _IMPULSE_P)),
-        (THETA, _IMPULSE_THETA, rest._replace(theta=_IMPULSE_THETA)),
+        (POSITION, _IMPULSE_X, standstill._replace(x=_IMPULSE_X)),
+        (P_A, _IMPULSE_P, standstill._replace(p_A=standstill.p_A + _IMPULSE_P)),
+        (P_B, _IMPULSE_P, standstill._replace(p_B=standstill.p_B + _IMPULSE_P)),
+        (THETA, _IMPULSE_THETA, standstill._replace(theta=_IMPULSE_THETA)),
     )
     answers = [(row, (answer(first) - quiet) / size) for row, size, first in asked]
     return [(row, values) for row, values in answers if np.any(values)]

@@ -52,8 +52,8 @@ class PositionPI:
     against the measured pressure difference; within `dead_volts` [V], the overlap of its edges, nothing flows, so a
     small voltage is moved beyond it, four times as quickly as it grows.
 
-    Within `dead_band` [m] of the target the integral stands still, so that it does not hunt a piston at rest about its
-    friction or between two counts of its encoder; so it does where the voltage is at its limit `u_max` [V].
+    Within `dead_band` [m] of the target the integral stands still, so that it does not hunt a piston at standstill
+    about its friction or between two counts of its encoder; so it does where the voltage is at its limit `u_max` [V].
 
     `rate` [Hz], `delay` in whole samples; `k_v` [1/s], `k_i` [1/s^2]; `area_A`, `area_B` [m^2].
     """

@@ -98,7 +98,7 @@ def _inspection(recording: Recording, names: Sequence[str]) -> Inspection:
 def _spoils(finding: Finding, samples: int) -> bool:
     """Return whether a finding on a chamber pressure of so many samples leaves no trust in its details.
 
-    A chamber that empties into the tank rests at the rail for a while in any stroke.
+    A chamber that empties into the tank stays at the rail for a while in any stroke.
     """
     return finding.code in ("constant", "stuck") or (finding.code == "clipped" and finding.count > samples / 2)
 

@@ -24,7 +24,6 @@ from sealscope.physics.cylinder import mechanical_power
 from sealscope.physics.fluid import P_ATM
 from sealscope.physics.motor import electric_power
 from sealscope.physics.pump import hydraulic_power
-from sealscope.physics.rest import carried_at_rest, holding_current, holding_integral, pressures_at_rest
 from sealscope.physics.rig import (
     CHOICES,
     DERIVED_FROM,
@@ -39,6 +38,12 @@ from sealscope.physics.rig import (
 )
 from sealscope.physics.solvers.imex import IMEX_NODES, imex_step
 from sealscope.physics.solvers.rk4 import RK4_NODES, rk4_step
+from sealscope.physics.standstill import (
+    carried_at_standstill,
+    holding_current,
+    holding_integral,
+    pressures_at_standstill,
+)
 from sealscope.physics.state import (
     CURRENT,
     INTEGRAL,
@@ -59,7 +64,7 @@ FAILURES = MappingProxyType(
     {
         1: "the state is not finite: take a smaller step, or smaller gains",
         2: "a pressure is below vacuum, where the model does not hold",
-        3: "the drive cannot hold the load at rest",
+        3: "the drive cannot hold the load at standstill",
     }
 )
 _SIZES = {"values": len(VALUES), "inputs": len(INPUTS), "y": len(STATES), "results": len(RESULTS)}
@@ -135,9 +140,9 @@ def numbers_of(choices: tuple[bool | tuple[bool, ...], ...], exponent: float, li
 def functions(choice: Choice) -> dict[str, Callable[..., Any]]:
     """Return the functions of a unit, to be compiled.
 
-    ``start(values, inputs, x_0, y)`` puts the state at rest under the load of the inputs; ``advance(values, inputs,
-    slopes, y, span, steps)`` moves it over `span` [s], while the inputs move along their slopes; ``report(values,
-    inputs, y, results)`` writes the outputs.
+    ``start(values, inputs, x_0, y)`` puts the state at standstill under the load of the inputs; ``advance(values,
+    inputs, slopes, y, span, steps)`` moves it over `span` [s], while the inputs move along their slopes;
+    ``report(values, inputs, y, results)`` writes the outputs.
     """
     choices, exponent, literal, implicit, euler = choice
     throttled, made_up = bool(choices[CHOICES.index("throttled")]), bool(choices[CHOICES.index("made_up")])
@@ -150,9 +155,9 @@ def functions(choice: Choice) -> dict[str, Callable[..., Any]]:
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
         v, given, state = carray(values, _N_VALUES), carray(inputs, _N_INPUTS), carray(y, _N_STATES)
         p = numbers(v, given)
-        force = carried_at_rest(x_0, p.F_l, p.k_load, p.A_opp, p.p_opp, p.L, p.k_stop, p.d_stop) + given[_F]
+        force = carried_at_standstill(x_0, p.F_l, p.k_load, p.A_opp, p.p_opp, p.L, p.k_stop, p.d_stop) + given[_F]
         V_A, V_B = (p.V_A + p.V_1, p.V_B + p.V_2) if throttled else (p.V_A, p.V_B)
-        p_A, p_B = pressures_at_rest(force, p.A_A, p.A_B, V_A, V_B, p.p_charge, made_up)
+        p_A, p_B = pressures_at_standstill(force, p.A_A, p.A_B, V_A, V_B, p.p_charge, made_up)
         state[:] = 0.0
         state[POSITION] = x_0
         state[P_A] = state[P_1] = p_A

@@ -33,7 +33,7 @@ from sealscope.diagnosis.inference.blocks import Columns
 from sealscope.diagnosis.inference.live.balance import BLOCK_SECONDS, LEARNED, TELLS, WAKES, live_equations, size_error
 from sealscope.diagnosis.inference.live.known import (
     MISFIT,
-    RESTS,
+    STANDSTILL,
     TINY,
     Known,
     add,
@@ -43,7 +43,7 @@ from sealscope.diagnosis.inference.live.known import (
     says,
     take,
 )
-from sealscope.diagnosis.inference.row_weights import SUPPORT, Room, median, room_shapes, weigh
+from sealscope.diagnosis.inference.row_weights import SUPPORT, Workspace, median, weigh, workspace_shapes
 from sealscope.diagnosis.inference.terms import ATMOSPHERE, HALF_DIFFERENCE, LEAST_ABSOLUTE
 from sealscope.diagnosis.inference.weak_form import LARGEST, SPAN, STRIDE, stride_samples, test_function
 from sealscope.errors import InputError
@@ -167,7 +167,7 @@ class _Memory(NamedTuple):
 
 
 def _shapes(choice: SensorChoice) -> tuple[tuple[tuple[int, ...], ...], ...]:
-    """Return the shapes of a memory's parts: those of `_Memory`, of a `Room` and of a `Known`."""
+    """Return the shapes of a memory's parts: those of `_Memory`, of a `Workspace` and of a `Known`."""
     n, slow = _Numbers.of(choice.rate), len(choice.own) - 1
     rows = SUPPORT * n.strides
     own = _Memory(
@@ -175,7 +175,7 @@ def _shapes(choice: SensorChoice) -> tuple[tuple[tuple[int, ...], ...], ...]:
         (SUPPORT, _WIDTH, _WIDTH), (SUPPORT + 1, 2), (slow + 1, slow + 1), (LEARNED, _WIDTH, _WIDTH), (LEARNED, 3),
         (LEARNED,), (WINDOW, 5),
     )  # fmt: skip
-    return tuple(own), room_shapes(rows, SUPPORT, len(choice.fast), slow), known_shapes(_LEAK)
+    return tuple(own), workspace_shapes(rows, SUPPORT, len(choice.fast), slow), known_shapes(_LEAK)
 
 
 def size(choice: SensorChoice) -> int:
@@ -239,10 +239,13 @@ def functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
 
 def _sample(choice: SensorChoice) -> Callable[..., Any]:
     """Return the law that takes a sample of the channels `INPUTS`."""
-    parts, room, known = _shapes(choice)
-    room_at = sum(math.prod(shape) for shape in parts)
+    parts, workspace, known = _shapes(choice)
+    workspace_at = sum(math.prod(shape) for shape in parts)
     of_memory = _arrays(parts, 0)
-    of_room, of_known = _arrays(room, room_at), _arrays(known, room_at + sum(math.prod(shape) for shape in room))
+    of_workspace, of_known = (
+        _arrays(workspace, workspace_at),
+        _arrays(known, workspace_at + sum(math.prod(shape) for shape in workspace)),
+    )
     (stride, strides, half), rate = _Numbers.of(choice.rate), choice.rate
     support, weight = SPAN * stride, float(test_function(rate)[0, 0]) / (1.0 - (1.0 / (SPAN * stride) - 1.0) ** 2) ** 4
     close, length = _close(choice), stride * strides
@@ -283,7 +286,7 @@ def _sample(choice: SensorChoice) -> Callable[..., Any]:
         if row % strides == strides - 1:
             taken = carray(pointer_at(memory, rows_at), (int(m.scalars[_ROWS]), _WIDTH))
             ends = carray(pointer_at(memory, ends_at), (int(m.scalars[_PENDING]) + 1,))
-            close(m, taken, ends, Room(*of_room(memory)), Known(*of_known(memory)), row // strides)
+            close(m, taken, ends, Workspace(*of_workspace(memory)), Known(*of_known(memory)), row // strides)
 
     return sample  # type: ignore[no-any-return]
 
@@ -332,7 +335,7 @@ def _show(m: Any, known: Any, error: float, rows: float, size: float, adds: bool
     """Put what the block `known.own` shows among the last ones."""
     scalars, moved = m.scalars, motion(known.own[-1, -1], rows, known.numbers)
     precision, lead, shift, leaning = says(known, rows, adds)
-    if not precision > (TELLS * scalars[_PRECISION] if moved < RESTS else 0.0):
+    if not precision > (TELLS * scalars[_PRECISION] if moved < STANDSTILL else 0.0):
         return
     total, last, k = lead / precision, m.last, int(scalars[_BLOCKS]) % WINDOW
     g = total - shift / precision
@@ -371,8 +374,8 @@ def _take(m: Any, known: Any, error: float, b: int, rows: float, size: float) ->
     scalars = m.scalars
     if scalars[_PRECISION] > 0.0:
         moved = motion(m.gram[b, _LEFT, _LEFT], rows, known.numbers)
-        scalars[_WOKEN] = scalars[_WOKEN] + 1.0 if moved > 1.0 / RESTS else 0.0
-        if scalars[_WOKEN] >= WAKES:  # all before were of a machine at rest: nothing is compared with them
+        scalars[_WOKEN] = scalars[_WOKEN] + 1.0 if moved > 1.0 / STANDSTILL else 0.0
+        if scalars[_WOKEN] >= WAKES:  # all before were of a machine at standstill: nothing is compared with them
             for i in range(len(known.own)):
                 for j in range(len(known.own)):
                     known.sums[i, j] = 0.0
@@ -403,7 +406,7 @@ def _close(choice: SensorChoice) -> Callable[..., Any]:
     fast, own, error = choice.fast, choice.own, choice.size_error
 
     @large_law
-    def close(m: Any, rows: Any, ends: Any, room: Any, known: Any, block: int) -> None:
+    def close(m: Any, rows: Any, ends: Any, workspace: Any, known: Any, block: int) -> None:
         scalars, count, pending, first = m.scalars, len(rows), len(ends), m.scalars[_CLOSED] == 0.0
         ends[pending - 1] = count
         scalars[_PENDING] = pending
@@ -414,7 +417,7 @@ def _close(choice: SensorChoice) -> Callable[..., Any]:
         for r in range(count):
             rows[r, _LEFT] *= scalars[_SIGN]
         scalars[_CLOSED] += pending
-        weigh(rows, ends, fast, own, m.support, min(1.0, SUPPORT / scalars[_CLOSED]), room, m.gram)
+        weigh(rows, ends, fast, own, m.support, min(1.0, SUPPORT / scalars[_CLOSED]), workspace, m.gram)
         scalars[_PENDING] = scalars[_ROWS] = 0.0
         for b in range(pending):
             of_block = ends[b] - (ends[b - 1] if b else 0.0)

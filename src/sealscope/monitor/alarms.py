@@ -187,8 +187,8 @@ class AlarmJudge:
                 now, happened = replace(now, state=over, returned_s=estimate.t), "returned"
         elif now.level == "warning" and self.error >= thresholds.debounce:
             # a higher level is a new call: it must be seen again, unless it is known to be a leak
-            seen: AlarmState = "valid" if now.state == "valid" else "new"
-            now, happened = replace(now, level="error", state=seen), "error"
+            to_state: AlarmState = "valid" if now.state == "valid" else "new"
+            now, happened = replace(now, level="error", state=to_state), "error"
         if leak is not None:
             leak_lpm, interval = estimate.leak_lpm, estimate.leak_interval_lpm
             chance = thresholds.by_chance(leak)

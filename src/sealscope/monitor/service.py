@@ -238,7 +238,7 @@ class Service:
         """End `run` after the block at hand."""
         self.stopping.set()
 
-    def _store(self, blocks: list[_Kept], keep: Callable[[list[_Kept]], object]) -> None:
+    def _store(self, blocks: list[_Kept], write: Callable[[list[_Kept]], object]) -> None:
         """Keep blocks in one transaction and acknowledge them; raises where the database is locked, full or away.
 
         Where something else fails they are kept one by one, and the one that fails is dropped, for it would fail
@@ -247,7 +247,7 @@ class Service:
         if not blocks:
             return
         try:
-            keep(blocks)
+            write(blocks)
         except Exception as error:
             if away(error) is not None:
                 self.count("waits for the database")
@@ -255,7 +255,7 @@ class Service:
                 raise
             if len(blocks) > 1:
                 for block in blocks:
-                    self._store([block], keep)
+                    self._store([block], write)
                 return
             self.count(_DROPPED)
             if _worth_a_line(self.actuators.counters[_DROPPED]):

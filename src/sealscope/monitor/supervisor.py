@@ -23,7 +23,7 @@ DATABASE, BROKER, WEBHOOK, OPCUA = "database", "broker", "webhook", "OPC UA serv
 #: Pauses after errors [s]: the first one, the longest one, and the longest one where the database is away.
 FIRST_PAUSE_S, LONGEST_PAUSE_S, DATABASE_PAUSE_S = 0.2, 60.0, 5.0
 #: A part that has run for so long [s] since it was started again counts as reached.
-_SOUND_S = 2.0
+_WORKING_S = 2.0
 #: Lines in a minute from one place in the code: of this package, and of the libraries that it uses.
 _OWN_LINES, _LIBRARY_LINES, _MINUTE_S, _MOST_PLACES = 300, 10, 60.0, 1000
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -175,20 +175,20 @@ class Supervisor:
         part = self.part(name)
 
         def lasting() -> None:
-            sound = threading.Timer(_SOUND_S, part.works)
-            sound.daemon = True
-            sound.start()
+            timer = threading.Timer(_WORKING_S, part.works)
+            timer.daemon = True
+            timer.start()
             try:
                 work()
             finally:
-                sound.cancel()
+                timer.cancel()
 
-        def keep() -> None:
+        def attempts() -> None:
             while not part.attempt(lasting) and again and not self._stopping.wait(part.pause_s):
                 pass
             ended()
 
-        return _started(keep, name)
+        return _started(attempts, name)
 
     def repeat(
         self, name: str, step: Callable[[], object], every_s: float, *, last: Callable[[], object] | None = None
@@ -196,13 +196,13 @@ class Supervisor:
         """Start a thread that runs a step every so many seconds, and `last` when `stopping` is set."""
         part = self.part(name)
 
-        def keep() -> None:
+        def attempts() -> None:
             while not self._stopping.wait(max(every_s, part.pause_s)):
                 part.attempt(step)
             if last is not None:
                 part.attempt(last, at_once=True)
 
-        return _started(keep, name)
+        return _started(attempts, name)
 
 
 class LimitedLines(logging.Filter):

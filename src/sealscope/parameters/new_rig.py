@@ -47,7 +47,7 @@ def rig_text(name: str, area_A: float, area_B: float, stroke: float, displacemen
     V = (0.5 + _DEAD) * larger * stroke
     size = V / base.cylinder.V
     mass = base.cylinder.M_eq * size
-    told = "stated when this file was written: replace by drawing or data sheet"
+    stated = "stated when this file was written: replace by drawing or data sheet"
     scaled = f"assumed: that of {base.name}, scaled with the"
     k_stop = base.cylinder.k_stop
     # side B is the smaller one in V_rod; a rod on side A leaves V to B
@@ -65,12 +65,12 @@ def rig_text(name: str, area_A: float, area_B: float, stroke: float, displacemen
         "# Speed of the motor for a volt of command, speed loop and winding (motor.omega_per_volt, k_p, K_i, R_c, ...)",
         "# are worth stating next: `sealscope parameters` lists them.",
         "[pump]",
-        f'q_b = {{ value = {1e6 * displacement:.6g}, unit = "cm^3/rev", source = "{told}" }}',
+        f'q_b = {{ value = {1e6 * displacement:.6g}, unit = "cm^3/rev", source = "{stated}" }}',
         "",
         "[cylinder]",
-        f'A_A = {{ value = {1e6 * area_A:.6g}, unit = "mm^2", source = "{told}" }}',
-        f'A_B = {{ value = {1e6 * area_B:.6g}, unit = "mm^2", source = "{told}" }}',
-        f'L = {{ value = {1e3 * stroke:.6g}, unit = "mm", source = "{told}" }}',
+        f'A_A = {{ value = {1e6 * area_A:.6g}, unit = "mm^2", source = "{stated}" }}',
+        f'A_B = {{ value = {1e6 * area_B:.6g}, unit = "mm^2", source = "{stated}" }}',
+        f'L = {{ value = {1e3 * stroke:.6g}, unit = "mm", source = "{stated}" }}',
         f'V = {{ value = {1e6 * V:.6g}, unit = "cm^3", source = "assumed: half the swept volume, and a quarter of it '
         'in dead volume and hoses" }',
         f'V_rod = {{ value = {1e6 * V_rod:.6g}, unit = "cm^3", source = "assumed: (A_A - A_B) L/2, so that both sides '

@@ -25,7 +25,7 @@ def coulomb_friction(p_A: float, p_B: float, F_pr: float, F_cfr: float, of_diffe
 def stribeck_level(speed: float, F_C: float, K_brk: float, C_c: float) -> float:
     """Friction force [N] of steady sliding at `speed` >= 0 [m/s] without its viscous part, eq. (4.21).
 
-    F_C (1 + (K_brk - 1) exp(-C_c speed)): the breakaway force K_brk F_C at rest, F_C at speed.
+    F_C (1 + (K_brk - 1) exp(-C_c speed)): the breakaway force K_brk F_C at standstill, F_C at speed.
     """
     return F_C * (1.0 + (K_brk - 1.0) * exponential(-C_c * speed))  # type: ignore[no-any-return]
 

@@ -1,6 +1,6 @@
 """Whether a reading moves: constant channels, held values and changes that are mere rounding.
 
-The noise of a transducer never rests. A value that stays the same to the last digit for longer than the noise allows
+The noise of a transducer never stops. A value that stays the same to the last digit for longer than the noise allows
 is a rail, a held value or a dead channel.
 """
 
@@ -36,11 +36,11 @@ def moves(values: Array) -> bool:
 
 
 def does_not_move(recording: Recording) -> str | None:
-    """Say which chamber pressure of a recording without missing samples rests for a while, and when; None for none.
+    """Say which chamber pressure of a recording without missing samples stays constant, and when; None for none.
 
-    A pressure rests where it stays the same to the last digit for longer than 1.5 s (and 64 samples), or where it is a
-    straight line to within `ROUNDING` throughout. A recording too short to tell and a constant channel, which `inspect`
-    reports, give None.
+    A pressure is constant where it stays the same to the last digit for longer than 1.5 s (and 64 samples), or where it
+    is a straight line to within `ROUNDING` throughout. A recording too short to tell and a constant channel, which
+    `inspect` reports, give None.
     """
     longest = max(round(_LONGEST_HOLD_S * recording.rate), _LONGEST_HOLD)
     for name in chambers_of(recording):

@@ -1,6 +1,6 @@
 """The quality of a recording: what is wrong with it is found and named, never repaired.
 
-Each test of a channel's values lets quantised, slow and resting signals pass.
+Each test of a channel's values lets quantised, slow and constant signals pass.
 """
 
 from __future__ import annotations
@@ -209,7 +209,7 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
     if kept.size < 2:
         return findings
     if constant(kept):
-        # a command may rest, and a flow meter on a closed bypass reads one value; a pressure never does
+        # a command may be constant, and a flow meter on a closed bypass reads one value; a pressure never does
         text = f"is constant at {kept[0]:g} {unit}"
         add("constant", kept.size, int(present[0]), text, "note" if steady else "warning")
         return findings
@@ -281,7 +281,7 @@ def clipped(values: Array, held: NDArray[np.intp] | None = None, low: bool = Tru
     A cut-off piles up at its value what lay beyond: far more samples than any of the five levels next to it, in runs
     that the signal enters or leaves by more than three quantisation steps (one, for a long run). The crest of a slow
     quantised signal also holds many samples, but its neighbours hold nearly as many and it is entered step by step; a
-    channel that rests at two levels, such as a square wave, has as many samples at the other. A run among `held`, as
+    channel that stays at two levels, such as a square wave, has as many samples at the other. A run among `held`, as
     `stuck` gives them, at an end of the values is a cut-off too.
     """
     if not values.size:

@@ -71,7 +71,7 @@ class MultiSine:
 
 @dataclass(frozen=True)
 class Trapezoid:
-    """u rises evenly from 0 to `level` within `rise` [s], rests, and falls back likewise, every `period` [s]."""
+    """u rises evenly from 0 to `level` within `rise` [s], stays, and falls back likewise, every `period` [s]."""
 
     level: float
     rise: float

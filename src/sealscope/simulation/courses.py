@@ -66,8 +66,8 @@ class Force:
         x, v = (np.array(bends or ((0.0, 0.0),), dtype=np.float64) for bends in (self.over_x, self.over_v))
         return x, v
 
-    def at_rest(self, x: float) -> float:
-        """Return the force [N] at t = 0 on a piston at rest at x [m]."""
+    def at_standstill(self, x: float) -> float:
+        """Return the force [N] at t = 0 on a piston at standstill at x [m]."""
         from sealscope.physics.cylinder import force_over
 
         force, tables = float(self.at(np.zeros(()))), self.tables()

@@ -227,7 +227,7 @@ def integrate(
     load: Force | None = None,
     feedback: Feedback | None = None,
 ) -> Trajectory:
-    """Integrate from rest over `duration` [s] and report the outputs at `rate` [Hz].
+    """Integrate from standstill over `duration` [s] and report the outputs at `rate` [Hz].
 
     A `step` [s] that is given is taken (the largest that divides the output interval and is not above it); else the
     largest is chosen, from `LONGEST_STEP` down to `FINEST` of it, that passes the check: in short windows spread over
@@ -242,12 +242,12 @@ def integrate(
     rig, the leak or a stop that was hit, when a given step does not pass the check, when a state is not finite, or when
     a pressure falls below vacuum; `allow_unresolved` lets all but a state that is not finite pass.
     """
-    from sealscope.physics.rest import initial_state
     from sealscope.physics.solvers.limits import longest_step
+    from sealscope.physics.standstill import initial_state
     from sealscope.physics.state import OUTPUTS, P_2, P_A, STATES
 
     base = numbers_under(rig, load)
-    start_state = initial_state(rig, x_0, 0.0 if load is None else load.at_rest(x_0))
+    start_state = initial_state(rig, x_0, 0.0 if load is None else load.at_standstill(x_0))
     if step is not None and not (math.isfinite(step) and step > 0):
         raise InputError(f"step must be > 0 s, got {step}")
     if error is not None and not (math.isfinite(error) and error > 0):

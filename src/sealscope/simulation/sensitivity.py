@@ -79,13 +79,13 @@ def _settled(name: str, channels: tuple[str, ...], first: float, quotient: Calla
     for _ in range(_MOST_HALVINGS):
         fine = quotient(step / 2.0)
         size = _rms(fine)
-        bent = _rms(coarse - fine) / size if size > 0.0 else 0.0
-        if bent <= LINEARITY:
-            return Sensitivity(name, channels, fine, step, bent)
+        nonlinearity = _rms(coarse - fine) / size if size > 0.0 else 0.0
+        if nonlinearity <= LINEARITY:
+            return Sensitivity(name, channels, fine, step, nonlinearity)
         step, coarse = step / 2.0, fine
     raise SimulationFailed(
-        f"the channels must answer in proportion to a small change of {name}, got {100 * bent:.2g} % apart between "
-        f"steps of {step:.3g} and its half; the run may meet a stop or a limit of the drive"
+        f"the channels must answer in proportion to a small change of {name}, got {100 * nonlinearity:.2g} % apart "
+        f"between steps of {step:.3g} and its half; the run may meet a stop or a limit of the drive"
     )
 
 

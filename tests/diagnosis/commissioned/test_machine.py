@@ -49,7 +49,7 @@ def figures_of(part) -> tuple:
 def test_the_predicted_smallest_leak_is_what_is_found(machine):
     """Leaks of 1.3 times the size are found, of a third of it hardly ever."""
     smallest = machine.summary.smallest.lpm
-    found = {
+    result = {
         share: [
             machine.diagnose(
                 ss.simulate(command="3 sin(4t)", duration="20 s", leak=f"{share * smallest:.6g} L/min", seed=seed),
@@ -60,8 +60,8 @@ def test_the_predicted_smallest_leak_is_what_is_found(machine):
         ]
         for share in (0.2, 1.4)
     }
-    assert sum(found[1.4]) >= 5
-    assert sum(found[0.2]) <= 1
+    assert sum(result[1.4]) >= 5
+    assert sum(result[0.2]) <= 1
 
 
 def test_what_is_learnt_is_the_machine(machine):

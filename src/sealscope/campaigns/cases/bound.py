@@ -190,7 +190,7 @@ def _opened(run: Experiment) -> Experiment:
     return replace(run, command=Recorded(path.t, path.volts, str(run.command)), controller=None)
 
 
-def smallest_found(deviation: float, false_alarm: float, detection: float = 0.9) -> float:
+def smallest_detectable(deviation: float, false_alarm: float, detection: float = 0.9) -> float:
     """Return the leak that the best one-sided test finds with probability `detection`.
 
     The leak's estimate is normal with this standard deviation s: ``(z_{1-alpha} + z_detection) s``, in the unit of s.

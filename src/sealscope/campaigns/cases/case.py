@@ -63,7 +63,8 @@ def profile_key(name: str) -> str:
     """Return a digest of what a bench profile says, the same wherever its file lies."""
     from sealscope.simulation.bench.profile import load_profile
 
-    return digest(repr(replace(load_profile(name), place="")))
+    profile = load_profile(name)
+    return digest(repr(replace(profile, name=profile.seeds or profile.name, place="")))
 
 
 def world(plan: SimulatedPlan) -> dict[str, Any]:

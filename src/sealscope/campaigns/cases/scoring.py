@@ -30,13 +30,15 @@ def stated(
     `split_s` [s]: the moment on the recording's time axis at which scorers split it.
     """
     detectors = [plan_detector(name) for name in names]
-    seen = {view: examination.through(views.get(view, ALL_CHANNELS)) for view in {d.view: None for d in detectors}}
+    examinations = {
+        view: examination.through(views.get(view, ALL_CHANNELS)) for view in {d.view: None for d in detectors}
+    }
     rules = [detector.name for detector in detectors if detector.scorer is not None]
     scores = scored(Sides.of(examination.recording, split_s), rules, views) if rules else {}
     statements: dict[str, Evidence] = {}
     for detector in detectors:
         if detector.scorer is None:
-            evidence = _evidence(detector, seen[detector.view])
+            evidence = _evidence(detector, examinations[detector.view])
             statement = stated_evidence({name: getattr(evidence, name) for name in STATED})
             statements[detector.name] = statement
             rank = _share(statement) if detector.of == DIAGNOSE else rank_of(statement)

@@ -18,17 +18,17 @@ from sealscope.errors import InputError
 INSPECTED = ("u", "x", "p_A", "p_B")
 
 
-def work(plan: SimulatedPlan, case: CampaignCase, keep: Path | None = None) -> CaseRow:
-    """Carry out one case; an error of any kind becomes the row's error. `keep`: folder to write the recording into."""
+def work(plan: SimulatedPlan, case: CampaignCase, folder: Path | None = None) -> CaseRow:
+    """Carry out one case; an error of any kind becomes the row's error. `folder` to write the recording into."""
     started = time.process_time()
     try:
-        row = _work(plan, case, keep)
+        row = _work(plan, case, folder)
     except Exception as error:  # a defect of the program must not end ten thousand other cases; the table says it
         row = CaseRow.of(case, error=error_text(error))
     return replace(row, seconds=round(time.process_time() - started, 4))
 
 
-def _work(plan: SimulatedPlan, case: CampaignCase, keep: Path | None) -> CaseRow:
+def _work(plan: SimulatedPlan, case: CampaignCase, folder: Path | None) -> CaseRow:
     from sealscope.campaigns.cases.bound import change_bound
     from sealscope.campaigns.cases.scoring import stated
     from sealscope.diagnosis.diagnose import Examination
@@ -37,10 +37,10 @@ def _work(plan: SimulatedPlan, case: CampaignCase, keep: Path | None) -> CaseRow
 
     experiment = experiment_of(plan, case)
     simulated = simulate_with_truth(experiment)
-    if keep is not None:
+    if folder is not None:
         from sealscope.recordings import write
 
-        write(simulated.recording, keep / f"{case.id}.nc")
+        write(simulated.recording, folder / f"{case.id}.nc")
     record = inspected(simulated.recording, INSPECTED)
     if record.defect is not None:
         raise InputError(f"the record cannot be judged: {record.defect}")

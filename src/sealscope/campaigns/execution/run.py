@@ -42,7 +42,7 @@ def run(
     `jobs`: processes of this machine, one a core by default and two a core at most, 1 for this process alone;
     `cluster`: address of a Dask scheduler instead; `retry`: carry failed cases out again; `batch`: simulate cases side
     by side (`batches`) with `jobs` threads; `trust`: whether controllers that the plan leads to (`FILE.py:NAME`) are
-    run, which may be a stranger's. The rows are the same whoever makes them and in whatever order, those of batches in
+    run, which may be hostile. The rows are the same whoever makes them and in whatever order, those of batches in
     any batch; kinds of records take turns (`interleaved`). Raises InputError where a controller is not trusted, the
     folder holds another campaign, another run is at work in it, or a batch cannot do what the plan asks for.
     """
@@ -66,13 +66,13 @@ def run(
         failures, done = sum(row.error is not None for row in rows.values()), len(rows)
         report = progress or (lambda done, size, failures: None)
         report(done, plan.size, failures)
-        keep = inner_folder(place, RECORDINGS) if plan.keep_recordings else None
+        recordings = inner_folder(place, RECORDINGS) if plan.keep_recordings else None
         jobs = process_count(jobs)
         if batch:
             new_rows = batches.in_batches(plan, waiting, jobs)
         else:
             carry = partial(on_cluster, address=cluster) if cluster else partial(carried_out, jobs=jobs)
-            new_rows = _rows(partial(_carry_out, task, plan, keep), waiting, carry)
+            new_rows = _rows(partial(_carry_out, task, plan, recordings), waiting, carry)
         with store.appending(place) as append, closing(new_rows):
             for row in new_rows:
                 append(row)
@@ -82,8 +82,8 @@ def run(
     return store.progress_of(plan, place)
 
 
-def _carry_out(task: Task, plan: SimulatedPlan, keep: Path | None, case: CampaignCase) -> CaseRow:
-    return task(plan, case, keep)
+def _carry_out(task: Task, plan: SimulatedPlan, recordings: Path | None, case: CampaignCase) -> CaseRow:
+    return task(plan, case, recordings)
 
 
 def _rows(

@@ -21,7 +21,7 @@ from sealscope.errors import InputError, MissingExtra
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 #: Environment of a process: one thread for linear algebra, as processes run side by side, and no module from the
-#: working folder, which may be a stranger's.
+#: working folder, which may be hostile.
 _ENVIRONMENT = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "PYTHONSAFEPATH"), "1"
 )

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from sealscope.campaigns.cases.bound import smallest_found
+from sealscope.campaigns.cases.bound import smallest_detectable
 from sealscope.campaigns.cases.case import FAMILY
 from sealscope.campaigns.cases.row import NO_CAUSE, PISTON_LEAK, CaseRow, cause_of, covers, duty_of, named_cause
 from sealscope.campaigns.plans.detectors import plan_detector
@@ -341,15 +341,15 @@ class _Judging:
             for row, ev, verdict in zip(rows, stated, given, strict=True)
         ]
         bounded = sum(row.bound_lpm is not None for row in rows) if common.get("leak_lpm") else 0
-        found = [verdict == "leak" for row, verdict in zip(rows, given, strict=True) if self._allowed(row)]
+        detected = [verdict == "leak" for row, verdict in zip(rows, given, strict=True) if self._allowed(row)]
         return AlarmShares(
             detector=detector,
             alarms=self._proportion(given.count("leak"), len(rows)),
             cannot_tell=self._proportion(given.count(CANNOT_TELL), len(rows)),
             coverage=self._proportion(sum(held), len(held)),
             named=self._proportion(sum(named), len(named)) if any(stated) else None,
-            reachable=self._proportion(len(found), bounded) if bounded else None,
-            allowed=self._proportion(sum(found), len(found)) if bounded else None,
+            reachable=self._proportion(len(detected), bounded) if bounded else None,
+            allowed=self._proportion(sum(detected), len(detected)) if bounded else None,
             failed=sum(row.error is not None for row in rows),
             **common,
         )
@@ -360,7 +360,7 @@ class _Judging:
     def _allowed(self, row: CaseRow) -> bool:
         """Whether the best test at this false-alarm probability finds the leak of a row nine times in ten."""
         bound = row.bound_lpm
-        return bound is not None and smallest_found(bound, self.false_alarm, ALLOWED_DETECTION) <= _flow(row)
+        return bound is not None and smallest_detectable(bound, self.false_alarm, ALLOWED_DETECTION) <= _flow(row)
 
     def _stating(self, rows: Sequence[CaseRow]) -> list[str]:
         """Return the detectors that state evidence."""

@@ -46,7 +46,7 @@ def check_controllers(plan: SimulatedPlan, trust: bool) -> None:
     """Make each controller that is none of Sealscope's, before a campaign begins.
 
     Raises InputError where one cannot be made, and where one is a program that the plan leads to and the caller does
-    not `trust` it: a plan may come from a stranger. Installed controllers are trusted.
+    not `trust` it: a plan may be hostile. Installed controllers are trusted.
     """
     from sealscope.control.registry import CONTROLLERS, controller_named, is_installed
     from sealscope.simulation.bench.profile import load_profile

@@ -150,8 +150,8 @@ class CommissionedMachine:
         known = next((own for own in self.healthy if own.digest == digest), None)
         if known is not None:
             raise InputError(f"a healthy recording must be new, got the samples of {known.file} ({file})")
-        if self.healthy and (found := self.diagnose(recording)).verdict == "leak":
-            raise InputError(f"a healthy recording must not leak, got one that does: {found.reason} ({file})")
+        if self.healthy and (result := self.diagnose(recording)).verdict == "leak":
+            raise InputError(f"a healthy recording must not leak, got one that does: {result.reason} ({file})")
         start_s = start_seconds(recording, file)
         if start_s is not None and (leak := self._leak_at(start_s)) is not None:
             raise InputError(f"a healthy recording must be of a time without a leak, got {leak} ({file})")

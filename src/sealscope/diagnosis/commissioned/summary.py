@@ -231,14 +231,14 @@ def _half_text(smallest: Smallest, count: int, dated: bool) -> str:
     return "twice the pressure difference at the same flow; more recordings alone do not"
 
 
-def _collected(found: Sequence[tuple[str, Sequence[str]]]) -> list[str]:
+def _collected(wrong: Sequence[tuple[str, Sequence[str]]]) -> list[str]:
     """Return what is wrong, each kind of it once, with the file or the number of files."""
     files: dict[str, list[tuple[str, str]]] = {}
-    for file, texts in found:
+    for file, texts in wrong:
         for text in texts:
             files.setdefault(text.partition(":")[0], []).append((text, file))
     return [
-        f"{max(own)[0]} ({own[0][1] if len(own) == 1 else f'in {len(own)} of {len(found)}'})" for own in files.values()
+        f"{max(own)[0]} ({own[0][1] if len(own) == 1 else f'in {len(own)} of {len(wrong)}'})" for own in files.values()
     ]
 
 

@@ -110,9 +110,9 @@ class BlockStream:
         parts = [self._close(joined, *pair) for pair in zip([self._done, *ends[:-1]], ends, strict=True)]
         blocks = parts[0] if len(parts) == 1 else Blocks.joined(parts)
         self._done = count
-        keep = max(0, count * length - self._margin)
-        self._pieces = [{name: values[keep - self._first :].copy() for name, values in joined.items()}]
-        self._first = keep
+        first_kept = max(0, count * length - self._margin)
+        self._pieces = [{name: values[first_kept - self._first :].copy() for name, values in joined.items()}]
+        self._first = first_kept
         return blocks
 
     def _joined(self) -> dict[str, Array]:

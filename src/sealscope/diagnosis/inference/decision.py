@@ -144,7 +144,7 @@ class RecordedBalance:
 
     @cached_property
     def moving(self) -> float:
-        """Mean flow while it flows [m^3/s]: the mean weighted by itself, so that rests do not count."""
+        """Mean flow while it flows [m^3/s]: the mean weighted by itself, so that standstills do not count."""
         flow = self.blocks.means[:, 2]
         return float(flow @ flow / max(float(flow.sum()), np.finfo(float).tiny))
 

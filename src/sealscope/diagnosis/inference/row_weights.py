@@ -31,7 +31,7 @@ _SIGMA = 1.4826  # standard deviation of normal values over the median of their 
 _Places = NDArray[np.intp]
 
 
-class Room(NamedTuple):
+class Workspace(NamedTuple):
     """Arrays to work in, for r rows of K blocks, f fast and s slow columns.
 
     `weights`, `residual`, `ordered` (r,); `inner` (f, f); `cross` (K, f, s + 1); `total` (s + 1, s + 1); `normal` (s,
@@ -49,8 +49,8 @@ class Room(NamedTuple):
     scale: Any
 
 
-def room_shapes(rows: int, blocks: int, fast: int, slow: int) -> tuple[tuple[int, ...], ...]:
-    """Return the shapes of a `Room`."""
+def workspace_shapes(rows: int, blocks: int, fast: int, slow: int) -> tuple[tuple[int, ...], ...]:
+    """Return the shapes of a `Workspace`."""
     own = slow + 1
     by_row = (rows,), (rows,), (rows,)
     return *by_row, (fast, fast), (blocks, fast, own), (own, own), (slow, slow), (slow, 1), (fast + slow,)
@@ -133,52 +133,52 @@ def _sum_products(values: Any, begin: int, end: int, weights: Any, gram: Any) ->
 
 
 @large_law
-def _add_reduced(gram: Any, fast: Any, own: Any, room: Any, cross: Any) -> None:
-    """Add to `room.total` what a block says of the columns `own`, whatever the fast ones' coefficients are.
+def _add_reduced(gram: Any, fast: Any, own: Any, workspace: Any, cross: Any) -> None:
+    """Add to `workspace.total` what a block says of the columns `own`, whatever the fast ones' coefficients are.
 
     `cross` (f, s + 1): the fast ones' coefficients for each of these.
     """
     for i in range(len(fast)):
         for j in range(len(fast)):
-            room.inner[i, j] = gram[fast[i], fast[j]]
+            workspace.inner[i, j] = gram[fast[i], fast[j]]
         for j in range(len(own)):
             cross[i, j] = gram[fast[i], own[j]]
-    solve_in_place(room.inner, cross, room.scale)
+    solve_in_place(workspace.inner, cross, workspace.scale)
     for i in range(len(own)):
         for j in range(len(own)):
             value = gram[own[i], own[j]]
             for k in range(len(fast)):
                 value -= gram[own[i], fast[k]] * cross[k, j]
-            room.total[i, j] += value
+            workspace.total[i, j] += value
 
 
 @large_law
-def _reweigh(values: Any, ends: Any, fast: Any, own: Any, room: Any) -> bool:
-    """Put Huber's weights at a fit into the room; return whether they are those at which it was made."""
+def _reweigh(values: Any, ends: Any, fast: Any, own: Any, workspace: Any) -> bool:
+    """Put Huber's weights at a fit into the workspace; return whether they are those at which it was made."""
     count, slow, b = len(values), len(own) - 1, 0
     for r in range(count):
         while r >= ends[b]:
             b += 1
         residual = values[r, own[slow]]
         for k in range(len(fast)):
-            residual -= room.cross[b, k, slow] * values[r, fast[k]]
+            residual -= workspace.cross[b, k, slow] * values[r, fast[k]]
         for i in range(slow):
             of_slow = values[r, own[i]]
             for k in range(len(fast)):
-                of_slow -= room.cross[b, k, i] * values[r, fast[k]]
-            residual -= room.right[i, 0] * of_slow
-        room.residual[r] = abs(residual)
-        room.ordered[r] = abs(residual)
-    size, change = HUBER * _SIGMA * median(room.ordered, count), 0.0
+                of_slow -= workspace.cross[b, k, i] * values[r, fast[k]]
+            residual -= workspace.right[i, 0] * of_slow
+        workspace.residual[r] = abs(residual)
+        workspace.ordered[r] = abs(residual)
+    size, change = HUBER * _SIGMA * median(workspace.ordered, count), 0.0
     for r in range(count):
-        weight = size / room.residual[r] if size > 0.0 and room.residual[r] > size else 1.0
-        change += abs(weight / room.weights[r] - 1.0)
-        room.weights[r] = weight
+        weight = size / workspace.residual[r] if size > 0.0 and workspace.residual[r] > size else 1.0
+        change += abs(weight / workspace.weights[r] - 1.0)
+        workspace.weights[r] = weight
     return change < _TOLERANCE * count or not size > 0.0
 
 
 @large_law
-def weigh(values: Any, ends: Any, fast: Any, own: Any, known: Any, share: float, room: Any, gram: Any) -> None:
+def weigh(values: Any, ends: Any, fast: Any, own: Any, known: Any, share: float, workspace: Any, gram: Any) -> None:
     """Put the sums of weighted products of rows (r, m), of K blocks that end before the rows `ends`, into `gram`.
 
     `fast`, `own`: columns, of `own` the last is the left side. `known` (s + 1, s + 1): sums over `own` that count as
@@ -186,31 +186,33 @@ def weigh(values: Any, ends: Any, fast: Any, own: Any, known: Any, share: float,
     """
     count, slow, blocks = len(values), len(own) - 1, len(ends)
     for r in range(count):
-        room.weights[r] = 1.0
+        workspace.weights[r] = 1.0
     settled = count == 0
     for turn in range(_MOST + 1):
         for i in range(slow + 1):
             for j in range(slow + 1):
-                room.total[i, j] = 0.0
+                workspace.total[i, j] = 0.0
         for b in range(blocks):
-            _sum_products(values, int(ends[b - 1]) if b else 0, int(ends[b]), room.weights, gram[b])
-            _add_reduced(gram[b], fast, own, room, room.cross[b])
+            _sum_products(values, int(ends[b - 1]) if b else 0, int(ends[b]), workspace.weights, gram[b])
+            _add_reduced(gram[b], fast, own, workspace, workspace.cross[b])
         if settled or turn == _MOST:
             break
         for i in range(slow):
-            room.right[i, 0] = room.total[i, slow] + known[i, slow]
+            workspace.right[i, 0] = workspace.total[i, slow] + known[i, slow]
             for j in range(slow):
-                room.normal[i, j] = room.total[i, j] + known[i, j]
-        solve_in_place(room.normal, room.right, room.scale)
-        settled = _reweigh(values, ends, fast, own, room)
+                workspace.normal[i, j] = workspace.total[i, j] + known[i, j]
+        solve_in_place(workspace.normal, workspace.right, workspace.scale)
+        settled = _reweigh(values, ends, fast, own, workspace)
     for i in range(slow + 1):
         for j in range(slow + 1):
-            known[i, j] += share * (SUPPORT / blocks * room.total[i, j] - known[i, j])
+            known[i, j] += share * (SUPPORT / blocks * workspace.total[i, j] - known[i, j])
 
 
 def weighted(values: Array, ends: _Places, fast: _Places, own: _Places, known: Array, share: float) -> Array:
     """Return the Gram matrices (K, m, m) of blocks, and learn from them (`weigh`)."""
-    room = Room(*(np.empty(shape) for shape in room_shapes(len(values), len(ends), len(fast), len(own) - 1)))
+    workspace = Workspace(
+        *(np.empty(shape) for shape in workspace_shapes(len(values), len(ends), len(fast), len(own) - 1))
+    )
     gram = np.empty((len(ends), values.shape[1], values.shape[1]))
-    weigh(values, ends, fast, own, known, share, room, gram)
+    weigh(values, ends, fast, own, known, share, workspace, gram)
     return gram

@@ -118,7 +118,7 @@ class Signals:
 
     @cached_property
     def outward(self) -> Array:
-        """1 where the piston moves towards B or rests, else 0, at each sample, by a central difference."""
+        """1 where the piston moves towards B or stands still, else 0, at each sample, by a central difference."""
         half = max(1, round(HALF_DIFFERENCE * self.rate))
         x = self._channels["x"]
         padded = np.concatenate([np.full(half, x[0]), x, np.full(half, x[-1])])
@@ -178,9 +178,9 @@ class SpeedLoop(NamedTuple):
     def speed(
         self, u: Array, rate: float, state: tuple[float, float] | None = None
     ) -> tuple[Array, tuple[float, float]]:
-        """Return the speed [rad/s] for a command, missing where it is, and the state to go on from (None: at rest).
+        """Return the speed [rad/s] for a command, missing where it is, and the state to go on from.
 
-        A missing command is held; the state is the filter's and the command that is held.
+        `state` None is standstill. A missing command is held; the state is the filter's and the command that is held.
         """
         from scipy.signal import lfilter
 
@@ -524,8 +524,8 @@ _STORED = tuple(
 def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
     """Return the balance of what a pump delivers where the piston displaces nothing; None where no channel gives it.
 
-    Over whole cycles or at rest: neither motion nor position is in it. A zero of the flow is not told from leakage
-    under a steady load, and is taken for none.
+    Over whole cycles or at standstill: neither motion nor position is in it. A zero of the flow is not told from
+    leakage under a steady load, and is taken for none.
     """
     left = pump_volume(rig, channels - {"u"} | ({"omega"} if "u" in channels else set()))
     if rig.valve.spool == "present" or left is None or not {"p_A", "p_B"} <= channels:
@@ -536,9 +536,8 @@ def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
 def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
     """Return the balance of a load that shut valves hold: what the loaded side loses, the piston gives way by.
 
-    Whether seal, valve or line loses it, the channels do not tell; a command that rests tells that they are shut.
-    x grows as A fills.
-    None for a pump-controlled machine, or where position, command or a pressure is missing.
+    Whether seal, valve or line loses it, the channels do not tell; a command that stands still tells that they are
+    shut. x grows as A fills. None for a pump-controlled machine, or where position, command or a pressure is missing.
     """
     if rig.valve.spool != "present" or not {"x", "u", "p_A", "p_B"} <= channels:
         return None

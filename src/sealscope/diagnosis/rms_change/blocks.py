@@ -107,7 +107,7 @@ def _columns(recording: Recording, transformed: list[Details], bounds: IntArray)
     command = recording.channels.get("u", np.zeros(len(recording)))
     squares = np.stack([command, np.gradient(command) * recording.rate, load]) ** 2
     rest = np.maximum(
-        beliefs("rms_change")["blocks"]["rest"] ** 2 * squares.mean(axis=1, keepdims=True), np.finfo(float).tiny
+        beliefs("rms_change")["blocks"]["standstill"] ** 2 * squares.mean(axis=1, keepdims=True), np.finfo(float).tiny
     )
     with np.errstate(divide="ignore", over="ignore"):
         energies = np.concatenate([mean_squares(own, bounds) for own in transformed], axis=1)

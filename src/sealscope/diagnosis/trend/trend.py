@@ -367,13 +367,14 @@ def _verdict(trend: Trend) -> tuple[Verdict, str]:
     count = last.end - last.begin
     if count < 3:
         return "cannot tell", f"{count} comparable recordings are too few, 3 are needed"
-    found = 5.0 * max(wear.scatter, (wear.healthy.high - wear.healthy.low) / 3.92)
-    if trend.limit is not None and wear.healthy.value + found > trend.limit:
+    detectable = 5.0 * max(wear.scatter, (wear.healthy.high - wear.healthy.low) / 3.92)
+    if trend.limit is not None and wear.healthy.value + detectable > trend.limit:
         return "cannot tell", (
             f"the level scatters so much from recording to recording that a rise to the limit would not surely show: "
-            f"{found:.2g} {trend.unit} would"
+            f"{detectable:.2g} {trend.unit} would"
         )
     since = " since the repair" if last.fell else ""
     return "no leak", (
-        f"no rise beyond the machine's own scatter{since} ({rate}); a step of {found:.2g} {trend.unit} would have shown"
+        f"no rise beyond the machine's own scatter{since} ({rate}); a step of {detectable:.2g} {trend.unit} would "
+        "have shown"
     )

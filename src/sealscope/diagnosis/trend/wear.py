@@ -225,8 +225,8 @@ def _log_ratio(a: Array, b: Array, scale: Array) -> Array:
     from scipy.special import log_ndtr
 
     v = 1.0 / (a + scale**-2)
-    bent = math.log(2.0) - 0.5 * np.log1p(a * scale**2) + log_ndtr(b * np.sqrt(v))
-    return np.asarray(bent + 0.5 * b * b * v, dtype=float)
+    log_factor = math.log(2.0) - 0.5 * np.log1p(a * scale**2) + log_ndtr(b * np.sqrt(v))
+    return np.asarray(log_factor + 0.5 * b * b * v, dtype=float)
 
 
 class Path(NamedTuple):

@@ -15,7 +15,7 @@ from sealscope.recordings.recording import Recording
 from sealscope.units import LITRE_PER_MINUTE, parse_quantity
 
 #: How much of the limit a leak takes: surely all of it, maybe half of it or more, surely less than half of it.
-Level = Literal["repair", "plan", "follow"]
+Level = Literal["repair", "plan", "monitor"]
 #: A figure with its 95 % interval, None where it is not known.
 _Figure = tuple[float, float, float] | None
 _ML_PER_MINUTE, _MM_PER_MINUTE = 1e-3 * LITRE_PER_MINUTE, 1e-3 / 60.0
@@ -96,14 +96,14 @@ class Severity:
 
     @property
     def level(self) -> Level | None:
-        """Level by the interval: `repair` where it is all over the limit, `follow` where it is all under half of it.
+        """Level by the interval: `repair` where it is all over the limit, `monitor` where it is all under half of it.
 
         Else `plan`; None where the leak cannot be held against the limit.
         """
         if self.of_limit is None:
             return None
         _, low, high = self.of_limit
-        return "repair" if low > 1.0 else "follow" if high < 0.5 else "plan"
+        return "repair" if low > 1.0 else "monitor" if high < 0.5 else "plan"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the severity as plain JSON values: each figure with `_interval` beside it, and the level."""

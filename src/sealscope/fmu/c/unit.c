@@ -61,7 +61,7 @@ void unit_reset(Instance *unit) {
     unit->block.step = START_STEP;
 }
 
-static int at_rest(Instance *unit) {
+static int at_standstill(Instance *unit) {
     Block *b = &unit->block;
     int64_t code = 0;
     sealscope_start(&code, NULL, b->values, b->inputs, b->start_position, b->y);
@@ -78,7 +78,7 @@ int unit_initialize(Instance *unit, double start) {
 int unit_started(Instance *unit) {
     int code;
     if (unit->block.phase != INITIALIZING) return unit_refuse(unit, WRONG_CALL, "initialization must be entered first");
-    code = at_rest(unit);
+    code = at_standstill(unit);
     if (code) return code;
     unit->block.phase = STEPPING;
     unit->block.fresh = 0;
@@ -96,7 +96,7 @@ int unit_get(Instance *unit, uint32_t reference, double *value) {
         *value = b->values[reference - VALUE_BASE];
     } else if (reference - RESULT_BASE < N_RESULTS) {
         if (!b->fresh) {
-            if (b->phase < STEPPING) at_rest(unit); /* what is not held is said when the start is left */
+            if (b->phase < STEPPING) at_standstill(unit); /* what is not held is said when the start is left */
             sealscope_report(&code, NULL, b->values, b->inputs, b->y, b->results);
             b->fresh = 1;
         }

@@ -47,8 +47,8 @@ class _Window:
 
     def add(self, samples: Recording) -> None:
         """Take the next samples; after a hole, at another rate or with other channels they begin anew."""
-        keep = min(MOST_SAMPLES, max(FEWEST_SAMPLES, round(SPAN_S * samples.rate)))
-        t = samples.t[-keep:]
+        most = min(MOST_SAMPLES, max(FEWEST_SAMPLES, round(SPAN_S * samples.rate)))
+        t = samples.t[-most:]
         names = [name for name in CHANNELS if name in samples]
         if not names or not t.size or not np.isfinite(t).all():
             return
@@ -58,9 +58,9 @@ class _Window:
         if not (follows and 0.5 < (t[0] - self.t[-1]) * samples.rate < 1.5):
             self.t, self.channels = np.empty(0), {name: np.empty(0) for name in names}
         self.rate = samples.rate
-        self.t = np.concatenate([self.t, t])[-keep:]
+        self.t = np.concatenate([self.t, t])[-most:]
         self.channels = {
-            name: np.concatenate([values, samples[name][-keep:]])[-keep:] for name, values in self.channels.items()
+            name: np.concatenate([values, samples[name][-most:]])[-most:] for name, values in self.channels.items()
         }
         self.version += 1
 
@@ -82,23 +82,23 @@ class LiveSamples:
         """Keep the samples of an actuator meanwhile; False where too many others are looked at."""
         with self._lock:
             if name not in self._windows and len(self._windows) >= MOST_ACTUATORS:
-                room = False
+                admitted = False
             else:
-                room = True
+                admitted = True
                 self._lookers[name] += 1
                 first = name not in self._windows
                 window = self._windows.setdefault(name, _Window())
         try:
-            if room and first:
+            if admitted and first:
                 with suppress(Exception):  # what comes from now on is shown without what is stored
                     stored = self._recall(name)
                     with self._lock:
                         if not window.version:  # else newer samples have come meanwhile
                             for samples in stored:
                                 window.add(samples)
-            yield room
+            yield admitted
         finally:
-            if room:
+            if admitted:
                 with self._lock:
                     self._lookers[name] -= 1
                     if not self._lookers[name]:

@@ -173,15 +173,15 @@ class _Pages:
         """Yield server-sent events: numbers where something has changed, and pictures of an actuator's samples."""
         live, actuators = self._live, self._actuators
         with ExitStack() as looking:
-            room = bool(name) and await asyncio.to_thread(looking.enter_context, live.looked_at(name))
-            if name and not room:
+            admitted = bool(name) and await asyncio.to_thread(looking.enter_context, live.looked_at(name))
+            if name and not admitted:
                 yield _event("live", {"name": name, "t": None, "error": "too many others are looked at"})
             shown, pictured, silent = -1, -1, 0.0
             while not await request.is_disconnected() and not actuators.closed:
                 if actuators.changed != shown or silent >= _ALIVE_S:
                     shown, silent = actuators.changed, 0.0
                     yield f"data: {shown}\n\n"
-                if room and live.version(name) != pictured:
+                if admitted and live.version(name) != pictured:
                     pictured = live.version(name)
                     yield _event("live", await asyncio.to_thread(live.picture, name, pressure, drawn))
                 await asyncio.sleep(_LOOK_S)

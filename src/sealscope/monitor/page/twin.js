@@ -4,7 +4,7 @@
 // the barrel's inner ends, the piston's width and the middle of the drawing, in its own units
 const BORE = { left: 62, right: 338, piston: 14, middle: 200 };
 const still = matchMedia("(prefers-reduced-motion: reduce)");
-const twin = { name: null, motion: null, end: 0, at: 0, seen: 0, frame: 0, flowed: 0, most: 1, reach: 1, machine: null, leak: null };
+const twin = { name: null, motion: null, end: 0, at: 0, last: 0, frame: 0, flowed: 0, most: 1, reach: 1, machine: null, leak: null };
 
 function showMachine(machine, summary, alarm) {
   twin.machine = machine;
@@ -75,8 +75,8 @@ function state() {
 
 function moved(now) {
   twin.frame = 0;
-  const passed = Math.min(0.1, Math.max(0, (now - twin.seen) / 1000));
-  twin.seen = now;
+  const passed = Math.min(0.1, Math.max(0, (now - twin.last) / 1000));
+  twin.last = now;
   if (document.hidden) return;
   const newest = twin.motion ? twin.end + twin.motion.t[twin.motion.t.length - 1] : twin.at;
   if (!still.matches) twin.at = Math.min(newest, twin.at + passed);

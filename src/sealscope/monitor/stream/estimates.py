@@ -17,7 +17,7 @@ class BlockEstimate:
     t : float
         End of the block [s].
     status : str
-        "learning", "watched", "alarm", or why the block is not judged: "at rest", "missing values", "another duty", ...
+        "learning", "watched", "alarm", or why the block is not judged: "at standstill", "missing values", ...
     total_lpm, total_interval_lpm : float and pair of floats, optional
         Flow past pump and piston together, and its 95 % interval [L/min]; None where it is not known.
     leak_lpm, leak_interval_lpm : float and pair of floats, optional

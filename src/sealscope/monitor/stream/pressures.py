@@ -1,9 +1,9 @@
 """An actuator watched by both chamber pressures and the command, without a position.
 
-The response of p_A - p_B to the command is led along with the machine (`diagnosis.inference.pressures.response`), a
-block after the other: friction, stiffness and gain of the machine are among its parameters, so that what changes in
-them as the oil warms is not taken for a leak. Each block gives a conductance of its own. Its level is not known well,
-so that changes are stated and levels are not.
+The response of p_A - p_B to the command is estimated along with the machine (`diagnosis.inference.pressures.response`),
+block by block: friction, stiffness and gain of the machine are among its parameters, so that what changes in them as
+the oil warms is not taken for a leak. Each block gives a conductance of its own. Its level is not known well, so that
+changes are stated and levels are not.
 
 After a gap it goes on with what it knew of the machine. After a pause, or where it has lost the machine, parameters are
 as little known as at first, and nothing before is compared with what comes after.
@@ -72,7 +72,7 @@ class PressureEstimator:
             self.begun = self._begin(self._next_samples(first))
             if not self.begun:
                 self._drop(first // 2)
-                reason = "half minutes at rest or with missing values before the first block"
+                reason = "half minutes at standstill or with missing values before the first block"
                 shown.append(NotJudged(self._until, "", reason))
         while self.begun and self._have >= length:
             block = self._next_samples(length)
@@ -135,7 +135,7 @@ class PressureEstimator:
         width = priors("response")["G"].width
         g, sd = float(follower.theta[G]), math.sqrt(follower.covariance[G, G]) * float(follower.beliefs.unit[G])
         if settling or sd > width:
-            return _passed_over(end, "settling" if settling else "at rest", apart)
+            return _passed_over(end, "settling" if settling else "at standstill", apart)
         dp = float(np.mean(np.abs(block["p_A"] - block["p_B"])))
         sizes = np.log(np.maximum([dp, np.sqrt(np.mean(block["u"] ** 2))], np.finfo(float).tiny))
         duty = float(sizes[0]), float(sizes[1])

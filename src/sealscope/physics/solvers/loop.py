@@ -46,15 +46,15 @@ def counted(value: float, count: float) -> float:
 @law
 def sampled(loop: Loop, k: int, y: np.ndarray) -> bool:
     """Let the controller see the state `y` at its sample k, unless it has; False where its voltage is not finite."""
-    whole, numbers, seen = loop.whole, loop.numbers, loop.measured
+    whole, numbers, measured = loop.whole, loop.numbers, loop.measured
     if k < whole[TAKEN]:
         return True
     for m in range(3):
-        seen[m] = loop.given[k, m]
-    seen[3] = counted(y[POSITION], numbers[COUNT_X])
-    seen[4] = max(y[P_A], numbers[FLOOR]) + loop.given[k, 3]
-    seen[5] = max(y[P_B], numbers[FLOOR]) + loop.given[k, 4]
-    seen[6] = counted(y[THETA], numbers[COUNT_THETA])
+        measured[m] = loop.given[k, m]
+    measured[3] = counted(y[POSITION], numbers[COUNT_X])
+    measured[4] = max(y[P_A], numbers[FLOOR]) + loop.given[k, 3]
+    measured[5] = max(y[P_B], numbers[FLOOR]) + loop.given[k, 4]
+    measured[6] = counted(y[THETA], numbers[COUNT_THETA])
     u = call_at(loop.addresses[0], loop.addresses[1], loop.addresses[2])
     numbers[ASKED] = u
     if not isfinite(u):

@@ -135,12 +135,12 @@ def result_text(result: CampaignResult) -> str:
         if not rows:
             continue
         largest = max(rows, key=lambda row: row.leak_lpm)
-        found = f"finds {percent(largest.detection)} of leaks of {largest.leak_lpm:g} {unit}"
+        finding = f"finds {percent(largest.detection)} of leaks of {largest.leak_lpm:g} {unit}"
         a90 = math.inf
         if pod.curve is not None and pod.curve.a90 <= largest.leak_lpm:
             a90 = pod.curve.a90
-            found = f"finds 9 in 10 leaks of {a90:.2g} {unit}"
-        text = f"{pod.detector} {found} at {percent(largest.false_alarm)} false alarms."
+            finding = f"finds 9 in 10 leaks of {a90:.2g} {unit}"
+        text = f"{pod.detector} {finding} at {percent(largest.false_alarm)} false alarms."
         said.append((a90, -largest.detection.value, text))
     said.sort(key=lambda item: item[:2])
     shown = [text for _, _, text in said[:_MOST_SAID]]
@@ -228,7 +228,9 @@ def _known_notes(result: CampaignResult) -> list[str]:
     if len(by_channels) == 1:
         notes.append(f"Channels given: {', '.join(next(iter(by_channels)))}.")
     else:
-        notes += [f"Channels given: {', '.join(seen)} to {', '.join(names)}." for seen, names in by_channels.items()]
+        notes += [
+            f"Channels given: {', '.join(channels)} to {', '.join(names)}." for channels, names in by_channels.items()
+        ]
     notes += [f"Rig {rig} assumed by {', '.join(names)}." for rig, names in by_rig.items() if rig]
     return notes
 

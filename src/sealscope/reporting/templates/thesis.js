@@ -2,7 +2,7 @@
   "use strict";
   var box = document.getElementById("find");
   var field = document.getElementById("find-text");
-  var told = document.getElementById("find-told");
+  var count = document.getElementById("find-count");
   var parts = Array.prototype.map.call(document.querySelectorAll("[data-words]"), function (node) {
     return { node: node, words: node.getAttribute("data-words") || node.textContent.toLowerCase(), kind: node.getAttribute("data-kind") };
   });
@@ -25,7 +25,7 @@
       one.classList.toggle("away", wanted.length > 0 && !some);
       if (wanted.length > 0) { one.open = Boolean(some); }
     });
-    told.textContent = wanted.length ? hits + (hits === 1 ? " match" : " matches") : "";
+    count.textContent = wanted.length ? hits + (hits === 1 ? " match" : " matches") : "";
   }
   function shown() {
     var target = location.hash && document.getElementById(decodeURIComponent(location.hash.slice(1)));

@@ -51,7 +51,7 @@ def draw(figure: Figure) -> tuple[bytes, bytes]:
     import matplotlib
 
     with matplotlib.rc_context():
-        matplotlib.rcdefaults()  # not the settings in the working folder, which may be a stranger's and run TeX
+        matplotlib.rcdefaults()  # not the settings in the working folder, which may be hostile and run TeX
         matplotlib.rcParams.update({**SETTINGS, "svg.hashsalt": figure.id})
         canvas = _canvas(figure)
         long = [line for ax in canvas.axes for line in ax.lines if np.size(line.get_xdata()) > _LONG]
@@ -156,10 +156,10 @@ def _panel(canvas: Canvas, ax: Axes, panel: Panel, *, mark_words: bool) -> None:
         drawn = ax.pcolormesh(image.x, image.y, image.values, cmap="Greys", shading="auto", rasterized=True)
         canvas.colorbar(drawn, ax=ax, label=typeset(image.label), pad=0.01, fraction=0.05)
         ax.grid(False)
-    seen: dict[Role, int] = {}
+    counts: dict[Role, int] = {}
     for curve in panel.curves:
-        again = seen.get(curve.role, 0)
-        seen[curve.role] = again + 1
+        again = counts.get(curve.role, 0)
+        counts[curve.role] = again + 1
         _curve(ax, curve, again, panel.x_range, len(panel.curves) == 1)
     for x, text in panel.marks:
         ax.axvline(x, color="#1b1f24", linewidth=0.8, dashes=(1.5, 1.5), zorder=4)

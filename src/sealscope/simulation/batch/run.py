@@ -1,4 +1,4 @@
-"""Sets of experiments that can run side by side, and how a set runs from rest to the end, a few seconds at a time."""
+"""Sets of experiments that can run side by side, and how a set runs from standstill, a few seconds at a time."""
 
 from __future__ import annotations
 
@@ -290,8 +290,8 @@ def _channels(rig: Rig, readings: Readings, ends: Array, samples: int) -> Array:
     return rows
 
 
-def _at_rest(experiment: Experiment) -> float:
-    return 0.0 if experiment.load is None else experiment.load.at_rest(experiment.x_0)
+def _at_standstill(experiment: Experiment) -> float:
+    return 0.0 if experiment.load is None else experiment.load.at_standstill(experiment.x_0)
 
 
 #: Steps of a chunk, and so the arrays of the command's shape; the cells of a chunk never are cut.
@@ -318,9 +318,9 @@ class SetRun:
         bounds: Array | None,
         most: int | None = None,
     ) -> None:
-        from sealscope.physics.rest import initial_state
         from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, nodes_of
         from sealscope.physics.solvers.limits import longest_step
+        from sealscope.physics.standstill import initial_state
         from sealscope.physics.vector.runs import ACCOUNTS, CHANNELS, LEAST
 
         members, common = part.members, part.experiment
@@ -346,7 +346,8 @@ class SetRun:
                     refuse_unresolved(numbers, self.h, self.method)
                     refuse_long(self.h, longest_step(numbers, G, C), f"the leak of run {member.place}")
         self.state = in_lanes(
-            np.array([initial_state(e.rig, e.x_0, _at_rest(e)) for e in (m.experiment for m in members)]), self.width
+            np.array([initial_state(e.rig, e.x_0, _at_standstill(e)) for e in (m.experiment for m in members)]),
+            self.width,
         )
         self.groups = len(self.state)
         self.drive = in_lanes(np.array([[m.gain, m.offset] for m in members]), self.width)
@@ -435,7 +436,7 @@ class SetRun:
         return min(max(0, (stop - self.after - 1) // self.factor + 1), self.samples)
 
     def _some(self, groups: tuple[int, int], tell: Callable[[float], None]) -> None:
-        """Run the groups first <= g < last from rest to the end."""
+        """Run the groups first <= g < last from standstill to the end."""
         from sealscope.physics.vector.runs import advance_lanes_imex, advance_lanes_rk4
         from sealscope.simulation.batch.signals import FILTER_ROWS, sense_lanes
 
@@ -462,7 +463,7 @@ class SetRun:
             self._check(groups, stop)
             if self.bounds is not None:
                 if start == 0:
-                    pressures[:, :kept] = pressures[:, kept : kept + 1]  # at rest before the beginning
+                    pressures[:, :kept] = pressures[:, kept : kept + 1]  # at standstill before the beginning
                 until = self._due(stop)
                 if until > sampled:
                     sensors = self._sensors(groups, sampled, until)

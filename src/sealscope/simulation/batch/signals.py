@@ -65,10 +65,10 @@ def _read(true: Any, sensor: np.ndarray, at: int, own: Any, common: Any, walk: A
     offset = load(sensor, at + OFFSET) + since * load(sensor, at + OFFSET_RISE)
     noise = load(sensor, at + NOISE) + since * load(sensor, at + NOISE_RISE)
     shared = load(sensor, at + COMMON) + since * load(sensor, at + COMMON_RISE)
-    seen = gain * true + offset + walk + noise * own + shared * common
+    reading = gain * true + offset + walk + noise * own + shared * common
     if anywhere(load(sensor, at + HUM) > 0.0):
-        seen = seen + _hum(sensor, at, sample)
-    return converted(seen, sensor, at)
+        reading = reading + _hum(sensor, at, sample)
+    return converted(reading, sensor, at)
 
 
 @contracted

@@ -104,7 +104,10 @@ class Family:
 
 @dataclass(frozen=True)
 class Profile:
-    """All nuisances of a kind of machines, and their duty; `families` of machines that depart from it."""
+    """All nuisances of a kind of machines, and their duty; `families` of machines that depart from it.
+
+    `seeds`: name that the seeds of cases derive from, "" for its own: a renamed profile draws the same machines.
+    """
 
     name: str
     title: str
@@ -112,6 +115,7 @@ class Profile:
     nuisances: tuple[AnyNuisance, ...]
     place: str
     families: tuple[Family, ...] = field(default=(), repr=False)
+    seeds: str = field(default="", repr=False)
 
     def family(self, name: str) -> Family:
         """Return the family of that name; raise InputError where there is none."""
@@ -204,6 +208,7 @@ class _FamilyEntry(_Entry):
 class _HeadEntry(_Entry):
     name: _Text
     title: _Text
+    seeds: str = ""
     extends: Literal[profile_names()] | None = None  # type: ignore[valid-type]
 
 
@@ -235,7 +240,7 @@ def _profile(path: Path, place: str) -> Profile:
         _names_of_their_own("families", families)
     except InputError as error:
         raise InputError(f"{error} ({place})") from None
-    return Profile(entry.profile.name, entry.profile.title, duty, nuisances, place, families)
+    return Profile(entry.profile.name, entry.profile.title, duty, nuisances, place, families, entry.profile.seeds)
 
 
 def _rule_broken(error: ValidationError) -> str:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 #: Length of the part without and of the part with the leak [s]; a quick reproduction takes the shorter one.
 HALF, QUICK_HALF = 90.0, 40.0
-#: What is left out of each record's beginning [s]: the rig starts at rest, the thesis's was running.
+#: What is left out of each record's beginning [s]: the rig starts at standstill, the thesis's was running.
 SETTLING = 5.0
 #: How far friction, bulk modulus and noise drift between the halves of a leak-free test: least and greatest share.
 FRICTION_DRIFT, BULK_DRIFT, NOISE_DRIFT = (0.04, 0.08), (0.03, 0.03), (0.04, 0.04)

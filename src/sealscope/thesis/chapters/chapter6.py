@@ -260,8 +260,8 @@ def load_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 def outside_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate tracking and stiffness where oil leaves the circuit past a rod seal of either side."""
-    sound, late = on_duty("pi", 0.0)
-    pressure = {side: float(np.mean(sound[f"p_{side}"][late])) for side in ("A", "B")}
+    healthy, late = on_duty("pi", 0.0)
+    pressure = {side: float(np.mean(healthy[f"p_{side}"][late])) for side in ("A", "B")}
     names, leaks = (CONTROLLERS[:1], (0.5,)) if context.quick else (CONTROLLERS[:4], LEAKS[1:])
     rows: list[tuple[Cell, ...]] = []
     for side, name, lpm in itertools.product(pressure, names, leaks):

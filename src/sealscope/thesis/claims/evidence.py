@@ -78,13 +78,13 @@ class SheetClaim:
     def judge(self, evidence: ClaimEvidence, id: str, kind: str = "") -> Claim:
         """Judge by the measured sheet; the same test on the simulated sheet stands beside it."""
 
-        def found(sheet: DataSheet) -> tuple[str, list[bool]]:
+        def findings(sheet: DataSheet) -> tuple[str, list[bool]]:
             texts, parts = zip(*self.test(sheet), strict=True)
             return self.head + self.joint.join(texts), [part for of in parts for part in of]
 
-        result, parts = (NO_SHEET, []) if evidence.measured is None else found(evidence.measured)
+        result, parts = (NO_SHEET, []) if evidence.measured is None else findings(evidence.measured)
         values = self.values(evidence, evidence.measured or evidence.leak)
-        return judged(id, parts, kind, sheet=result, simulation=found(evidence.leak)[0], **values)
+        return judged(id, parts, kind, sheet=result, simulation=findings(evidence.leak)[0], **values)
 
 
 def fired(sheet: DataSheet, rule: Rule) -> str:
@@ -170,7 +170,7 @@ def samples_of(sheet: DataSheet) -> MeasuredSamples:
     )
 
 
-def told_apart_by_levels(sheet: DataSheet, leave_out: str) -> tuple[float, float]:
+def separation_by_levels(sheet: DataSheet, leave_out: str) -> tuple[float, float]:
     """Tell leak from no leak by the absolute log RMS of d1..d4 of both chambers, without the test's own baseline.
 
     Logistic regression with a ridge of 1; `leave_out`: every "test" or every "condition" is left out in turn. Returns

@@ -24,7 +24,7 @@ def judged(id: str, tests: Iterable[bool | None], kind: str = "", /, **values: A
     texts = _texts()
     text = dict(texts[kind or id])
     text.setdefault("sheet", next(of for prefix, of in texts["sheet"].items() if id.startswith(prefix)))
-    told = {name: of.format(**values) for name, of in text.items()}
-    told |= {name: values[name] for name in ("sheet", "simulation") if name in values}
-    told["verdict"] = verdict_of(tests)
-    return Claim(id=f"claim-{id}", **told)  # type: ignore[arg-type]  # the verdict is one of the texts that it may be
+    filled = {name: of.format(**values) for name, of in text.items()}
+    filled |= {name: values[name] for name in ("sheet", "simulation") if name in values}
+    filled["verdict"] = verdict_of(tests)
+    return Claim(id=f"claim-{id}", **filled)  # type: ignore[arg-type]  # the verdict is one of the texts that it may be

@@ -131,7 +131,7 @@ def _identified(sheet: DataSheet) -> Iterator[Finding]:
 
 def _without_baseline(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
     of = ("test", "condition")
-    return {f"{name}s": "{:.2f} (AUC {:.3f})".format(*ev.told_apart_by_levels(sheet, name)) for name in of}
+    return {f"{name}s": "{:.2f} (AUC {:.3f})".format(*ev.separation_by_levels(sheet, name)) for name in of}
 
 
 def _at_5_percent(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:

@@ -89,9 +89,9 @@ class Reproduction:
         try:
             products = self.products(name) or tuple(map(_thinned, item.make(self._context(item), item)))
             files = () if self.publish is None else self.publish(item, products, self.folder.path)
-            self.folder.keep(name, self._key(item), products, files)
+            self.folder.save(name, self._key(item), products, files)
         except Exception as error:
-            self.folder.keep_failure(name, traceback.format_exc())
+            self.folder.save_failure(name, traceback.format_exc())
             text = str(error) if isinstance(error, SealscopeError) else f"{type(error).__name__}: {error}"
             return ItemStatus(item, "failed", (text.strip() or type(error).__name__).splitlines()[0])
         return ItemStatus(item, "made", files=files)

@@ -52,8 +52,8 @@ class ResultsFolder:
             yield
             shutil.rmtree(self._kept / "runs", ignore_errors=True)
 
-    def keep(self, item: str, key: str, products: tuple[Product | Claim, ...], files: tuple[str, ...] = ()) -> None:
-        """Keep an item's products, the key of what they rest on, and the files drawn of them."""
+    def save(self, item: str, key: str, products: tuple[Product | Claim, ...], files: tuple[str, ...] = ()) -> None:
+        """Save an item's products, the key of what they rest on, and the files drawn of them."""
         _save(self._kept / "items" / f"{item}.npz", products, {"key": key, "files": files}, compress=True)
         (self._kept / "failed" / f"{item}.txt").unlink(missing_ok=True)
 
@@ -72,8 +72,8 @@ class ResultsFolder:
         files = tuple(map(str, note["files"]))
         return files if all(names_a_file(self.path / name) for name in files) else None
 
-    def keep_failure(self, item: str, trace: str) -> None:
-        """Keep the traceback of an item that failed."""
+    def save_failure(self, item: str, trace: str) -> None:
+        """Save the traceback of an item that failed."""
         with atomic_write(self._kept / "failed" / f"{item}.txt") as temporary:
             temporary.write_text(trace, encoding="utf-8")
 

@@ -5,12 +5,12 @@ itself, has a double zero at every harmonic of the duty: over it a piston that a
 
     integral of phi D dtheta = G integral of phi (p_A - p_B) dt + sum_j c_j integral of phi f_j dg_j,
 
-so that what the pump delivers is what leaks. While a loop holds the piston at rest any test function will do. Rows that
-touch a missing sample weigh nothing, nor do rows of a single rod that touch a change of the side that carries: the
-circuit exchanges oil there. Of the mean pressure difference only what zeros of the sensors cannot make counts,
-d - z^2/d beyond z (Breiman's garrote). A loop makes good what leaks; where the pump delivers less than any pump loses,
-none does, and the balance says nothing. Where nothing gives a flow, shut valves hold the piston, and what the loaded
-side loses shows by how it gives way; while a command moves the valve may feed what is lost, and nothing counts.
+so that what the pump delivers is what leaks. While a loop holds the piston at standstill any test function will do.
+Rows that touch a missing sample weigh nothing, nor do rows of a single rod that touch a change of the side that
+carries: the circuit exchanges oil there. Of the mean pressure difference only what zeros of the sensors cannot make
+counts, d - z^2/d beyond z (Breiman's garrote). A loop makes good what leaks; where the pump delivers less than any pump
+loses, none does, and the balance says nothing. Where nothing gives a flow, shut valves hold the piston, and what the
+loaded side loses shows by how it gives way; while a command moves the valve may feed what is lost, and nothing counts.
 
 Sources: M. Shinbrot, Trans. ASME 79 (1957) 547; L. Breiman, Technometrics 37 (1995) 373.
 """
@@ -124,7 +124,7 @@ def _samples(recording: Recording, rig: Rig, equation: Equation) -> dict[str, Ar
 
 
 def _held(speed: Array, rate: float, area: float = 0.0) -> NDArray[np.bool_]:
-    """Return in which samples the piston is held at rest, after it has settled; with an `area`, creep is a rest."""
+    """Return in which samples the piston is held, after it has settled; with an `area`, creep is a standstill."""
     size, settles = max(1, round(AVERAGED * rate)), max(1, round(SETTLES * rate))
     slow = np.abs(np.convolve(speed, np.full(size, 1.0 / size), "same"))
     finite = np.isfinite(slow)

@@ -19,7 +19,7 @@ from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.balance import BlockStream
 from sealscope.diagnosis.inference.blocks import Blocks, Columns
 from sealscope.diagnosis.inference.live.known import (
-    RESTS,
+    STANDSTILL,
     TINY,
     Known,
     Said,
@@ -44,8 +44,8 @@ _BELIEVED = beliefs("inference.live")["block"]
 #: About how long a block is [s], and blocks before anything is said.
 BLOCK_SECONDS: float = _BELIEVED["seconds"]
 LEARNED: int = _BELIEVED["learned"]
-#: A block that rests counts all the same where it tells of the leak more than so much of what the usual one does, and
-#: after so many that move so much more, all before were of a machine at rest.
+#: A block at standstill counts all the same where it tells of the leak more than so much of what the usual one does,
+#: and after so many that move so much more, all before were of a machine at standstill.
 TELLS: float = _BELIEVED["tells"]
 WAKES: int = _BELIEVED["wakes"]
 #: Two samples follow each other where their times differ by so many steps.
@@ -182,14 +182,14 @@ class LiveBalance:
         if not rows:
             return NotJudged(end, "missing values", "blocks: missing values")
         if self._precision > 0.0:
-            self._woken = self._woken + 1 if self._moves(block) > 1.0 / RESTS else 0
+            self._woken = self._woken + 1 if self._moves(block) > 1.0 / STANDSTILL else 0
             if self._woken >= WAKES:
                 self.relearn()
                 return NotJudged(end, "learning", "blocks: moves as never before", True)
             shown = self._shown(block)
             return shown if isinstance(shown, NotJudged) else [shown]
         if not block.gram[0, 0, -1, -1] > 0.0 and self._waiting is None:
-            return NotJudged(end, "at rest", "blocks: at rest")
+            return NotJudged(end, "at standstill", "blocks: at standstill")
         self._waiting = block if self._waiting is None else Blocks.joined([self._waiting, block])
         if len(self._waiting) < LEARNED:
             return NotJudged(end, "learning")
@@ -198,7 +198,7 @@ class LiveBalance:
             _learns(known, np.ascontiguousarray(waiting.gram[:, e]), place, waiting.rows)
         self._precision = float(np.median([self._says(part, adds=False).precision for part in _parts(waiting)]))
         parts = [self._shown(part, adds=False) for part in _parts(waiting)]
-        return [part for part in parts if not isinstance(part, NotJudged)] or NotJudged(end, "at rest")
+        return [part for part in parts if not isinstance(part, NotJudged)] or NotJudged(end, "at standstill")
 
     def _moves(self, block: Blocks) -> float:
         """Return the motion of a block over the usual one."""
@@ -213,10 +213,10 @@ class LiveBalance:
     def _shown(self, block: Blocks, adds: bool = True) -> BlockConductance | NotJudged:
         half = 0.5 * stride_samples(self._rate) / self._rate
         begin, end = float(block.start[0]) - half, float(block.end[0]) + half
-        at_rest = self._moves(block) < RESTS
+        at_standstill = self._moves(block) < STANDSTILL
         precision, lead, shift, leaning = self._says(block, adds)
-        if not precision > (TELLS * self._precision if at_rest else 0.0):
-            return NotJudged(end, "at rest", "blocks: at rest")
+        if not precision > (TELLS * self._precision if at_standstill else 0.0):
+            return NotJudged(end, "at standstill", "blocks: at standstill")
         total = lead / precision
         offset = math.hypot(math.sqrt(leaning) / precision, self.size_error * lead / precision)
         pressure, _, rate = (max(float(value), TINY) for value in block.means[0])
@@ -281,5 +281,5 @@ def size_error(rig: Rig) -> float:
 def live_equations(rig: Rig, names: Sequence[str]) -> list[Equation]:
     """Return a machine's balances with the terms that have a column: none has what is zero or lies beside the leak."""
     balances = equations(rig, frozenset(names))
-    told = [tuple(term for term in own.terms if term.nuisance and term.name != "pump leak") for own in balances]
-    return [own._replace(terms=terms) for own, terms in zip(balances, told, strict=True)]
+    nuisances = [tuple(term for term in own.terms if term.nuisance and term.name != "pump leak") for own in balances]
+    return [own._replace(terms=terms) for own, terms in zip(balances, nuisances, strict=True)]

@@ -23,7 +23,7 @@ from sealscope.diagnosis.inference.row_weights import solve_in_place
 from sealscope.diagnosis.inference.weak_form import OVERLAP
 
 JUMP: float = beliefs("inference.live")["coefficients"]["jump"]
-RESTS: float = beliefs("inference.live")["block"]["rests"]
+STANDSTILL: float = beliefs("inference.live")["block"]["standstill"]
 #: What is left after a block of what those before said, and of how far the series stands from the present level.
 _KEEP, _RETURNS = (math.exp(-1.0 / beliefs("inference.live")["coefficients"][name]) for name in ("memory", "returns"))
 TINY = float(np.finfo(float).tiny)
@@ -165,11 +165,11 @@ def says(known: Any, rows: float, adds: bool) -> tuple[float, float, float, floa
         left = max(_left(own, right), 0.0) / rows
         numbers[MISFIT] = left / numbers[NOISE]
         weight = min(1.0, JUMP**2 * numbers[NOISE] / max(left, TINY))
-        before, told = known.sums[n, n + 1], max(known.sums[n, n], TINY)
+        before, information = known.sums[n, n + 1], max(known.sums[n, n], TINY)
         for i in range(n):
             before -= known.sums[n, i] * right[i, 0]
-        spread = OVERLAP * numbers[NOISE] * (2.0 / (energy * weight) + 1.0 / told)
-        add(known, rows, weight, (g - before / told) ** 2 > JUMP**2 * spread)
+        spread = OVERLAP * numbers[NOISE] * (2.0 / (energy * weight) + 1.0 / information)
+        add(known, rows, weight, (g - before / information) ** 2 > JUMP**2 * spread)
         numbers[NOISE] += (1.0 - _KEEP) * (left * weight - numbers[NOISE])
     # beside its rows' noise a block has what it leans on the others otherwise than the usual one
     variance = OVERLAP * numbers[NOISE] * (1.0 / weight + max(turned, 0.0) / energy)

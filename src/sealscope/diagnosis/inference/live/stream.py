@@ -37,7 +37,7 @@ class BalanceState:
     t : float
         End of the last whole block [s].
     blocks, refused : int
-        Whole blocks so far, and those of them that say nothing: at rest, or with missing values throughout.
+        Whole blocks so far, and those of them that say nothing: at standstill, or with missing values throughout.
     evidence : Evidence
         As of the last block, with the 95 % bound of a leak where none is shown.
     alarm : Evidence or None

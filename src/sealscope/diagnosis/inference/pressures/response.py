@@ -86,7 +86,7 @@ _EXPLAINED = 0.5
 _UNEXPLAINED = 3.0
 #: Least share of a step that is tried; damping [1] of steps that did not gain, at first, at least and at most.
 _LEAST_SHARE, _DAMPED, _LEAST_DAMPED, _MOST_DAMPED = 0.02, 0.1, 1e-3, 100.0
-#: Beginning along which it is led once, and the blocks there [s].
+#: Beginning along which it is run once before, and the blocks there [s].
 _BEGINNING, _BLOCK = 24.0, 6.0
 #: The first fit: length of its window [s], width of the Gaussian that takes the ring out [periods], steps of the slow
 #: fit, steps by which starts are compared, and length of the spectra [samples].
@@ -344,7 +344,7 @@ class Stretch:
     known: Array
     smooth: float = 0.0
 
-    def seen(self, rows: Array) -> Array:
+    def fitted_part(self, rows: Array) -> Array:
         """Return rows (n, m) without what is not fitted."""
         rows = gaussian_filter1d(rows, self.smooth, axis=0) if self.smooth > 0.0 else rows
         rows = rows * self.known[:, None]
@@ -353,7 +353,7 @@ class Stretch:
     def residuals(self, paths: Array) -> Array:
         """Return what up to 16 sets of parameters (m, p) leave (n, m), their means taken out."""
         shown, _ = self.machine.run(self.command, paths, self.states[:, np.zeros(len(paths), dtype=int)])
-        left = self.seen(self.dp[:, None] - paths[:, SCALE] * shown)
+        left = self.fitted_part(self.dp[:, None] - paths[:, SCALE] * shown)
         return np.asarray(left - left.mean(axis=0))
 
     def look(self, theta: Array, others: Array) -> tuple[Look, Array]:
@@ -371,7 +371,7 @@ class Stretch:
             [earlier, lfilter([kept - 1.0], [1.0, -kept], earlier), shown[:, 0], np.ones(len(shown))]
         )
         rest *= self.unit[_SIMULATED:]
-        rows = self.seen(np.concatenate([left, slopes, rest], axis=1))
+        rows = self.fitted_part(np.concatenate([left, slopes, rest], axis=1))
         count = len(own)
         return Look(theta, rows[:, 0], rows[:, count:], ends[:, : _SIMULATED + 1]), rows[:, 1:count]
 
@@ -544,7 +544,7 @@ class Follower:
         covariance, states = follower.covariance, follower.states
         length = round(_BLOCK * recording.rate)
         taken = min(round(_BEGINNING * recording.rate), len(recording) - length + 1)
-        for first in range(0, taken, length):  # led on once, to begin where that ends
+        for first in range(0, taken, length):  # run once before, to begin where that ends
             follower.take(recording.samples(slice(first, first + length)))
         follower.covariance, follower.states, follower.last = covariance, states, math.nan
         return follower
@@ -578,14 +578,14 @@ class Follower:
             wander[jumped] += (beliefs.width[jumped] / beliefs.unit[jumped]) ** 2
         return Normal(self.theta, np.asarray(np.linalg.inv(self.covariance + np.diag(wander))))
 
-    def _led(self, stretch: Stretch, seconds: float) -> tuple[Look, Normal]:
+    def _updated(self, stretch: Stretch, seconds: float) -> tuple[Look, Normal]:
         """Return the likeliest look and the belief beside it.
 
         Where wandering does not explain the block, a jump is looked for: of the conductance, or of the stiffness.
         """
         unit, belief = self.beliefs.unit, self._belief(seconds)
-        led = [(stretch.descend(self.theta, belief, _STEPS, self.variance), belief)]
-        if not _explained(led[0][0].cost(self.variance, belief, unit), stretch.known):
+        candidates = [(stretch.descend(self.theta, belief, _STEPS, self.variance), belief)]
+        if not _explained(candidates[0][0].cost(self.variance, belief, unit), stretch.known):
             for parameter, values in (
                 (G, _tried("response_jump", "G", SINGLE_WIDTH)),
                 (K_OIL, self.theta[K_OIL] * _tried("response_jump", "K", SINGLE_WIDTH)),
@@ -593,13 +593,13 @@ class Follower:
                 sets, belief = np.tile(self.theta, (SINGLE_WIDTH, 1)), self._belief(seconds, parameter)
                 sets[:, parameter] = values
                 squares = np.nan_to_num(np.square(stretch.residuals(sets)).sum(axis=0), nan=np.inf)
-                led.append((stretch.descend(sets[int(squares.argmin())], belief, _STEPS, self.variance), belief))
-        return min(led, key=lambda own: own[0].cost(self.variance, own[1], unit))
+                candidates.append((stretch.descend(sets[int(squares.argmin())], belief, _STEPS, self.variance), belief))
+        return min(candidates, key=lambda own: own[0].cost(self.variance, own[1], unit))
 
     def take(self, block: Recording) -> LinearBlock:
         """Return the sums of the next block."""
         stretch = self.stretch(block)
-        look, belief = self._led(stretch, block.duration)
+        look, belief = self._updated(stretch, block.duration)
         own = linear(look, stretch.known, round(block.rate))
         excess = look.cost(self.variance, belief, self.beliefs.unit) - own.samples
         self.excess = excess / math.sqrt(2.0 * max(own.samples, 1.0))

@@ -359,8 +359,8 @@ class _Ring:
         K, lines = self.blocks, np.arange(self.falling, self.size)
         for each, begin in zip(self.classes, self.begins, strict=True):
             wave, m = self._wave(x, each, begin), each.occupied.size
-            seen, turned = wave.real, -wave.imag
-            columns = np.array([-each.tau * seen, each.tau * turned, seen, turned, -each.slow * seen])
+            real, turned = wave.real, -wave.imag
+            columns = np.array([-each.tau * real, each.tau * turned, real, turned, -each.slow * real])
             columns = np.concatenate([each.less_slow(columns), each.lines])
             left = self._residual(x, each, wave)
             squares += float(np.vdot(left, left))

@@ -25,7 +25,7 @@ THESIS_STEP = 1e-4
 #: Duration [s] of a run, and the whole periods of both commands in it that numbers are taken from.
 DURATION = 6.5
 STEADY = (math.pi, 2.0 * math.pi)
-WINDOW = "from pi to 2 pi s of a run from rest"
+WINDOW = "from pi to 2 pi s of a run from standstill"
 #: Every third step of 1e-4 s: a solution that alternates from step to step is met at both its values, which
 #: sampling every 2nd, 4th or 20th step would hide.
 SAMPLE_RATE = 1.0 / (3.0 * THESIS_STEP)

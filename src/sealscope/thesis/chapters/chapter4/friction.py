@@ -58,7 +58,7 @@ def friction_models(context: Context, item: Item) -> tuple[Figure, ...]:
     v = np.linspace(-0.1, 0.1, 801)
     sketches: dict[str, tuple[str, Any, Any]] = {
         "(a) Coulomb": ("F_C sign(v)", [-0.1, 0.0, 0.0, 0.1], [-F, -F, F, F]),
-        "(b) Static": ("F_C K_brk at rest", [-0.1, 0.0, 0.0, 0.0, 0.0, 0.1], [-F, -F, -peak, peak, F, F]),
+        "(b) Static": ("F_C K_brk at standstill", [-0.1, 0.0, 0.0, 0.0, 0.0, 0.1], [-F, -F, -peak, peak, F, F]),
         "(c) Stick-slip": ("linear below v_th", [-0.1, -v_th, v_th, 0.1], [-F, -peak, peak, F]),
         "(d) Stribeck": ("eqs. 4.21, 4.22", v, stribeck(v, F)),
     }
@@ -76,7 +76,7 @@ def friction_models(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def stribeck_curve(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw Fig. 4.3: friction against velocity, near rest under both bracketings, and its slope."""
+    """Draw Fig. 4.3: friction against velocity, near standstill under both bracketings, and its slope."""
     rig = thesis_rig()
     f = rig.friction
     charged = f.F_pr + f.F_cfr * 2.0 * rig.fluid.p_charge

@@ -1,4 +1,4 @@
-"""The state at rest: pressures that carry the load, and a motor that holds them."""
+"""The state at standstill: pressures that carry the load, and a motor that holds them."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ if TYPE_CHECKING:
 
 
 @law
-def carried_at_rest(
+def carried_at_standstill(
     x: float, F_l: float, k_load: float, A_opp: float, p_opp: float, L: float, k_stop: float, d_stop: float
 ) -> float:
-    """Force [N] against +x that the pressures carry at rest at x [m]: the load less that of a stop."""
+    """Force [N] against +x that the pressures carry at standstill at x [m]: the load less that of a stop."""
     load = load_force(x, F_l, k_load) + opposing_force(0.0, A_opp, p_opp, 1.0)
     return load - hard_stop_force(x, 0.0, L, k_stop, d_stop)
 
 
 @kernel
 def holding_current(dp: float, q_b: float, C_m: float) -> float:
-    """Winding current [A] that holds the pump against dp [Pa]: T_load/C_m, eq. (4.5) at rest."""
+    """Winding current [A] that holds the pump against dp [Pa]: T_load/C_m, eq. (4.5) at standstill."""
     return pump_torque(dp, q_b) / C_m
 
 
 @law
 def holding_integral(i: float, R_c: float, K_i: float) -> float:
-    """Speed controller's integral [rad] that gives the winding its current i [A] at rest: R_c i/K_i, eq. (4.3)."""
+    """Integral [rad] of the speed controller that gives the winding i [A] at standstill: R_c i/K_i, eq. (4.3)."""
     return R_c * i / K_i if K_i > 0.0 else 0.0
 
 
 @law
-def pressures_at_rest(
+def pressures_at_standstill(
     force: float, A_A: float, A_B: float, V_A: float, V_B: float, p_charge: float, made_up: bool
 ) -> tuple[float, float]:
-    """Return p_A, p_B [Pa] that carry `force` [N] against +x at rest: p_A A_A - p_B A_B = force.
+    """Return p_A, p_B [Pa] that carry `force` [N] against +x at standstill: p_A A_A - p_B A_B = force.
 
     With a make-up the lower of both is at the accumulator's charge pressure. Without one the circuit holds as much oil
     as at the charge pressure throughout: the mean of both, weighted by the volumes V_A, V_B of the sides [m^3], stays.
@@ -69,7 +69,7 @@ def pressures_behind_valve(force: float, A_A: float, A_B: float, p_1: float, p_2
 
 
 @kernel
-def supply_at_rest(force: float, x: float, p: RigNumbers) -> tuple[float, float, float]:
+def supply_at_standstill(force: float, x: float, p: RigNumbers) -> tuple[float, float, float]:
     """Return p_1, p_A, p_B [Pa] at which pump, relief valve and a servo valve at null let the supply's pressure stay.
 
     By bisection: dp_1/dt falls as p_1 rises. `force` [N] against +x, `x` [m] of the piston.
@@ -91,7 +91,7 @@ def supply_at_rest(force: float, x: float, p: RigNumbers) -> tuple[float, float,
 
 
 def _carried(c: Cylinder, x: float) -> float:
-    return carried_at_rest(x, c.F_l, c.k_load, c.A_opp, c.p_opp, c.L, c.k_stop, c.d_stop)  # type: ignore[no-any-return]
+    return carried_at_standstill(x, c.F_l, c.k_load, c.A_opp, c.p_opp, c.L, c.k_stop, c.d_stop)  # type: ignore[no-any-return]
 
 
 def side_volumes(rig: Rig) -> tuple[float, float]:
@@ -101,30 +101,30 @@ def side_volumes(rig: Rig) -> tuple[float, float]:
     return c.V + c.V_hose_A + V_1, c.V - c.V_rod + c.V_hose_B + V_2
 
 
-def rest_pressures(rig: Rig, force: float) -> tuple[float, float]:
-    """Return p_A, p_B [Pa] that carry `force` [N] against +x at rest (`pressures_at_rest`).
+def standstill_pressures(rig: Rig, force: float) -> tuple[float, float]:
+    """Return p_A, p_B [Pa] that carry `force` [N] against +x at standstill (`pressures_at_standstill`).
 
     Raises InputError where one of them is below vacuum.
     """
     c, made_up = rig.cylinder, rig.makeup.check_valves != "absent"
-    p_A, p_B = pressures_at_rest(force, c.A_A, c.A_B, *side_volumes(rig), rig.fluid.p_charge, made_up)
+    p_A, p_B = pressures_at_standstill(force, c.A_A, c.A_B, *side_volumes(rig), rig.fluid.p_charge, made_up)
     if min(p_A, p_B) < -P_ATM:
         raise InputError(
-            f"a load of {force:.4g} N must be carried at rest by pressures above vacuum, got p_A = {p_A:.4g} Pa and "
-            f"p_B = {p_B:.4g} Pa; raise fluid.p_charge, or let a make-up hold the low side (makeup.check_valves)"
+            f"a load of {force:.4g} N must be carried at standstill by pressures above vacuum, got p_A = {p_A:.4g} Pa "
+            f"and p_B = {p_B:.4g} Pa; raise fluid.p_charge, or let a make-up hold the low side (makeup.check_valves)"
         )
     return p_A, p_B
 
 
 def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
-    """State (12,) at rest with the piston at x_0 [m] from mid-stroke, under `push` [N] beside the rig's own load.
+    """State (12,) at standstill with the piston at x_0 [m] from mid-stroke, under `push` [N] beside the rig's own load.
 
-    The pressures carry the load (`rest_pressures`), the motor holds the pump against them: i = T_load/C_m, with the
-    speed controller's integral at R_c i/K_i, which gives that current. A machine that leaks creeps from there. Without
-    a load and with equal areas all pressures are at the charge pressure and all else is zero.
+    The pressures carry the load (`standstill_pressures`), the motor holds the pump against them: i = T_load/C_m, with
+    the speed controller's integral at R_c i/K_i, which gives that current. A machine that leaks creeps from there.
+    Without a load and with equal areas all pressures are at the charge pressure and all else is zero.
 
-    Behind a servo valve at null the motor turns at the supply's speed, whose pressure stays (`supply_at_rest`). An
-    underlapped valve lets a loaded piston creep from there.
+    Behind a servo valve at null the motor turns at the supply's speed, whose pressure stays (`supply_at_standstill`).
+    An underlapped valve lets a loaded piston creep from there.
 
     Raises InputError where the pressures are below vacuum or beyond the supply's, or the drive cannot hold them.
     """
@@ -134,27 +134,27 @@ def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
     if rig.valve.spool == "present":
         return _at_valve(rig, y, push)
     force = _carried(c, x_0) + push
-    p_A, p_B = rest_pressures(rig, force)
+    p_A, p_B = standstill_pressures(rig, force)
     y[[P_A, P_1]], y[[P_B, P_2]] = p_A, p_B
     y[CURRENT] = holding_current(p_A - p_B, rig.pump.q_b, m.C_m)
     if abs(y[CURRENT]) > m.i_max or m.R_c * abs(y[CURRENT]) > m.V_max:
         most = min(m.i_max, m.V_max / m.R_c)
         raise InputError(
-            f"the drive must hold the load of {force:.4g} N at rest, which takes {abs(y[CURRENT]):.4g} A, got at most "
-            f"{most:.4g} A (motor.i_max, motor.V_max); take a smaller load or pump"
+            f"the drive must hold the load of {force:.4g} N at standstill, which takes {abs(y[CURRENT]):.4g} A, got at "
+            f"most {most:.4g} A (motor.i_max, motor.V_max); take a smaller load or pump"
         )
     y[INTEGRAL] = holding_integral(y[CURRENT], m.R_c, m.K_i)
     return y
 
 
 def _at_valve(rig: Rig, y: np.ndarray, push: float) -> np.ndarray:
-    """Return the state `y` at rest behind a servo valve, under `push` [N] beside the rig's own load."""
+    """Return the state `y` at standstill behind a servo valve, under `push` [N] beside the rig's own load."""
     c, m, p = rig.cylinder, rig.motor, rig_numbers(rig)
     force = _carried(c, y[POSITION]) + push
-    p_1, p_A, p_B = supply_at_rest(force, y[POSITION], p)
+    p_1, p_A, p_B = supply_at_standstill(force, y[POSITION], p)
     if not rig.supply.p_return <= min(p_A, p_B) <= max(p_A, p_B) <= p_1:
         raise InputError(
-            f"a load of {force:.4g} N must be carried at rest by pressures between the return's "
+            f"a load of {force:.4g} N must be carried at standstill by pressures between the return's "
             f"{rig.supply.p_return:.4g} Pa and the supply's {p_1:.4g} Pa, got p_A = {p_A:.4g} Pa and p_B = {p_B:.4g} "
             "Pa; raise supply.p_set, or take a smaller load"
         )
