@@ -192,3 +192,13 @@ def test_chance_threshold_and_interval_agree() -> None:
     assert Rise(made.threshold(made.chance) * 2.0, 2.0, 4.0).value == pytest.approx(3.0)
     low, high = made.interval(1.0 - 2.0 * made.chance)
     assert (low, high) == (pytest.approx(0.0, abs=1e-9), pytest.approx(6.0))
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-200, 1.0, 1e150])
+def test_recordings_of_any_size_have_a_rise_and_a_threshold(scale: float) -> None:
+    random = np.random.default_rng(6)
+    *healthy, judged = fleet(random, (1, 1, 2, 3), 0.1, BELIEVED)
+    scaled = [own._replace(sums=own.sums * scale, flow=own.flow * scale) for own in (*healthy, judged)]
+    with np.errstate(all="ignore"):
+        made = rise(scaled[-1], scaled[:-1], (COLUMNS,))
+    assert 0.0 <= made.chance <= 1.0 and made.threshold(0.01) > 0.0

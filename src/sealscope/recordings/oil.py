@@ -9,7 +9,12 @@ from sealscope.recordings.recording import Recording
 
 
 def oil_temperature(recording: Recording) -> float | None:
-    """Return the oil's mean temperature [deg C], else what the file says beside its samples; None where neither is."""
-    if "T_oil" in recording and np.any(known := np.isfinite(recording["T_oil"])):
-        return float(recording["T_oil"][known].mean()) - 273.15
+    """Return the oil's mean temperature [deg C], else what the file says beside its samples; None where neither is.
+
+    Values that are no temperature of oil, below 213 K or above 473 K, count as missing.
+    """
+    if "T_oil" in recording and recording.units["T_oil"] == "K":
+        known = recording["T_oil"][np.abs(recording["T_oil"] - 343.15) < 130.0]
+        if known.size:
+            return float(known.mean()) - 273.15
     return stated_oil_temperature(recording.provenance)

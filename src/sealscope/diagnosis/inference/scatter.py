@@ -28,6 +28,7 @@ import numpy as np
 
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, solve, total
 from sealscope.diagnosis.inference.terms import priors
+from sealscope.diagnosis.inference.weak_form import LARGEST
 from sealscope.recordings.recording import Array
 
 #: Nodes of a deviation, and the largest one between sessions over what is believed.
@@ -140,7 +141,9 @@ def _between_sessions(value: float, members: Sequence[Array], at: int | None, us
     squares = weight * usual**2 + float(sum(((own - own.mean()) ** 2).sum() for own in members))
     everything = float(sum((own**2).sum() for own in members))
     least, most = 0.1 * np.sqrt(squares / (weight + count)), 100.0 * np.sqrt(squares + everything)
-    within = np.geomspace(max(least, np.finfo(float).tiny), max(most, np.finfo(float).tiny), NODES)[:, None] ** 2
+    if not most < LARGEST:  # numbers that cannot be computed with bound nothing
+        return Rise(value, np.inf, weight)
+    within = np.geomspace(max(least, 1.0 / LARGEST), max(most, 10.0 / LARGEST), NODES)[:, None] ** 2
     nodes = np.square((np.arange(NODES) + 0.5) / NODES)  # closer near zero
     between = (WIDEST * apart * nodes) ** 2
     spread = between[:, None] + within[..., None] / sizes
