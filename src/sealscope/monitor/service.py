@@ -33,7 +33,7 @@ from sealscope.monitor.sources.source_block import (
     SourceBlock,
     bytes_of,
 )
-from sealscope.monitor.supervisor import DATABASE, OPCUA, WEBHOOK, Supervisor
+from sealscope.monitor.supervisor import DATABASE, WEBHOOK, Supervisor
 from sealscope.monitor.waiting import Waiting
 from sealscope.storage.folders import locked
 
@@ -190,7 +190,7 @@ class Service:
         if self.settings.opcua is not None:
             from sealscope.monitor.sources.opcua import opcua_of
 
-            sources.append((OPCUA, opcua_of(self.settings.opcua)))
+            sources.append(("OPC UA source", opcua_of(self.settings.opcua)))
         return sources
 
     def _started(self, name: str, source: Source) -> threading.Thread:
