@@ -40,8 +40,8 @@ from scipy.special import gammaincinv
 from threadpoolctl import threadpool_limits
 
 import sealscope as ss
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.live.balance import BlockConductance, LiveBalance, NotJudged, size_error
-from sealscope.diagnosis.inference.terms import priors
 
 RESULTS = Path(__file__).parent / "results" / "monitor_months.csv"
 SHIFT_S, DAY_S = 16 * 3600.0, 24 * 3600.0
@@ -59,7 +59,7 @@ COLUMNS = (
     *("delay_h", "delay_watched_h", "test", "true_lpm", "stated_lpm", "stated_low_lpm", "stated_high_lpm"),
 )
 Libraries = dict[tuple[float, float] | str, list[BlockConductance]]
-WARMEST = priors()["oil"]["warmest"].value
+WARMEST = beliefs("inference")["oil"]["warmest"]
 
 
 def libraries(seed: int) -> tuple[ss.Recording, Libraries, float]:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, Weighting, information, solve
 from sealscope.diagnosis.inference.row_weights import HUBER, SUPPORT, weighted
-from sealscope.diagnosis.inference.terms import LEAK, Equation, Term, priors
+from sealscope.diagnosis.inference.terms import LEAK, Equation, Term
 from sealscope.diagnosis.inference.weak_form import OVERLAP, rows
 
 FIELDS = tuple(Blocks.__dataclass_fields__)
@@ -65,7 +66,7 @@ def oracle(values: np.ndarray, seconds: float = 3.0) -> tuple[np.ndarray, np.nda
     drifting = np.hstack([flat[:, [k]] * shapes for k in others])
     free = np.where(block[:, None] == np.arange(count), flat[:, [TESTED]], 0.0)
     level = np.linalg.lstsq(flat[:, others], flat[:, LEFT], rcond=None)[0]
-    width = np.abs(level) * np.array([priors()["drift"][name].value for name in ("compliance", "air", "bias")])
+    width = np.abs(level) * np.array([beliefs("inference")["drift"][name] for name in ("compliance", "air", "bias")])
     width *= length / 60.0
     assert own.nuisance == (STROKE, OIL, ZERO, TESTED)
     variance = float(np.var(flat[:, LEFT]))

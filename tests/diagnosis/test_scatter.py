@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from scipy.stats import binom, kstest
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.blocks import Blocks, Columns
 from sealscope.diagnosis.inference.scatter import Rise, Taught, rise
-from sealscope.diagnosis.inference.terms import LEAK, Equation, Term, priors
+from sealscope.diagnosis.inference.terms import LEAK, Equation, Term
 
 PRESSURE, FLOW = 1e5, 1e-5
 #: What is believed of the scatter of the leak's coefficient [m^3/(s Pa)].
-BELIEVED = priors()["scatter"]["leak"].value * FLOW / PRESSURE
+BELIEVED = beliefs("inference")["scatter"]["leak"] * FLOW / PRESSURE
 
 
 def nothing(_: object) -> np.ndarray:
@@ -82,7 +83,7 @@ def fleet(random: np.random.Generator, days: Sequence[int], viscosity: float, wi
 def test_a_day_of_other_oil_is_no_leak(days: Sequence[int]) -> None:
     """Between two days the viscosity differs as far as it is believed to."""
     random, draws = np.random.default_rng(len(days)), 100
-    viscosity = 0.5 * np.log(priors()["oil"]["warmest"].value) / np.sqrt(2.0)
+    viscosity = 0.5 * np.log(beliefs("inference")["oil"]["warmest"]) / np.sqrt(2.0)
     chances = []
     for _ in range(draws):
         *healthy, judged = fleet(random, days, viscosity, BELIEVED)
@@ -104,7 +105,7 @@ def test_recordings_without_a_date_are_of_one_day() -> None:
 def test_a_known_temperature_of_the_oil_takes_off_what_it_makes_of_the_level() -> None:
     """Twice the leakage in oil that is 17 K warmer is no leak, and as much at the same temperature is."""
     random, level = np.random.default_rng(5), 20.0 * BELIEVED
-    twice = np.exp(priors()["oil"]["per_kelvin"].value * 17.3)
+    twice = np.exp(beliefs("inference")["oil"]["per_kelvin"] * 17.3)
     healthy = [Taught.of(recording(random, level), (COLUMNS,), DAY * 1, 40.0) for _ in range(4)]
 
     def risen(day: int, warm: float) -> Rise:
@@ -127,7 +128,7 @@ def test_days_that_are_known_narrow_what_another_day_may_be() -> None:
 
 def believed_scatter(random: np.random.Generator) -> float:
     """A machine's scatter, drawn from what is believed of it: scaled inverse chi square."""
-    freedom = priors()["scatter"]["freedom"].value
+    freedom = beliefs("inference")["scatter"]["freedom"]
     return float(BELIEVED * np.sqrt(freedom / random.chisquare(freedom)))
 
 
@@ -135,7 +136,7 @@ def believed_scatter(random: np.random.Generator) -> float:
 def test_the_score_is_students_t_over_machines_as_they_are_believed(count: int) -> None:
     random = np.random.default_rng(count)
     made = [risen(random, count, believed_scatter(random)) for _ in range(80)]
-    assert {own.freedom for own in made} == {priors()["scatter"]["freedom"].value + count - 1}
+    assert {own.freedom for own in made} == {beliefs("inference")["scatter"]["freedom"] + count - 1}
     assert kstest([own.chance for own in made], "uniform").pvalue > 1e-3
     held = sum(low <= 0.0 <= high for low, high in (own.interval(0.9) for own in made))
     assert binom.ppf(0.0005, len(made), 0.9) <= held <= binom.ppf(0.9995, len(made), 0.9)

@@ -1,4 +1,4 @@
-"""What is believed of machines before a recording is seen: `priors.toml` of a package, as `inference/terms.toml`."""
+"""What is believed of machines before a recording is seen: `priors.toml` of a package, as `inference/priors.toml`."""
 
 from __future__ import annotations
 

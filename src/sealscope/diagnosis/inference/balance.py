@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.blocks import PRESSURE_PARTS, SMOOTHED, Blocks, Columns, Weighting
 from sealscope.diagnosis.inference.onset import FEWEST
 from sealscope.diagnosis.inference.row_weights import SUPPORT
@@ -20,7 +21,6 @@ from sealscope.diagnosis.inference.terms import (
     Equation,
     Signals,
     equations,
-    priors,
 )
 from sealscope.diagnosis.inference.weak_form import SPAN, STRIDE, rows, stride_samples
 from sealscope.diagnosis.inference.zero import about_zero
@@ -304,7 +304,7 @@ def blocks_of(recording: Recording, rig: Rig) -> tuple[Blocks, Blocks, tuple[Col
         plain = blocks if plain is None else plain
         blocks = about_zero(blocks, stream.columns)
         zero, before = float(blocks.zero[0]), zero
-        if abs(zero - before) < NEAR * priors()["zero"]["pressure"].value:
+        if abs(zero - before) < NEAR * beliefs("inference")["zero"]["pressure"]:
             break
     return None if blocks is None or plain is None else (blocks.merged(), plain.merged(), stream.columns)
 

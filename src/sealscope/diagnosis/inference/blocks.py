@@ -5,7 +5,7 @@ matrices is that of their union, so that a stream and a whole recording are hand
 costs no more than one of minutes. Rows are weighted once, when their block is closed (`row_weights`).
 
 For one coefficient g, a number for each block, everything else is eliminated (`information`). The other coefficients
-are a level with a slow drift, c_j(t) = sum_p c_jp P_p(t), whose size is believed within a width (`terms.toml`):
+are a level with a slow drift, c_j(t) = sum_p c_jp P_p(t), whose size is believed within a width (`priors.toml`):
 
     Lambda = (diag N - B M^-1 B') / s^2,    eta = (n - B M^-1 m) / s^2,
 
@@ -23,9 +23,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Information
 from sealscope.diagnosis.inference.row_weights import SUPPORT, weighted
-from sealscope.diagnosis.inference.terms import BIAS, LEAK, Equation, Prior, priors
+from sealscope.diagnosis.inference.terms import BIAS, LEAK, Equation
 from sealscope.diagnosis.inference.weak_form import OVERLAP
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
@@ -122,14 +123,12 @@ class Columns:
         self.left = len(self.names)
         self.nuisance = tuple(k for k, term in enumerate(equation.terms) if term.nuisance)
         self.leak = self.names.index(LEAK)
-        beliefs: Mapping[str, Prior] = priors()["drift"]
-        self.drift = np.array([beliefs[term.drift].value if term.nuisance else 0.0 for term in equation.terms])
-        differs = priors()["between"]
-        self.between = np.array([differs[term.drift].value if term.nuisance else 0.0 for term in equation.terms])
-        levels = priors()["level"]
-        self.levels = np.array(
-            [levels[term.drift].value if term.drift in levels else np.inf for term in equation.terms]
-        )
+        believed = beliefs("inference")["drift"]
+        self.drift = np.array([believed[term.drift] if term.nuisance else 0.0 for term in equation.terms])
+        differs = beliefs("inference")["between"]
+        self.between = np.array([differs[term.drift] if term.nuisance else 0.0 for term in equation.terms])
+        levels = beliefs("inference")["level"]
+        self.levels = np.array([levels.get(term.drift, np.inf) for term in equation.terms])
         self.motion = tuple(k for k in self.nuisance if equation.terms[k].drift in ("motion", "edge"))
         self.support = tuple(
             k for k in self.nuisance if equation.terms[k].drift not in ("leak", "pump", "bias", "outside")
@@ -137,7 +136,7 @@ class Columns:
         self.fast = tuple(k for k in self.nuisance if k not in self.support)
         self.bias = self.names.index(BIAS) if BIAS in self.names else None
         self.driven = tuple(term.driven for term in equation.terms)
-        self.healthy = priors()["healthy"][equation.healthy].value if equation.healthy else float("inf")
+        self.healthy = beliefs("inference")["healthy"][equation.healthy] if equation.healthy else float("inf")
 
     def level(self, test: int, blocks: Blocks) -> float:
         """Return the standard deviation of a healthy machine's coefficient of a column; infinite for other columns."""
@@ -155,7 +154,7 @@ class Columns:
         driven = self.driven[test] if test < self.left and self.bias is not None else ""
         root = float(np.mean(blocks.driving(root=True)))
         slope = {"": 0.0, "pressure": 1.0, "root": 0.5 / root if root > 0.0 else 0.0}[driven]
-        return min(priors()["zero"]["pressure"].value, float(np.mean(blocks.driving()))) * slope
+        return float(min(beliefs("inference")["zero"]["pressure"], np.mean(blocks.driving()))) * slope
 
 
 class Weighting:
@@ -382,8 +381,8 @@ def _eliminated(gram: Array, blocks: Blocks, columns: Columns, test: int, others
 
 def cost_of_zero(zero: float) -> float:
     """Return minus twice the logarithm of what is believed of a zero of the pressures [Pa], over that of none."""
-    usual, far, odds = (priors()["zero"][name].value for name in ("pressure", "far", "odds"))
-    return min((zero / usual) ** 2, (zero / far) ** 2 + 2.0 * float(np.log(far / usual / odds)))
+    usual, far, odds = (beliefs("inference")["zero"][name] for name in ("pressure", "far", "odds"))
+    return float(min((zero / usual) ** 2, (zero / far) ** 2 + 2.0 * np.log(far / usual / odds)))
 
 
 def zero_of(blocks: Blocks, columns: Sequence[Columns]) -> float:

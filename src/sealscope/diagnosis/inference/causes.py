@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.blocks import (
     Blocks,
     Columns,
@@ -24,7 +25,7 @@ from sealscope.diagnosis.inference.blocks import (
 )
 from sealscope.diagnosis.inference.onset import StepTest, step_test
 from sealscope.diagnosis.inference.other_steps.step import OtherStep
-from sealscope.diagnosis.inference.terms import AIR, BIAS, LEAK, MADE_UP, ORIFICE, PUMP, Equation, priors
+from sealscope.diagnosis.inference.terms import AIR, BIAS, LEAK, MADE_UP, ORIFICE, PUMP, Equation
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause
 
 #: Blocks that causes are weighed with: a step is dated by the leak's own test.
@@ -95,7 +96,7 @@ def hypotheses(
 
 def _unlikely(scale: StepTest) -> float:
     """Return minus twice the logarithm of what is believed of a step of the scale, over that of the likeliest one."""
-    size, spread = (priors()["scale"][name].value for name in ("size", "spread"))
+    size, spread = (beliefs("inference")["scale"][name] for name in ("size", "spread"))
     return float(np.log(max(abs(scale.fitted[0]), np.finfo(float).tiny) / size) / spread) ** 2
 
 
@@ -132,16 +133,16 @@ def probabilities(
     """
     if not tested:
         return {}
-    beliefs, scores, beside = priors()["causes"], dict[Cause, float](), dict[Cause, float]()
+    believed, scores, beside = beliefs("inference")["causes"], dict[Cause, float](), dict[Cause, float]()
     for each in reversed(tested):
         scores[each.cause], beside[each.cause] = each.test.score, each.beside
     if other is not None and _coincides(tested[0].test, other):
         own = max(scores.values()) if other.cause == "changed duty" else max(scores.get(other.cause, 0.0), 0.0)
-        slowed = min(max(share, 0.0) / priors()["worth"]["share"].value, 1.0)
+        slowed = min(max(share, 0.0) / beliefs("inference")["worth"]["share"], 1.0)
         scores[other.cause] = own + other.score * (1.0 - slowed if other.cause == "friction change" else 1.0)
-    temper = 2.0 * (1.0 + beliefs["model"].value * max(*scores.values(), 0.0))
+    temper = 2.0 * (1.0 + believed["model"] * max(*scores.values(), 0.0))
     logs = {
-        cause: float(np.log(beliefs["leak" if cause in (*LEAKS, "pump leak") else cause].value))
+        cause: float(np.log(believed["leak" if cause in (*LEAKS, "pump leak") else cause]))
         + score / temper
         + 0.5 * beside.get(cause, 0.0)
         for cause, score in scores.items()

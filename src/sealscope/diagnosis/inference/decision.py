@@ -6,7 +6,7 @@
 
 `leak` where one of them is answered with yes at its share of the false-alarm probability, and a leak past piston or
 pump is the most probable of all causes; `no leak` with the 95 % bound X where X is below the leak worth finding
-(`terms.toml`); else `cannot tell` with X. Nothing changes the verdict afterwards.
+(`priors.toml`); else `cannot tell` with X. Nothing changes the verdict afterwards.
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, information, mean_of, zero_of
 from sealscope.diagnosis.inference.causes import StepHypothesis, hypotheses, probabilities
 from sealscope.diagnosis.inference.causes import stepped as stepped_cause
 from sealscope.diagnosis.inference.onset import Course, Information, Interval, StepTest, course, step_test
 from sealscope.diagnosis.inference.other_steps.step import OtherStep, other_step
 from sealscope.diagnosis.inference.scatter import Rise, Taught, rise
-from sealscope.diagnosis.inference.terms import LAG, ORIFICE, PUMP, Equation, priors
+from sealscope.diagnosis.inference.terms import LAG, ORIFICE, PUMP, Equation
 from sealscope.diagnosis.verdict.evidence import (
     LEAKS,
     NO_RIG,
@@ -183,25 +184,25 @@ def _size(balance: RecordedBalance) -> Size:
     where both are stated and disagree the flow lies between what either says.
     """
     column, rig = balance.columns[0], balance.rig
-    beliefs = priors()["size"]
+    believed = beliefs("inference")["size"]
     with_unit = not {("theta", "count"), ("omega", "count"), ("u", "count")} & balance.units
     pressures = not {("p_A", "count"), ("p_B", "count")} & balance.units
     states_displacement = rig.states("pump.q_b") and with_unit
     if len(balance.columns) > 1:  # behind a valve the area sizes the flow
-        return Size(1.0, beliefs["area"].value, rig.states("cylinder.A_A", "cylinder.A_B") and pressures, None, None)
+        return Size(1.0, believed["area"], rig.states("cylinder.A_A", "cylinder.A_B") and pressures, None, None)
     motion = [k for k in column.motion if column.names[k].startswith("motion")]
     area = _area(balance, motion) if motion and ("x", "m") in balance.units else None
     if area is None or not area.measured > 0.0 or not with_unit:
-        return Size(1.0, beliefs["displacement"].value, states_displacement and pressures, None, None)
+        return Size(1.0, believed["displacement"], states_displacement and pressures, None, None)
     ratio = Interval(*(area.assumed / end for end in (area.measured, area.high, max(area.low, 1e-12))))
     apart = abs(1.0 / ratio.value - 1.0)
-    known = float(np.hypot(beliefs["displacement"].value, beliefs["area"].value))
+    known = float(np.hypot(believed["displacement"], believed["area"]))
     if states_displacement:
         disagrees = rig.states("cylinder.A_A", "cylinder.A_B") and apart > _95 * known
-        deviation = apart if disagrees else beliefs["displacement"].value
+        deviation = apart if disagrees else believed["displacement"]
         return Size(1.0, deviation, pressures, ratio, area.measured, disagrees)
     if rig.states("cylinder.A_A", "cylinder.A_B"):
-        return Size(ratio.value, beliefs["area"].value, pressures, ratio, area.measured)
+        return Size(ratio.value, believed["area"], pressures, ratio, area.measured)
     return Size(1.0, known, False, ratio, area.measured)
 
 
@@ -241,7 +242,7 @@ def judge(balance: RecordedBalance, probability: float, baseline: Sequence[Taugh
     if answered is None:
         judging = questions[0]
         bound = bound_of(balance, against)
-        enough = balance.moving > 0.0 and bound <= priors()["worth"]["share"].value * balance.moving
+        enough = balance.moving > 0.0 and bound <= beliefs("inference")["worth"]["share"] * balance.moving
         enough &= sum(causes.get(own, 0.0) for own in LEAKS) < 1.0 - _SURE  # a change that may as well be a leak
         cause = stepped_cause(balance.hypotheses, RAREST, balance.other)
         evidence = Evidence("no leak" if enough else "cannot tell", "", cause=None if cause in LEAKS else cause)
@@ -346,7 +347,7 @@ def _flow(balance: RecordedBalance, evidence: Evidence, value: float, deviation:
     """Return the evidence with the flow [m^3/s] of a leak and its deviation, as far as the machine's size is known."""
     size = balance.size
     pump = balance.mean(2)
-    half = _95 * float(np.linalg.norm([deviation, value * size.deviation, value * priors()["size"]["law"].value]))
+    half = _95 * float(np.linalg.norm([deviation, value * size.deviation, value * beliefs("inference")["size"]["law"]]))
     low, high = max(value - half, 0.0), value + half
     relative = RelativeLeak(
         pump_share=value / pump if pump > 0.0 else None,
@@ -372,7 +373,7 @@ def bound_of(balance: RecordedBalance, against: Rise | None) -> float:
         bounds.append((against.value + against.threshold(0.05) * against.deviation) * balance.mean(0))
     elif balance.test is not None:
         bounds.append(balance.test.bound() * balance.mean(0))
-    size = float(np.hypot(balance.size.deviation, priors()["size"]["law"].value))
+    size = float(np.hypot(balance.size.deviation, beliefs("inference")["size"]["law"]))
     return max(max(bounds, default=np.inf), 0.0) * (1.0 + _ONE_SIDED * size)
 
 
@@ -498,7 +499,7 @@ def _reason(balance: RecordedBalance, evidence: Evidence, bound: float, question
     size = balance.size
     if size.ratio is not None and size.disagrees:
         text += f"; displacement over area is {size.ratio.value:.3g} times the assumed one: flows lie between both"
-    if abs(balance.zero) > 2.0 * _95 * priors()["zero"]["pressure"].value:
+    if abs(balance.zero) > 2.0 * _95 * beliefs("inference")["zero"]["pressure"]:
         text += f"; p_A - p_B reads {abs(balance.zero) / 1e5:.2g} bar too {'much' if balance.zero > 0.0 else 'little'}"
     if (late := balance.delay) is not None and abs(late[0]) > 1.0 / balance.recording.rate + _95 * late[1]:
         text += f"; x is recorded {1e3 * abs(late[0]):.3g} ms {'later' if late[0] > 0.0 else 'earlier'} than the flow"

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.balance import blocks_of, shortest
 from sealscope.diagnosis.inference.blocks import Columns
 from sealscope.diagnosis.inference.circuit.store import lost_beside
 from sealscope.diagnosis.inference.circuit.without_position import circulations
 from sealscope.diagnosis.inference.decision import RecordedBalance, bound_of, judge
 from sealscope.diagnosis.inference.scatter import Rise, Taught, motion_change, rise
-from sealscope.diagnosis.inference.terms import CYLINDER, LOCKED, circulation, equations, locked, priors
+from sealscope.diagnosis.inference.terms import CYLINDER, LOCKED, circulation, equations, locked
 from sealscope.diagnosis.inference.weak_form import STRIDE, stride_samples
 from sealscope.diagnosis.learnt import Healthy, Lesson, lessons_of
 from sealscope.diagnosis.verdict.evidence import Evidence
@@ -37,7 +38,8 @@ RESOLVED = 2
 
 def made_good(balance: RecordedBalance) -> bool:
     """Whether the pump surely delivers what any pump loses: a loop brings the piston back, or holds it."""
-    return balance.level.low * balance.mean(0) > priors()["held"]["share"].value * balance.mean(2)
+    least: float = beliefs("inference")["held"]["share"]
+    return balance.level.low * balance.mean(0) > least * balance.mean(2)
 
 
 class VolumeBalance:

@@ -12,7 +12,7 @@ and e_j ~ N(0, sigma^2). With r_j the rise of recording j of n against the n - 1
 for a judged recording of session k, q = sigma^2 / (sigma^2 + n_k tau^2); of a new session n_k = m_k = 0 and q = 1.
 tau has a half-normal prior, sigma^2 a scaled inverse chi square one (s_0, nu_0); with the restricted likelihood of what
 is observed, the rise is a mixture over both. Where all are of a single session, d^2 = sigma^2 (1 + 1/n), and t is
-Student's with nu_0 + n - 1 degrees of freedom. What is believed stands in `terms.toml`: between sessions leakage goes
+Student's with nu_0 + n - 1 degrees of freedom. What is believed stands in `priors.toml`: between sessions leakage goes
 with the inverse of the oil's viscosity, in proportion to its level. Recordings without a date are of one session. Where
 the oil's temperature T is known of all, what it makes of the level is taken off, and only that factor's error remains.
 
@@ -26,8 +26,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, solve, total
-from sealscope.diagnosis.inference.terms import priors
 from sealscope.diagnosis.inference.weak_form import LARGEST
 from sealscope.recordings.recording import Array
 
@@ -117,17 +117,17 @@ class Taught(NamedTuple):
 def rise(judged: Taught, baseline: Sequence[Taught], columns: Sequence[Columns]) -> Rise:
     """Return how far the leak's coefficient of a recording is beyond that of healthy recordings of the same machine."""
     everything, count = np.sum([own.sums for own in baseline], axis=0), len(baseline)
-    beliefs, by_flow = priors()["scatter"], judged.flow / judged.pressure if judged.pressure > 0.0 else 0.0
+    believed, by_flow = beliefs("inference")["scatter"], judged.flow / judged.pressure if judged.pressure > 0.0 else 0.0
     apart = np.array([_rise(own.sums, everything - own.sums, columns) for own in baseline] if count > 1 else [0.0])
     *by_oil, warmer, oil = _of_oil([*baseline, judged], *_level(everything, columns))
     value, deviations = _rise(judged.sums, everything, columns) - warmer, apart * ((count - 1) / count) - by_oil
     *of_baseline, of_judged = sessions = _sessions([*baseline, judged])
     if len(set(sessions)) == 1:
-        return student(value, deviations * (count / max(count - 1, 1)), beliefs["leak"].value * by_flow)
+        return student(value, deviations * (count / max(count - 1, 1)), believed["leak"] * by_flow)
     members = [deviations[np.equal(of_baseline, session)] for session in dict.fromkeys(of_baseline)]
     at = list(dict.fromkeys(of_baseline)).index(of_judged) if of_judged in of_baseline else None
-    believed = beliefs["leak"].value * by_flow, float(np.hypot(oil, beliefs["session"].value * by_flow))
-    return _between_sessions(value, members, at, *believed)
+    scales = believed["leak"] * by_flow, float(np.hypot(oil, believed["session"] * by_flow))
+    return _between_sessions(value, members, at, *scales)
 
 
 def _between_sessions(value: float, members: Sequence[Array], at: int | None, usual: float, apart: float) -> Rise:
@@ -137,7 +137,7 @@ def _between_sessions(value: float, members: Sequence[Array], at: int | None, us
     session, None for a new one; `usual` within a session, and how far sessions are `apart`, as believed.
     """
     sizes, means = np.array([len(own) for own in members]), np.array([own.mean() for own in members])
-    count, weight = int(sizes.sum()), priors()["scatter"]["freedom"].value
+    count, weight = int(sizes.sum()), beliefs("inference")["scatter"]["freedom"]
     squares = weight * usual**2 + float(sum(((own - own.mean()) ** 2).sum() for own in members))
     everything = float(sum((own**2).sum() for own in members))
     least, most = 0.1 * np.sqrt(squares / (weight + count)), 100.0 * np.sqrt(squares + everything)
@@ -165,7 +165,7 @@ def _between_sessions(value: float, members: Sequence[Array], at: int | None, us
 
 def _sessions(taught: Sequence[Taught]) -> list[int]:
     """Return the session of each recording: a number of its own after every gap in which the oil may have warmed."""
-    apart = 3600.0 * priors()["oil"]["shift"].value
+    apart = 3600.0 * beliefs("inference")["oil"]["shift"]
     dates = sorted(own.start_s for own in taught if own.start_s is not None)
     begins = [date for before, date in zip([-np.inf, *dates], dates, strict=False) if date - before > apart]
     return [-1 if own.start_s is None else int(np.searchsorted(begins, own.start_s, "right")) for own in taught]
@@ -176,13 +176,13 @@ def _of_oil(taught: Sequence[Taught], level: float, error: float) -> list[float]
 
     Last the deviation of the last one's: what may still differ, as far as the `level` within its `error` goes.
     """
-    beliefs = priors()["oil"]
+    believed = beliefs("inference")["oil"]
     known = [own.oil_degC for own in taught if own.oil_degC is not None]
     if len(known) < len(taught):  # the difference of two sessions has twice the variance of each
-        return [0.0] * len(taught) + [0.5**1.5 * (beliefs["warmest"].value - 1.0) * (level + error)]
+        return [0.0] * len(taught) + [0.5**1.5 * (believed["warmest"] - 1.0) * (level + error)]
     warmer = np.array(known) - np.mean(known[:-1])
-    factor = np.exp(beliefs["per_kelvin"].value * warmer)
-    deviation = beliefs["per_kelvin_deviation"].value * abs(warmer[-1]) * factor[-1] * (level + error)
+    factor = np.exp(believed["per_kelvin"] * warmer)
+    deviation = believed["per_kelvin_deviation"] * abs(warmer[-1]) * factor[-1] * (level + error)
     return [*(level * (factor - factor[:-1].mean())).tolist(), float(np.hypot(deviation, error * (factor[-1] - 1.0)))]
 
 
@@ -215,7 +215,7 @@ def motion_change(judged: Array, baseline: Sequence[Array], columns: Columns) ->
 
     at = [chosen.index(k) for k in motion]
     apart = [logarithm(own, everything - own) for own in baseline] if len(baseline) > 1 else [0.0]
-    return student(logarithm(judged, everything), apart, priors()["between"]["motion"].value)
+    return student(logarithm(judged, everything), apart, beliefs("inference")["between"]["motion"])
 
 
 def student(value: float, apart: Sequence[float] | Array, believed: float) -> Rise:
@@ -223,9 +223,9 @@ def student(value: float, apart: Sequence[float] | Array, believed: float) -> Ri
 
     `believed`: what is believed of the scatter beforehand.
     """
-    beliefs, count = priors()["scatter"], len(apart)
-    squares = beliefs["freedom"].value * believed * believed
-    freedom = beliefs["freedom"].value + count - 1
+    width, count = beliefs("inference")["scatter"], len(apart)
+    squares = width["freedom"] * believed * believed
+    freedom = width["freedom"] + count - 1
     if count > 1:
         squares += float(np.sum(np.square(apart))) * ((count - 1) / count) ** 2
     deviation = np.sqrt(squares / freedom * (1.0 + 1.0 / count))

@@ -9,17 +9,15 @@ f_j and g_j are functions of the recorded channels. A term gives its increment f
 that nothing is differentiated (`weak_form`). Behind a servo valve each chamber has a balance of its own, whose left
 side is what the piston displaces and whose terms are the orifice flows of the valve's edges; G is the same in both.
 
-What is believed of a term is in `terms.toml`: how fast its coefficient may drift, each with unit and source.
+What is believed of a term is in `priors.toml`: how fast its coefficient may drift, each with unit and source.
 
 Source: Merritt, Hydraulic Control Systems, 1967, sections 5.2 and 6.3 (continuity of the chambers, flow of the edges).
 """
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Mapping
-from functools import cache, cached_property
-from importlib.resources import files
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -36,21 +34,6 @@ ATMOSPHERE = 101325.0
 LEAST_ABSOLUTE = 2e4
 #: Half the time over which the direction of motion is taken [s]: a few counts of an encoder at slow motion.
 HALF_DIFFERENCE = 0.025
-
-
-class Prior(NamedTuple):
-    """A belief: value, unit and source, as `terms.toml` states it."""
-
-    value: float
-    unit: str
-    source: str
-
-
-@cache
-def priors() -> Mapping[str, Mapping[str, Prior]]:
-    """Return what is believed of the terms, and between recordings, by table and name."""
-    tree = tomllib.loads((files("sealscope.diagnosis.inference") / "terms.toml").read_text("utf-8"))
-    return {table: {name: Prior(**row) for name, row in rows.items()} for table, rows in tree.items()}
 
 
 class Signals:
@@ -200,7 +183,7 @@ class Term(NamedTuple):
 
     `increments` gives f dg over each sampling interval, shape (n - 1,); `unit` is that of its coefficient; `cause` is
     what a step of the coefficient means; `nuisance`: the coefficient is unknown in any machine and drifts as `drift`
-    allows (a table of `terms.toml`), else it is zero unless that cause is present; `needs`: channels; `driven`: by a
+    allows (a table of `priors.toml`), else it is zero unless that cause is present; `needs`: channels; `driven`: by a
     "pressure" or by its "root", so that a zero of the sensors acts on the flow.
     """
 
@@ -218,7 +201,7 @@ class Term(NamedTuple):
 class Equation(NamedTuple):
     """A balance: what gives the increments of its left side [m^3], and its terms, with those of the leak last.
 
-    `healthy`: what is believed of a healthy machine's leak (a row of `terms.toml`), where that says more than nothing;
+    `healthy`: what is believed of a healthy machine's leak (a row of `priors.toml`), where that says more than nothing;
     `drive`: what makes a speed of the command, and `START`, where none is recorded; `takes`: 1 where a flow into A is
     positive on the left, -1 where it is negative.
     """

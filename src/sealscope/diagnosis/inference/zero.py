@@ -23,9 +23,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, cost_of_zero, pair
 from sealscope.diagnosis.inference.onset import FEWEST, WALKS
-from sealscope.diagnosis.inference.terms import priors
 from sealscope.recordings.recording import Array
 
 #: Blocks that the zero is estimated from; neighbours are added up beyond.
@@ -48,7 +48,7 @@ def about_zero(blocks: Blocks, columns: Sequence[Columns]) -> Blocks:
     if effects is None:
         return blocks
     within, offset, z = effects
-    usual, far = (priors()["zero"][name].value for name in ("pressure", "far"))
+    usual, far = (beliefs("inference")["zero"][name] for name in ("pressure", "far"))
     width = columns[0].zero(columns[0].leak, blocks)
     walks = WALKS[: int(_likelihoods(within, z, WALKS).argmax()) + 1]
 

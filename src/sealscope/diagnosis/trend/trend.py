@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sealscope.calls import checked_call
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Interval
-from sealscope.diagnosis.inference.terms import priors
 from sealscope.diagnosis.trend.reading import (
     DAY,
     Basis,
@@ -325,7 +325,7 @@ def _levels(trend: Trend, readings: Sequence[LeakReading]) -> tuple[Levels, DayT
     warmer, slope_sd = np.zeros(t.size), 0.0
     temperatures = [reading.temperature for reading in readings if reading.temperature is not None]
     if trend.basis != "ringing" and len(temperatures) == t.size:
-        slope, deviation = (priors()["oil"][name].value for name in ("per_kelvin", "per_kelvin_deviation"))
+        slope, deviation = (beliefs("inference")["oil"][name] for name in ("per_kelvin", "per_kelvin_deviation"))
         warmer, slope_sd = np.array(temperatures) - temperatures[0], deviation * abs(usual)
         value, error = (own * np.exp(-slope * warmer) for own in (value, error))
     flows = trend.pressure is not None

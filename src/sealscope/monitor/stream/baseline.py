@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from sealscope.diagnosis.beliefs import beliefs
-from sealscope.diagnosis.inference.terms import priors
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,7 @@ class WatchBaseline:
         """
         from scipy.special import ndtri
 
-        warmest = priors()["oil"]["warmest"].value
+        warmest = beliefs("inference")["oil"]["warmest"]
         ceiling = warmest * max(self.low, 0.0)
         score, threshold = (g - ceiling) / deviation, -float(ndtri(probability))
         if score <= threshold:

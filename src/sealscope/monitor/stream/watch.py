@@ -23,7 +23,6 @@ from sealscope.diagnosis.inference.live.balance import (
     Shown,
 )
 from sealscope.diagnosis.inference.live.sequential import RECENT, StepDetector, probability_of
-from sealscope.diagnosis.inference.terms import priors
 from sealscope.errors import InputError
 from sealscope.monitor.stream.baseline import BaselineLearning, WatchBaseline, WatchedRise, within
 from sealscope.monitor.stream.estimates import BlockEstimate, WatchedLeak
@@ -269,7 +268,7 @@ class Watch:
         if self.leak is not None or self.baseline is None:
             return
         # what all conductances are off by is in the ceiling that many times
-        deviation = math.hypot(sd, offset * (priors()["oil"]["warmest"].value - 1.0))
+        deviation = math.hypot(sd, offset * (beliefs("inference")["oil"]["warmest"] - 1.0))
         rise = self.baseline.rise(at, g, deviation, self._probability("level", GROUP * self.block_seconds))
         if rise is not None:
             self._raise(rise, block, self.baseline.level)
@@ -320,9 +319,9 @@ class Watch:
     ) -> tuple[float, float, float]:
         """Return the conductance since the onset of a leak, and its interval, in which the oil may have warmed."""
         recent = [row[1] for row in self._last if row[0] - self.block_seconds >= leak.onset_interval_s[1]][-_RECENT:]
-        now, oil = float(np.mean(recent or [block.g])), priors()["oil"]
+        now, oil = float(np.mean(recent or [block.g])), beliefs("inference")["oil"]
         hours = max(0.0, block.end - leak.onset_s) / 3600.0
-        warmed = oil["warmest"].value ** min(1.0, hours / oil["shift"].value)
+        warmed = oil["warmest"] ** min(1.0, hours / oil["shift"])
         before, rise = max(leak.before, 0.0), now - leak.before
         spread = 1.96 * math.hypot(sd / math.sqrt(max(len(recent), 1)), leak.before_sd, own.size_error * rise)
         return rise, own.inside * (now - before * warmed - spread), now - before / warmed + spread

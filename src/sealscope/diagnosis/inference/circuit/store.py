@@ -6,7 +6,7 @@ the side that does not carry, what has been given off by the middle of block k i
     y_k = -V p_k/(n p_charge) - (A_A - A_B) x_k = y_0 + sum_j g_j P_j tau (1 or 1/2) + w t + v t^2 + noise,
 
 with the conductance g_j to the outside, P_j the pressure that drives it, w and v the warmth that is believed
-(`terms.toml`). A level is known to the noise of a mean: its changes tell what 5 s of rates do not.
+(`priors.toml`). A level is known to the noise of a mean: its changes tell what 5 s of rates do not.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.balance import whole_samples
 from sealscope.diagnosis.inference.onset import FEWEST, Information, StepTest, step_test
-from sealscope.diagnosis.inference.terms import ATMOSPHERE, Signals, priors
+from sealscope.diagnosis.inference.terms import ATMOSPHERE, Signals
 from sealscope.recordings.cycle import cycle_of, fundamental
 from sealscope.recordings.recording import Array, Recording
 
@@ -103,9 +104,9 @@ def _information(level: Array, pressure: Array, length: float, begin: float) -> 
     time = (np.arange(count) + 0.5) * length
     flows = (np.tril(np.ones((count, count)), -1) + 0.5 * np.eye(count)) * pressure * length
     noise = float(np.mean(np.diff(level, 2) ** 2)) / 6.0
-    warmth = priors()["level"]["gas"].value * np.column_stack([time, time**2 / time[-1]])
+    warmth = beliefs("inference")["level"]["gas"] * np.column_stack([time, time**2 / time[-1]])
     weight = np.linalg.inv(max(noise, np.finfo(float).tiny) * np.eye(count) + warmth @ warmth.T)
     weight -= np.outer(weight.sum(axis=0), weight.sum(axis=1)) / weight.sum()
-    healthy = priors()["healthy"]["outside"].value
+    healthy = beliefs("inference")["healthy"]["outside"]
     precision, vector = flows.T @ weight @ flows, flows.T @ weight @ level
     return Information(np.asarray(begin + time, dtype=float), 0.5 * (precision + precision.T), vector, healthy, healthy)

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.control.drive import Drive
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.balance import LONGEST, pressure_parts, whole_samples
 from sealscope.diagnosis.inference.blocks import SMOOTHED, Blocks, Columns, Weighting
 from sealscope.diagnosis.inference.circuit.store import cycle_length, lost_oil
@@ -37,7 +38,6 @@ from sealscope.diagnosis.inference.terms import (
     Signals,
     circulation,
     locked,
-    priors,
 )
 from sealscope.recordings.recording import Array, Recording
 
@@ -128,7 +128,7 @@ def _held(speed: Array, rate: float, area: float = 0.0) -> NDArray[np.bool_]:
     size, settles = max(1, round(AVERAGED * rate)), max(1, round(SETTLES * rate))
     slow = np.abs(np.convolve(speed, np.full(size, 1.0 / size), "same"))
     finite = np.isfinite(slow)
-    limit = max(SLOW * slow[finite].max(initial=0.0), priors()["held"]["creep"].value * area)
+    limit = max(SLOW * slow[finite].max(initial=0.0), beliefs("inference")["held"]["creep"] * area)
     moves = ~finite | (slow > limit)
     return np.asarray(np.convolve(moves, np.ones(settles))[: speed.size] == 0)
 
@@ -151,7 +151,7 @@ def _blocks(
     _less_the_zero(rows.values, [term.name for term in equation.terms])
     if carries:
         side = _rows([signals.carried_by_A[1:] / rate], counts, half, rate).values[:, 0]
-        one_side = np.minimum(side, 1.0 - side) < priors()["held"]["elsewhere"].value
+        one_side = np.minimum(side, 1.0 - side) < beliefs("inference")["held"]["elsewhere"]
         rows = rows._replace(whole=rows.whole & one_side)
     each = 2 if half > HELD else round(2.0 * LONGEST / half)
     parts = [slice(k * each, (k + 1) * each) for k in range(len(rows.time) // each)]
@@ -190,7 +190,7 @@ def _rows(increments: list[Array], counts: NDArray[np.bool_], half: float, rate:
 
 def _less_the_zero(values: Array, names: list[str]) -> None:
     """Take from the mean pressure difference of each row what zeros of the sensors may have made."""
-    zero = _95 * priors()["zero"]["pressure"].value
+    zero = _95 * beliefs("inference")["zero"]["pressure"]
     mean = values[:, names.index(LEAK)]
     share = np.maximum(1.0 - (zero / np.maximum(np.abs(mean), zero)) ** 2, 0.0)
     for name in (LEAK, ORIFICE):

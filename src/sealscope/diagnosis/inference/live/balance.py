@@ -30,7 +30,7 @@ from sealscope.diagnosis.inference.live.known import (
     says,
     take,
 )
-from sealscope.diagnosis.inference.terms import Equation, equations, priors
+from sealscope.diagnosis.inference.terms import Equation, equations
 from sealscope.diagnosis.inference.weak_form import stride_samples
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
@@ -275,7 +275,7 @@ def _valved(rig: Rig) -> bool:
 
 def size_error(rig: Rig) -> float:
     """Return how far a flow by the rig's size is known, relative."""
-    return priors()["size"]["area" if _valved(rig) else "displacement"].value
+    return float(beliefs("inference")["size"]["area" if _valved(rig) else "displacement"])
 
 
 def live_equations(rig: Rig, names: Sequence[str]) -> list[Equation]:

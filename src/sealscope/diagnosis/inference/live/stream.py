@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.live.balance import BLOCK_SECONDS, BlockConductance, LiveBalance, NotJudged, Shown
 from sealscope.diagnosis.inference.live.sequential import StepDetector, probability_of
-from sealscope.diagnosis.inference.terms import priors
 from sealscope.diagnosis.verdict.evidence import NO_RIG, Cause, Evidence, without_flow
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
@@ -187,7 +187,7 @@ class SequentialBalance:
         if not math.isfinite(bound):
             return _waits("for the next blocks")
         limit = f"{bound:.2g} L/min" if litres else f"{100.0 * bound / pump:.2g} % of the pump's flow"
-        enough = bound <= priors()["worth"]["share"].value * pump
+        enough = bound <= beliefs("inference")["worth"]["share"] * pump
         return Evidence(
             "no leak" if enough else "cannot tell",
             f"no leak above {limit} (95 %)" if enough else f"a leak of up to {limit} would not show (95 %)",

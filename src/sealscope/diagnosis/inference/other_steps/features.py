@@ -16,7 +16,6 @@ import numpy as np
 
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Information
-from sealscope.diagnosis.inference.terms import priors
 from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording
@@ -113,7 +112,7 @@ def features(recording: Recording, wanted: Sequence[Feature] = FEATURES) -> list
         missing = recording.bridged[: count * length].reshape(count, length)
         blocks = {name: np.where(missing, np.nan, values) for name, values in blocks.items()}
     time = recording.t[0] + (np.arange(count) + 0.5) * length / recording.rate
-    wander, shown = priors()["features"]["wander"].value, []
+    wander, shown = beliefs("inference")["features"]["wander"], []
     for feature in wanted:
         values = feature.of(blocks, recording.rate) if feature.needs <= blocks.keys() else None
         if values is not None and np.isfinite(values).all() and np.ptp(values) > 0.0:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.causes import StepHypothesis, probabilities
 from sealscope.diagnosis.inference.causes import stepped as stepped_cause
 from sealscope.diagnosis.inference.decision import AGAINST, SECOND, WITHIN, Question, asked, is_leak
@@ -22,7 +23,6 @@ from sealscope.diagnosis.inference.onset import StepTest, course, step_test
 from sealscope.diagnosis.inference.pressures import response, ring_down
 from sealscope.diagnosis.inference.pressures.evidence import PressureEvidence, priors, states_flow, unusable
 from sealscope.diagnosis.inference.scatter import Rise, student
-from sealscope.diagnosis.inference.terms import priors as terms_priors
 from sealscope.diagnosis.learnt import Healthy, Lesson, lessons_of
 from sealscope.diagnosis.verdict.evidence import LEAKS, NO_RIG, RAREST, Cause, Evidence, LeakCourse, Passage
 from sealscope.recordings.recording import Recording
@@ -142,7 +142,7 @@ def judge(own: PressureReading, probability: float, levels: Sequence[float] = ()
     judging = answered or questions[0]
     bound = max(against.interval(0.9)[1], 0.0) if against is not None else (test.bound() if test is not None else 0.0)
     if answered is None:
-        worth = bound * float(own.evidence.pressure.mean()) <= terms_priors()["worth"]["share"].value * own.flow
+        worth = bound * float(own.evidence.pressure.mean()) <= beliefs("inference")["worth"]["share"] * own.flow
         enough = worth and sum(causes.get(cause, 0.0) for cause in LEAKS) < 1.0 - _SURE
         cause = stepped_cause(own.hypotheses, RAREST)
         evidence = Evidence("no leak" if enough else "cannot tell", "", cause=None if cause in LEAKS else cause)
