@@ -90,3 +90,14 @@ def test_mean_flow_from_pressures_and_command(law: str) -> None:
     assert evidence.leak_interval_lpm is not None
     assert evidence.leak_interval_lpm[0] <= result.truth.mean_leak_lpm <= evidence.leak_interval_lpm[1]
     assert evidence.onset_s == pytest.approx(ONSET, abs=4.0)
+
+
+def test_pressures_that_hardly_vary_leave_the_size_as_it_is() -> None:
+    """A laminar leak passes for an orifice whose zero is off: its flow is counted about that zero."""
+    leak = "0.1 L/min from 60 s"
+    result = simulate_with_truth(
+        Experiment.of(rig="single-rod-eha", command="2 sin(6t)", duration=120.0, leak=leak, seed=1)
+    )
+    evidence = VolumeBalance(load_rig("single-rod-eha")).examine(result.recording, [], 0.01)
+    assert evidence.verdict == "leak"
+    assert evidence.leak_lpm == pytest.approx(0.1, rel=0.03)

@@ -15,6 +15,7 @@ from sealscope.recordings.recording import Recording
 from sealscope.simulation.simulate import simulate
 
 RATE, SECONDS = 200.0, 120.0
+CHANCE = 0.01
 T = np.arange(round(RATE * SECONDS)) / RATE
 LATE = T >= 60.0
 
@@ -57,7 +58,7 @@ STEPS: dict[str, tuple[dict[str, np.ndarray], str | None]] = {
 @pytest.mark.parametrize("kind", STEPS)
 def test_each_step_has_its_cause_and_its_time(kind: str) -> None:
     changed, cause = STEPS[kind]
-    step = other_step(machine(**changed))
+    step = other_step(machine(**changed), CHANCE)
     assert (None if step is None else step.cause) == cause
     assert step is None or abs(step.onset - 60.0) < 6.0
 
@@ -70,7 +71,7 @@ def test_units_and_sides_do_not_matter() -> None:
     )
     swapped = replace(recording, channels={**recording.channels, "p_A": recording["p_B"], "p_B": recording["p_A"]})
     for other in (counts, swapped):
-        assert sorted(test.score for test in level_tests(other)) == pytest.approx(sorted(scores), rel=0.02)
+        assert sorted(test.score for test in level_tests(other)) == pytest.approx(sorted(scores), rel=0.05)
 
 
 CHANGES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -84,7 +85,7 @@ CHANGES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 def test_another_reading_is_a_sensor_fault(kind: str, names: tuple[str, ...]) -> None:
     recording = machine()
     changed = {name: np.where(LATE, CHANGES[kind](recording[name]), recording[name]) for name in names}
-    step = other_step(replace(recording, channels={**recording.channels, **changed}))
+    step = other_step(replace(recording, channels={**recording.channels, **changed}), CHANCE)
     assert step is not None
     assert step.cause == "sensor fault"
 
@@ -93,7 +94,7 @@ def test_swapped_sensors_are_a_sensor_fault() -> None:
     recording = machine()
     p_A, p_B = recording["p_A"], recording["p_B"]
     changed = {"p_A": np.where(LATE, p_B, p_A), "p_B": np.where(LATE, p_A, p_B)}
-    step = other_step(replace(recording, channels={**recording.channels, **changed}))
+    step = other_step(replace(recording, channels={**recording.channels, **changed}), CHANCE)
     assert step is not None
     assert (step.cause, round(step.onset / 10.0)) == ("sensor fault", 6)
 
@@ -108,17 +109,19 @@ def test_swapped_sensors_are_a_sensor_fault() -> None:
     ],
 )
 def test_faults_of_the_simulated_rig(fault: str, cause: str) -> None:
-    step = other_step(simulate(command="3 sin(4t)", fault=fault, duration="120 s", seed=1))
+    step = other_step(simulate(command="3 sin(4t)", fault=fault, duration="120 s", seed=1), CHANCE)
     assert step is not None
     assert (step.cause, round(step.onset / 10.0)) == (cause, 6)
 
 
-@pytest.mark.parametrize("leak", [(), "0.0042 L/min from 60 s", "0.1 L/min from 60 s"])
+@pytest.mark.parametrize("leak", [(), "0.0042 L/min from 60 s", "0.02 L/min from 60 s"])
 def test_a_leak_moves_none_of_them(leak: str) -> None:
-    assert other_step(simulate(command="3 sin(4t)", leak=leak, duration="120 s", seed=1)) is None
+    recording = simulate(command="3 sin(4t)", leak=leak, duration="120 s", seed=1)
+    assert other_step(recording, CHANCE) is None
 
 
-def test_a_large_leak_slows_the_piston_and_is_a_leak() -> None:
-    recording = simulate(command="3 sin(4t)", leak="0.5 L/min from 60 s", duration="120 s", seed=1)
-    assert other_step(recording) is not None
+@pytest.mark.parametrize("leak", ["0.1 L/min from 60 s", "0.5 L/min from 60 s"])
+def test_a_large_leak_slows_the_piston_and_is_a_leak(leak: str) -> None:
+    recording = simulate(command="3 sin(4t)", leak=leak, duration="120 s", seed=1)
+    assert other_step(recording, CHANCE) is not None
     assert diagnose(recording, quick=True).verdict == "leak"

@@ -148,7 +148,9 @@ class Examination:
                 evidences.append(self.evidence(name))
                 if judging(evidences) is not None:
                     break
-        return judged(evidences, None if self.distrust else other_step(self.recording), self.refusal)
+        return judged(
+            evidences, None if self.distrust else other_step(self.recording, self.false_alarm_probability), self.refusal
+        )
 
 
 def _unusable(detector: Detector, healthy: Healthy) -> str | None:

@@ -80,14 +80,16 @@ def hypotheses(
     tested.append((SCALE, "sensor fault", information(_with_scale(recorded, columns, orifice), columns, orifice)))
     stepped = []
     cost = cost_of_zero(zero_of(blocks, columns))
+    root = 2.0 * float(np.mean(blocks.driving(root=True)))  # dp over d sqrt(p)
+    costs = {LEAK: cost, PUMP: cost, ORIFICE: cost_of_zero(root * zero_of(blocks, columns, orifice))}
     for name, cause, own in tested:
         signs = (1.0,) if cause in (*LEAKS, "pump leak", "external leak") else (1.0, -1.0)
         best = step_test(own, signs)
         if best is not None:
             stored = lost.get(name.removesuffix(MADE_UP)) if cause == "external leak" else None
             beside = 0.0 if stored is None else _agree(best, stored)
-            if name in (LEAK, ORIFICE, PUMP):
-                beside -= cost
+            if name in costs:
+                beside -= costs[name]
             elif name == SCALE:
                 beside -= _unlikely(best)
             stepped.append(StepHypothesis(name, cause, best, beside))
@@ -157,12 +159,12 @@ def _coincides(test: StepTest, other: OtherStep) -> bool:
 
 
 def stepped(tested: Sequence[StepHypothesis], chance: float, other: OtherStep | None = None) -> Cause | None:
-    """Return what stepped beside a leak: the cause that names itself (`other`), else the most probable one.
+    """Return what stepped beside a leak: the most probable cause, what else stepped (`other`) counted.
 
-    That where a step of its term is as rare as `chance` among so many; None where nothing is.
+    That where a step of its term is as rare as `chance` among so many, or it is the other's; None where nothing is.
     """
-    if tested and other is not None and _coincides(tested[0].test, other):
-        return other.cause
-    named = next(iter(probabilities(tested)), None)
+    named = next(iter(probabilities(tested, other)), None)
+    if tested and other is not None and named == other.cause and _coincides(tested[0].test, other):
+        return named
     best = max((own.test for own in tested if own.cause == named), key=lambda test: test.score, default=None)
     return named if best is not None and best.chance * len(tested) < chance else None

@@ -23,9 +23,9 @@ from sealscope.diagnosis.inference.blocks import Blocks, Columns, information, m
 from sealscope.diagnosis.inference.causes import StepHypothesis, hypotheses, probabilities
 from sealscope.diagnosis.inference.causes import stepped as stepped_cause
 from sealscope.diagnosis.inference.onset import Course, Information, Interval, StepTest, course, step_test
-from sealscope.diagnosis.inference.other_steps.step import OtherStep, other_step
+from sealscope.diagnosis.inference.other_steps.step import other_step
 from sealscope.diagnosis.inference.scatter import Rise, Taught, rise
-from sealscope.diagnosis.inference.terms import LAG, ORIFICE, PUMP, Equation
+from sealscope.diagnosis.inference.terms import LAG, LEAK, ORIFICE, PUMP, Equation
 from sealscope.diagnosis.verdict.evidence import (
     LEAKS,
     NO_RIG,
@@ -115,14 +115,14 @@ class RecordedBalance:
         return Taught.of(self.blocks, self.columns, dated, oil)
 
     @cached_property
-    def other(self) -> OtherStep | None:
-        """What stepped in what a leak does not move."""
-        return other_step(self.recording)
-
-    @cached_property
     def zero(self) -> float:
         """Zero of p_A - p_B [Pa], as a change of the leak shows it."""
         return zero_of(self.blocks, self.columns)
+
+    @cached_property
+    def root_zero(self) -> float:
+        """Zero of the root of p_A - p_B [Pa^0.5], as a change of a leak through an orifice shows it."""
+        return zero_of(self.blocks, self.columns, self.columns[0].names.index(ORIFICE))
 
     @cached_property
     def delay(self) -> tuple[float, float] | None:
@@ -137,7 +137,8 @@ class RecordedBalance:
 
     def mean(self, column: int, since: float = -np.inf) -> float:
         """Return a mean over the blocks whose middle is at `since` or later, of pressures about their zero."""
-        values = self.blocks.means[:, 2] if column == 2 else self.blocks.driving(self.zero, root=column == 1)
+        zero = self.root_zero if column == 1 else self.zero
+        values = self.blocks.means[:, 2] if column == 2 else self.blocks.driving(zero, root=column == 1)
         chosen = self.blocks.time >= since
         if not chosen.any():
             chosen[-1] = True
@@ -237,14 +238,16 @@ def judge(balance: RecordedBalance, probability: float, baseline: Sequence[Taugh
     causes: dict[Cause, float] = {}
     if answered is not None and answered.name == WITHIN and test is not None:
         flow, pump = test.fitted[0] * balance.mean(0), balance.mean(2)
-        causes = probabilities(balance.hypotheses, balance.other, flow / pump if pump > 0.0 else 0.0)
+        causes = probabilities(
+            balance.hypotheses, other_step(balance.recording, probability), flow / pump if pump > 0.0 else 0.0
+        )
         answered = answered if is_leak(causes) else None
     if answered is None:
         judging = questions[0]
         bound = bound_of(balance, against)
         enough = balance.moving > 0.0 and bound <= beliefs("inference")["worth"]["share"] * balance.moving
         enough &= sum(causes.get(own, 0.0) for own in LEAKS) < 1.0 - _SURE  # a change that may as well be a leak
-        cause = stepped_cause(balance.hypotheses, RAREST, balance.other)
+        cause = stepped_cause(balance.hypotheses, probability, other_step(balance.recording, probability))
         evidence = Evidence("no leak" if enough else "cannot tell", "", cause=None if cause in LEAKS else cause)
     else:
         judging = answered
@@ -318,12 +321,13 @@ def _step(balance: RecordedBalance, causes: dict[Cause, float]) -> Evidence:
     assert test is not None
     onset = test.onset()
     flows, deviations, scores = [], [], []
-    for own, mean in ((test, 0), (orifice, 1)):
+    beside = {own.name: own.beside for own in balance.hypotheses}
+    for name, own, mean in ((LEAK, test, 0), (ORIFICE, orifice, 1)):
         if own is not None:
             pressure = balance.mean(mean, onset.value)
             flows.append(own.fitted[0] * pressure)
             deviations.append(own.fitted[1] * pressure)
-            scores.append(own.score)
+            scores.append(own.score + beside.get(name, 0.0))
     weights = np.exp(0.5 * (np.array(scores) - max(scores)))
     weights /= weights.sum()
     value = float(weights @ flows)

@@ -325,13 +325,14 @@ def _released(rig: Rig, share: Callable[[Signals], Array | float]) -> Term:
     return Term(AIR, formula, "Pa", released, "air in the oil", nuisance=False, needs=("x", "p_A", "p_B"))
 
 
-def _lost_outside(side: str) -> Term:
+def _lost_outside(side: str, share: float = 1.0) -> Term:
+    """Return what one side loses to the outside; `share`: how far it counts in the balance, and its sign there."""
     name = f"p_{side}"
     return Term(
         f"external leak {side}",
         f"max(p_{side}, 0) dt",
         "m^3/(s Pa)",
-        lambda s: np.maximum(s.mean(name), 0.0) * s.dt,
+        lambda s: share * np.maximum(s.mean(name), 0.0) * s.dt,
         "external leak",
         nuisance=False,
         needs=(name,),
@@ -470,7 +471,8 @@ def _chamber(side: str, rig: Rig) -> Equation:
     of a healthy piston tells them apart, and so friction that changes from a leak.
     """
     area = rig.cylinder.A_A if side == "A" else rig.cylinder.A_B
-    terms = (*_edges(side), *_of_side(side), _BIAS, _released(rig, lambda s: float(side == "A")), *_LEAKS)
+    lost = (_lost_outside("A", float(side == "A")), _lost_outside("B", -float(side == "B")))
+    terms = (*_edges(side), *_of_side(side), _BIAS, _released(rig, lambda s: float(side == "A")), *lost, *_LEAKS)
     return Equation(f"chamber {side}", lambda s: -area * s.step("x"), terms, "piston", takes=-1.0)
 
 

@@ -24,6 +24,8 @@ _BELIEVED = beliefs("inference.other_steps")["features"]
 BLOCKS, ORDER = _BELIEVED["blocks"], _BELIEVED["order"]
 #: What commands the motion, and what moves, in the order of preference.
 COMMANDS, MOTIONS = ("x_d", "u", "omega", "theta"), ("x", "theta", "omega", "u")
+#: Bins of a spectrum beyond the main lobe of a line, by a Hann window.
+_BESIDE = (3.0, 4.0, 5.0)
 _Blocks = dict[str, Array]
 
 
@@ -56,14 +58,16 @@ def _noise(sign: float, blocks: _Blocks, rate: float) -> Array:
 
 
 def _hum(hertz: float, blocks: _Blocks, rate: float) -> Array | None:
-    """Return the power of p_A + p_B at a frequency, the mean of four pieces of a block."""
-    if not hertz < 0.45 * rate:
+    """Return the power of p_A + p_B in a line, over that beside it: ringing is wider than a line."""
+    length = blocks["p_A"].shape[1]
+    bins = np.array([0.0, *_BESIDE, *np.negative(_BESIDE)])
+    if not hertz + _BESIDE[-1] * rate / length < 0.45 * rate:
         return None
-    length = blocks["p_A"].shape[1] // 4
-    values = (blocks["p_A"] + blocks["p_B"])[:, : 4 * length].reshape(-1, 4, length)
-    window = np.hanning(length) * np.exp(-2j * np.pi * hertz / rate * np.arange(length))
-    power = np.abs((values - values.mean(axis=2, keepdims=True)) @ window) ** 2
-    return np.asarray(np.log(power.mean(axis=1)))
+    values = blocks["p_A"] + blocks["p_B"]
+    turns = np.outer(np.arange(length), hertz / rate + bins / length)
+    window = np.hanning(length)[:, None] * np.exp(-2j * np.pi * turns)
+    power = np.log(np.abs((values - values.mean(axis=1, keepdims=True)) @ window) ** 2)
+    return np.asarray(power[:, 0] - power[:, 1:].mean(axis=1))
 
 
 def _sense(blocks: _Blocks, rate: float) -> Array | None:

@@ -1,9 +1,10 @@
 """What else the chamber pressures show: friction, load and sensors, by their levels in either direction of motion.
 
-Of each block four numbers are taken, the mean of each chamber's pressure over both directions and half of what it
-differs by between them,
+Of each block four numbers are taken, of what moves: the level of each chamber's pressure, and half of what it differs
+by between the directions. The force of the piston goes with speed, acceleration and position as well, throughout a
+recording alike,
 
-    p_i = level_i + half_i sign(v),    i = A, B.
+    p_i = level_i + half_i sign(v) + b_i v + c_i dv/dt + d_i x,    i = A, B.
 
 A leak between the chambers moves none of them: the force that the piston needs sets their difference, the oil that is
 enclosed their mean. Another cause moves some of them together, at one instant and in a known pattern: each pattern, a
@@ -18,6 +19,7 @@ a coefficient more costs log K (G. Schwarz, Ann. Statist. 6 (1978) 461).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -27,9 +29,11 @@ from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Information, two_sided
 from sealscope.diagnosis.inference.terms import HALF_DIFFERENCE
 from sealscope.diagnosis.verdict.evidence import Cause
+from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording
 
 _RANK = 1e-9  # directions that carry less than this share of the largest carry nothing
+_TINY = float(np.finfo(float).tiny)
 #: Oil that is lost lowers both levels; what raises them has many causes.
 CHARGE = "a loss of oil"
 
@@ -61,40 +65,67 @@ class Level(NamedTuple):
     block: float
 
 
-def directions(recording: Recording) -> Array | None:
-    """Return the direction of motion at each sample, 1, -1 or 0; None where no channel shows it."""
+def _motion(recording: Recording) -> Array | None:
+    """Return speed, acceleration and, of a recorded position, position (n, 2 or 3); None where no channel shows them.
+
+    Each in a unit of its own size.
+    """
     name = next((name for name in ("x", "theta", "omega", "u") if name in recording), None)
-    if name not in ("x", "theta"):
-        return None if name is None else np.asarray(np.sign(recording[name]))
+    if name is None:
+        return None
     half = max(1, round(HALF_DIFFERENCE * recording.rate))
-    padded = np.pad(recording[name], half, mode="edge")
-    return np.asarray(np.sign(padded[2 * half :] - padded[: -2 * half]))
+    speed = _slope(recording[name], half) if name in ("x", "theta") else recording[name]
+    motion = [speed, _slope(speed, half)]
+    if name == "x":
+        motion.append(recording[name] - recording[name].mean())
+    return np.column_stack([own / max(float(np.percentile(np.abs(own), 99.0)), _TINY) for own in motion])
+
+
+def _slope(values: Array, half: int) -> Array:
+    padded = np.pad(values, half, mode="edge")
+    return np.asarray(padded[2 * half :] - padded[: -2 * half])
 
 
 def levels(recording: Recording) -> tuple[Array, Array] | None:
     """Return times (K,) and the four numbers (K, 4) of each block; None where the pressures or the motion are missing.
 
-    Without a direction the halves are zero.
+    Least squares of what moves: both numbers of either pressure are free in each block, b, c and d are the recording's.
+    Without a direction the numbers are the means and zero.
     """
     if not {"p_A", "p_B"} <= set(recording.channels):
         return None
-    way = directions(recording)
+    pressures = np.column_stack([recording["p_A"], recording["p_B"]])
+    means, motion = pressures.mean(axis=0), _motion(recording)
     believed = beliefs("inference.other_steps")["levels"]
-    for count in believed["blocks"]:
-        length = len(recording) // count
-        if length < 2:
+    if motion is None:
+        motion, moving = np.zeros((len(recording), 0)), np.ones(len(recording))
+        columns = np.column_stack([moving, pressures - means])
+    else:
+        moving = (np.abs(motion[:, 0]) > believed["slowest"]).astype(float)
+        columns = np.column_stack([np.ones(len(recording)), np.sign(motion[:, 0]), motion, pressures - means])
+    own, size = min(2, columns.shape[1] - 2), columns.shape[1]
+    lengths, cycle = [len(recording) // count for count in believed["blocks"]], find_cycle(recording)
+    if cycle is not None:
+        samples = cycle * recording.rate
+        lengths.insert(0, round(math.ceil(lengths[0] / samples) * samples))
+    for length in lengths:
+        count = len(recording) // max(length, 1)
+        if length < 2 or count < believed["blocks"][-1]:
             continue
-        p = np.stack([recording[name][: count * length].reshape(count, length) for name in ("p_A", "p_B")])
-        time = recording.t[0] + (np.arange(count) + 0.5) * length / recording.rate
-        if way is None:
-            level = p.mean(axis=2).T
-            return time, np.column_stack([level, np.zeros_like(level)])
-        own = way[: count * length].reshape(count, length)
-        shares = np.stack([(own > 0.0).mean(axis=1), (own < 0.0).mean(axis=1)])
-        if shares.min() < believed["least"]:
-            continue
-        out, back = ((p * (own == sign)).mean(axis=2) / share for sign, share in zip((1.0, -1.0), shares, strict=True))
-        return time, np.vstack([0.5 * (out + back), 0.5 * (out - back)]).T
+        rows = (columns * moving[:, None])[: count * length].reshape(count, length, size)
+        gram = rows.transpose(0, 2, 1) @ rows
+        if own == 2:
+            ways = 0.5 * (gram[:, 0, :1] + np.multiply.outer(gram[:, 0, 1], [1.0, -1.0]))
+            if ways.min() < believed["least"] * length:
+                continue
+        solved = np.linalg.solve(gram[:, :own, :own], gram[:, :own, own:])
+        rest = (gram[:, own:, own:] - gram[:, own:, :own] @ solved).sum(axis=0)
+        shared = np.linalg.lstsq(rest[:-2, :-2], rest[:-2, -2:], rcond=None)[0]
+        fitted = solved[:, :, -2:] - solved[:, :, :-2] @ shared
+        values = np.zeros((count, 4))
+        values[:, : 2 * own] = fitted.reshape(count, 2 * own)
+        values[:, :2] += means
+        return recording.t[0] + (np.arange(count) + 0.5) * length / recording.rate, values
     return None
 
 
@@ -103,6 +134,9 @@ def _patterns(mean: Array) -> Iterator[Pattern]:
     A, B, half_A, half_B = np.eye(4)
     yield Pattern(CHARGE, "external leak", (np.array([A + B]),))
     yield Pattern("friction", "friction change", (np.array([A + B, half_A, half_B]),))
+    yield Pattern("friction", "friction change", (np.array([half_A - half_B]),))
+    yield Pattern("friction", "friction change", (np.eye(4),))
+    yield Pattern("what feeds both chambers", None, (np.array([A + B, half_A + half_B]),))
     yield Pattern("load", "changed duty", tuple(np.array(own) for own in ([A, B], [B, A], [A + B, A])))
     yield Pattern("zero of p_A", "sensor fault", (A[None],))
     yield Pattern("zero of p_B", "sensor fault", (B[None],))
@@ -148,6 +182,6 @@ def _test(pattern: Pattern, rows: Array, whitened: Array, time: Array) -> Level 
     best = int(np.argmax(shares))
     score = 2.0 * half * float(np.log1p(shares[best]))
     chance = 2.0 * count * min(test.law.chance(score) for test in tests)
-    rank = 2.0 * half * float(shares[best]) - (count - 1) * float(np.log(len(time)))
+    rank = score - (count - 1) * float(np.log(len(time)))
     onset, block = float(tests[0].onsets[best]), float(time[1] - time[0])
     return Level(pattern.name, pattern.cause, rank, score, min(1.0, chance), onset, block)

@@ -13,7 +13,7 @@ from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import StepTest, two_sided
 from sealscope.diagnosis.inference.other_steps.features import BLOCKS, DUTY, ORDER, features
 from sealscope.diagnosis.inference.other_steps.levels import level_tests
-from sealscope.diagnosis.verdict.evidence import RAREST, Cause
+from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.recordings.recording import Recording, remembered
 
 
@@ -33,42 +33,42 @@ class OtherStep(NamedTuple):
         return cls(cause, f"near {onset.value:.0f} s the {name} steps", test.score, onset.value, onset.high - onset.low)
 
 
-def other_step(recording: Recording) -> OtherStep | None:
-    """Return what stepped beside a leak, computed once; None where nothing does that is as rare as `RAREST`."""
-    return remembered(recording, ("other step",), _other_step)
+def other_step(recording: Recording, chance: float) -> OtherStep | None:
+    """Return what stepped beside a leak, computed once; None where nothing does that is as rare as `chance`."""
+    return remembered(recording, ("other step", chance), lambda own: _other_step(own, chance))
 
 
 @np.errstate(all="ignore")
-def _other_step(recording: Recording) -> OtherStep | None:
+def _other_step(recording: Recording, chance: float) -> OtherStep | None:
     shortest = beliefs("inference.other_steps")["features"]["shortest"]
     if len(recording) < BLOCKS * max(ORDER + 2, shortest * recording.rate):
         return None
     try:
-        return _duty(recording) or _feature(recording) or _level(recording)
+        return _duty(recording, chance) or _feature(recording, chance) or _level(recording, chance)
     except (ArithmeticError, np.linalg.LinAlgError):  # numbers that cannot be computed with are no machine's
         return None
 
 
-def _duty(recording: Recording) -> OtherStep | None:
+def _duty(recording: Recording, chance: float) -> OtherStep | None:
     """Return a step of command and motion nearer to (1, 1) than to (1, 0) and (0, 1): not the answer to a leak."""
     sizes = [test for _, own in features(recording, DUTY) if (test := two_sided(own)) is not None]
     steps = np.abs([test.fitted[0] for test in sizes])
-    rare = bool(sizes) and max(2.0 * test.chance for test in sizes) < RAREST
+    rare = bool(sizes) and max(2.0 * test.chance for test in sizes) < chance
     if not rare or not steps.min() > np.tan(np.pi / 8.0) * steps.max():
         return None
     return OtherStep.of("changed duty", "size of the duty", min(sizes, key=lambda test: test.score))
 
 
-def _feature(recording: Recording) -> OtherStep | None:
+def _feature(recording: Recording, chance: float) -> OtherStep | None:
     tests = [(feature, test) for feature, own in features(recording) if (test := two_sided(own)) is not None]
-    rare = (own for own in tests if 2.0 * len(tests) * own[1].chance < RAREST)
+    rare = (own for own in tests if 2.0 * len(tests) * own[1].chance < chance)
     return next((OtherStep.of(feature.cause, feature.name, test) for feature, test in rare), None)
 
 
-def _level(recording: Recording) -> OtherStep | None:
+def _level(recording: Recording, chance: float) -> OtherStep | None:
     patterns = level_tests(recording)
     best = patterns[0] if patterns else None
-    if best is None or best.cause is None or len(patterns) * best.chance >= RAREST:
+    if best is None or best.cause is None or len(patterns) * best.chance >= chance:
         return None
     text = f"near {best.onset:.0f} s the pressures step as of {best.name}"
     return OtherStep(best.cause, text, best.score, best.onset, 2.0 * best.block)
