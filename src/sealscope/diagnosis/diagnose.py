@@ -148,9 +148,8 @@ class Examination:
                 evidences.append(self.evidence(name))
                 if judging(evidences) is not None:
                     break
-        return judged(
-            evidences, None if self.distrust else other_step(self.recording, self.false_alarm_probability), self.refusal
-        )
+        other = None if self.distrust else other_step(self.recording, self.false_alarm_probability)
+        return judged(evidences, other, self.refusal)
 
 
 def _unusable(detector: Detector, healthy: Healthy) -> str | None:

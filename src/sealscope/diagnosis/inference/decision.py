@@ -236,18 +236,17 @@ def judge(balance: RecordedBalance, probability: float, baseline: Sequence[Taugh
     questions = _questions(balance, against, probability)
     answered = next((own for own in questions if own.chance < own.probability), None)
     causes: dict[Cause, float] = {}
+    other = other_step(balance.recording, probability)
     if answered is not None and answered.name == WITHIN and test is not None:
         flow, pump = test.fitted[0] * balance.mean(0), balance.mean(2)
-        causes = probabilities(
-            balance.hypotheses, other_step(balance.recording, probability), flow / pump if pump > 0.0 else 0.0
-        )
+        causes = probabilities(balance.hypotheses, other, flow / pump if pump > 0.0 else 0.0)
         answered = answered if is_leak(causes) else None
     if answered is None:
         judging = questions[0]
         bound = bound_of(balance, against)
         enough = balance.moving > 0.0 and bound <= beliefs("inference")["worth"]["share"] * balance.moving
         enough &= sum(causes.get(own, 0.0) for own in LEAKS) < 1.0 - _SURE  # a change that may as well be a leak
-        cause = stepped_cause(balance.hypotheses, probability, other_step(balance.recording, probability))
+        cause = stepped_cause(balance.hypotheses, probability, other)
         evidence = Evidence("no leak" if enough else "cannot tell", "", cause=None if cause in LEAKS else cause)
     else:
         judging = answered

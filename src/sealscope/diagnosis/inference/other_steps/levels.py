@@ -12,7 +12,7 @@ subspace of the four, is a hypothesis. With S the covariance of neighbouring blo
 hardly enter, coordinates S^(-1/2) (..) are alike in noise: the steps in the orthonormal directions of a pattern add up,
 F the share by which each makes the residual smaller,
 
-    rank = max over onsets of n sum_j F_j - (m - 1) log K,    F_j = exp(score_j / n) - 1,
+    rank = max over onsets of n log(1 + sum_j F_j) - (m - 1) log K,    F_j = exp(score_j / n) - 1,
 
 a coefficient more costs log K (G. Schwarz, Ann. Statist. 6 (1978) 461).
 """
