@@ -146,32 +146,9 @@ if TYPE_CHECKING:
         """A rig's parameters as the compiled laws take them: SI floats, choices as truth values."""
 
         _fields: tuple[str, ...]
-        position_dependent: bool
-        coulomb_of_difference: bool
-        literal_bracket: bool
-        made_up: bool
-        throttled: tuple[bool, ...]
-        aerated: tuple[bool, ...]
-        open_circuit: tuple[bool, ...]
-        conserving: tuple[bool, ...]
-        sticking: tuple[bool, ...]
-        bristled: tuple[bool, ...]
-        one_sided: tuple[bool, ...]
-        piloted: tuple[bool, ...]
-        relieved: tuple[bool, ...]
-        polytropic: tuple[bool, ...]
-        damped: tuple[bool, ...]
-        pushed: tuple[Any, ...]
-        valved: tuple[bool, ...]
-        filtered: tuple[bool, ...]
-        lossy: tuple[bool, ...]
-        opposed: tuple[bool, ...]
-        boiling: tuple[bool, ...]
-        clogging: tuple[bool, ...]
-        bypassed: tuple[bool, ...]
 
         def __init__(self, *values: Any, **fields: Any) -> None: ...
-        def __getattr__(self, name: str) -> float: ...
+        def __getattr__(self, name: str) -> Any: ...
         def _replace(self, **fields: Any) -> RigNumbers: ...
         def _asdict(self) -> dict[str, Any]: ...
 
@@ -312,7 +289,7 @@ def vapour_floor(q: float, p: RigNumbers) -> float:
     """
     if len(p.boiling) == 0:
         return q
-    return max(q, p.p_vap - P_ATM)
+    return max(q, p.p_vap - P_ATM)  # type: ignore[no-any-return]
 
 
 @contracted
@@ -325,8 +302,8 @@ def pressures_of(y: State, p: RigNumbers) -> Pressures:
 def speed_error(y: State, u: float, p: RigNumbers) -> float:
     """Commanded less actual motor speed [rad/s]; the pump of a servo valve's supply has one speed."""
     if len(p.valved) > 0:
-        return p.omega_P - y[OMEGA]
-    return p.omega_per_volt * u - y[OMEGA]
+        return p.omega_P - y[OMEGA]  # type: ignore[no-any-return]
+    return p.omega_per_volt * u - y[OMEGA]  # type: ignore[no-any-return]
 
 
 @contracted
@@ -424,7 +401,7 @@ def volumes_at(x: float, p: RigNumbers) -> tuple[float, float]:
 def bulk_modulus(pressure: float, p: RigNumbers) -> float:
     """Bulk modulus [Pa] of the oil and its air in a volume at `pressure` [Pa]."""
     if len(p.aerated) == 0:
-        return p.K_oil
+        return p.K_oil  # type: ignore[no-any-return]
     return effective_bulk_modulus(vapour_floor(pressure, p), p.K_oil, p.air, p.n_air)
 
 
@@ -544,7 +521,7 @@ def supply_compliance(p_1: float, p: RigNumbers) -> float:
     (V_1 + V_oil)/K + V_gas/(n p_abs), V_oil = V_acc - V_gas the oil in the accumulator.
     """
     V_gas = gas_volume(p_1, p.p_pre, p.V_acc, p.n_acc)
-    return (p.V_1 + p.V_acc - V_gas) / bulk_modulus(p_1, p) + accumulator_compliance(p_1, p.p_pre, V_gas, p.n_acc)
+    return (p.V_1 + p.V_acc - V_gas) / bulk_modulus(p_1, p) + accumulator_compliance(p_1, p.p_pre, V_gas, p.n_acc)  # type: ignore[no-any-return]
 
 
 @contracted

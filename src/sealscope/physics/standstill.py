@@ -27,7 +27,7 @@ def carried_at_standstill(
     return load - hard_stop_force(x, 0.0, L, k_stop, d_stop)
 
 
-@kernel
+@law
 def holding_current(dp: float, q_b: float, C_m: float) -> float:
     """Winding current [A] that holds the pump against dp [Pa]: T_load/C_m, eq. (4.5) at standstill."""
     return pump_torque(dp, q_b) / C_m

@@ -360,43 +360,28 @@ class SetRun:
             self._prepare_statistics(bounds)
 
     def _prepare_filters(self, rate: float) -> None:
-        """Lay out the anti-alias filter, for each lane where a channel is late.
-
-        Its first tap is `before` and its last `after` outputs from the sample's.
-        """
-        from sealscope.simulation.batch.signals import TILE
-
-        taps = anti_alias_taps(self.factor)
-        self.before = self.after = taps.size // 2
-        self.taps = np.pad(taps, (TILE - 1) * self.factor)
+        """Lay out the anti-alias filter of each lane: its taps are `before` .. `after` outputs from the sample's."""
         sensors = [member.experiment.rig.sensors for member in self.part.members]
         delays = np.array([[getattr(group, name).delay * rate for name in CHAMBERS] for group in sensors])
-        whole = np.floor(delays).astype(np.int64)
-        if not delays.any():
-            self.own_taps = np.zeros((self.groups, self.channels, 1, self.width))
-            return
-        filters = [[anti_alias_taps(self.factor, delay % 1.0) for delay in run] for run in delays]
-        self.after = max(taps.size // 2 for run in filters for taps in run)
-        self.before = self.after + int(whole.max())
+        known = {delay: anti_alias_taps(self.factor, delay % 1.0) for delay in set(delays.ravel().tolist())}
+        self.after = max(taps.size // 2 for taps in known.values())
+        self.before = self.after + int(delays.max())
         own = np.zeros((self.runs, self.channels, self.before + self.after + 1))
-        for run, channel in np.ndindex(*delays.shape):
-            taps = filters[run][channel]
-            start = self.before - int(whole[run, channel]) - taps.size // 2
-            own[run, channel, start : start + taps.size] = taps
-        self.own_taps = in_lanes(own, self.width)
+        for place, delay in np.ndenumerate(delays):
+            taps = known[float(delay)]
+            start = self.before - int(delay) - taps.size // 2
+            own[place][start : start + taps.size] = taps
+        self.taps = in_lanes(own, self.width)
 
     def _prepare_statistics(self, bounds: Array) -> None:
-        from sealscope.signals.filters import decomposition_filters, reach
+        from sealscope.signals.filters import reach
         from sealscope.simulation.batch.noise import keys
-        from sealscope.simulation.batch.signals import LEVELS, QUANTITIES
+        from sealscope.simulation.batch.signals import QUANTITIES
 
-        rate = self.part.experiment.rate
-        before, after = reach("db8", LEVELS)[-1]
-        at = np.round(bounds * rate).astype(np.int64)
+        before, after = reach()[-1]
+        at = np.round(bounds * self.part.experiment.rate).astype(np.int64)
         self.segments = np.clip(at, before, self.samples - after)
-        self.low, self.high = (tuple(taps.tolist()) for taps in decomposition_filters("db8"))
-        shape = (self.groups, self.channels)
-        self.sums = np.zeros((*shape, self.segments.size - 1, QUANTITIES, self.width))
+        self.sums = np.zeros((self.groups, self.channels, self.segments.size - 1, QUANTITIES, self.width))
         self.keys = in_lanes(keys([m.experiment.seed for m in self.part.members]), self.width)
 
     def all(self, threads: int, progress: Callable[[float], None] | None) -> None:
@@ -438,7 +423,8 @@ class SetRun:
     def _some(self, groups: tuple[int, int], tell: Callable[[float], None]) -> None:
         """Run the groups first <= g < last from standstill to the end."""
         from sealscope.physics.vector.runs import advance_lanes_imex, advance_lanes_rk4
-        from sealscope.simulation.batch.signals import FILTER_ROWS, sense_lanes
+        from sealscope.signals.streams import DetailStream
+        from sealscope.simulation.batch.signals import sense_lanes
 
         advance = advance_lanes_imex if self.method == "imex" else advance_lanes_rk4
         a, b = groups
@@ -450,7 +436,7 @@ class SetRun:
         longest = max(stop - start for _, _, start, stop in chunks)
         pressures = np.zeros((b - a, kept + longest, self.channels, self.width))
         walks = np.zeros((b - a, self.channels, self.width))
-        filters = np.zeros((b - a, self.channels, FILTER_ROWS if self.bounds is not None else 0, self.width))
+        wavelet = DetailStream((self.channels, (b - a) * self.width))
         sampled = 0
         for first, last, start, stop in chunks:
             if cells != (first, last):
@@ -466,11 +452,11 @@ class SetRun:
                     pressures[:, :kept] = pressures[:, kept : kept + 1]  # at standstill before the beginning
                 until = self._due(stop)
                 if until > sampled:
-                    sensors = self._sensors(groups, sampled, until)
                     begin = sampled * self.factor - self.before - (start - kept)
                     sense_lanes(
-                        own, pressures, begin, self.factor, self.taps, self.own_taps[a:b], sampled, until, sensors,
-                        self.keys[a:b], walks, filters, self.low, self.high, self.segments, self.sums[a:b],
+                        own, pressures, begin, self.factor, self.taps[a:b], sampled, until,
+                        self._sensors(groups, sampled, until), self.keys[a:b], walks, wavelet.taps, wavelet.buffers,
+                        self.segments, self.sums[a:b],
                     )  # fmt: skip
                     sampled = until
                 pressures[:, :kept] = pressures[:, stop - start : stop - start + kept].copy()
@@ -541,7 +527,7 @@ class SetRun:
 
     @property
     def _half(self) -> float:
-        return 0.5 * min(member.numbers.L for member in self.part.members)
+        return 0.5 * float(min(member.numbers.L for member in self.part.members))
 
     def rms(self) -> Array:
         """RMS of d1..d4 and d3 d4 in each segment, (runs, 2, segments, 5)."""
