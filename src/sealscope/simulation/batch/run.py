@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import sys
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -33,7 +32,6 @@ from sealscope.simulation.experiment import Experiment, choose_method, exact
 from sealscope.simulation.instruments import FILTER_REACH, anti_alias_taps
 from sealscope.simulation.integrate import (
     VACUUM,
-    NodeSines,
     oversampling_of,
     refuse_long,
     refuse_unresolved,
@@ -302,36 +300,26 @@ class SetRun:
     """The runs of a set.
 
     `sizes` (runs,) are the leaks' coefficients, `measured` those whose flow is accounted, `bounds` [s] the segments of
-    the statistics, None for none (flows alone are then of interest). `most` samples are run where that is less than
-    all.
+    the statistics, None for none (flows alone are then of interest).
     """
 
     #: Runs of a group.
     width: ClassVar[int] = 8
 
-    def __init__(
-        self,
-        part: LaneSet,
-        step: float,
-        sizes: Array,
-        measured: Array,
-        bounds: Array | None,
-        most: int | None = None,
-    ) -> None:
+    def __init__(self, part: LaneSet, step: float, sizes: Array, measured: Array, bounds: Array | None) -> None:
         from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, nodes_of
         from sealscope.physics.solvers.limits import longest_step
         from sealscope.physics.standstill import initial_state
         from sealscope.physics.vector.runs import ACCOUNTS, CHANNELS, LEAST
 
         members, common = part.members, part.experiment
-        self.asked_step, self.sizes = step, sizes
         self.part, self.runs, self.channels = part, len(members), CHANNELS
         self.method = choose_method(common.rig, common.method)
         self.factor = oversampling_of(common.rate, step)
         rate = common.rate * self.factor
         self.every = steps_per_output(rate, step)
         self.h = 1.0 / (rate * self.every)
-        self.samples = min(round(common.duration * common.rate), most or sys.maxsize)
+        self.samples = round(common.duration * common.rate)
         self.outputs = (self.samples + FILTER_REACH) * self.factor
         self.nodes = nodes_of(IMPLICIT if self.method == "imex" else EXPLICIT, self.h)
         self.cells = cells_of(members, self.outputs, rate)
@@ -431,7 +419,7 @@ class SetRun:
         own = (0, b - a)
         state, drive, leaks, account = self.state[a:b], self.drive[a:b], self.leaks[a:b], self.account[a:b]
         table, cells = np.empty((0, 0, 0, 0)), (-1, -1)
-        chunks, shapes = self._chunks(), self._shapes()
+        chunks = self._chunks()
         kept = self.before + self.after + self.factor  # outputs that later samples still need
         longest = max(stop - start for _, _, start, stop in chunks)
         pressures = np.zeros((b - a, kept + longest, self.channels, self.width))
@@ -443,7 +431,7 @@ class SetRun:
                 table, cells = self.cells.table(first, last, self.width)[a:b], (first, last)
             bounds = (np.clip(self.cells.bounds[first : last + 1], start, stop) - start) * self.every  # in steps
             advance(
-                own, state, self.h, start * self.every, self.nodes, shapes(start, stop), drive, leaks, table,
+                own, state, self.h, start * self.every, self.nodes, self._shape(start, stop), drive, leaks, table,
                 bounds, self.numbers, self.every, pressures, kept, account,
             )  # fmt: skip
             self._check(groups, stop)
@@ -462,23 +450,14 @@ class SetRun:
                 pressures[:, :kept] = pressures[:, stop - start : stop - start + kept].copy()
             tell((stop - start) / self.outputs * (b - a) / self.groups)
 
-    def _shapes(self) -> Callable[[int, int], Array]:
-        """Return the command's shape at the nodes of the steps between two outputs, for one thread's use.
-
-        Where there is a load, its forces [N] at the nodes stand behind.
-        """
-        shape, load = self.part.shape, self.part.experiment.load
-        sines = NodeSines(shape.omega, shape.phase) if isinstance(shape, Sine) else None
-
-        def shapes(start: int, stop: int) -> Array:
-            t = np.arange(start * self.every, stop * self.every, dtype=np.float64) * self.h
-            at = t[:, None] + self.nodes
-            volts = shape.volts(at) if sines is None else sines.at(t, self.nodes, 1.0, 0.0)
-            return np.ascontiguousarray(
-                volts if load is None else np.hstack([volts, np.broadcast_to(load.at(at), at.shape)])
-            )
-
-        return shapes
+    def _shape(self, start: int, stop: int) -> Array:
+        """Return the command's shape at the nodes of the steps between two outputs, and a load's forces behind it."""
+        t = np.arange(start * self.every, stop * self.every, dtype=np.float64) * self.h
+        at, load = t[:, None] + self.nodes, self.part.experiment.load
+        volts = self.part.shape.volts(at)
+        return np.ascontiguousarray(
+            volts if load is None else np.hstack([volts, np.broadcast_to(load.at(at), at.shape)])
+        )
 
     def _sensors(self, groups: tuple[int, int], first: int, last: int) -> Array:
         """Return the instruments of the groups for samples first .. last, (groups, 2, INSTRUMENT_ROWS, width)."""
