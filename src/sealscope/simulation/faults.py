@@ -19,7 +19,7 @@ import numpy as np
 
 from sealscope.errors import InputError
 from sealscope.recordings.recording import CHANNEL_UNITS, Array
-from sealscope.simulation.changes import RESOLUTION, THROTTLES, Adjustment, Effect, Hold, fields_of
+from sealscope.simulation.changes import RESOLUTION, THROTTLES, Effect, Hold, fields_of
 from sealscope.simulation.commands import NUMBER, TIME, UNSIGNED, Command, number_text, plain_text, seconds
 from sealscope.simulation.leaks import WHEN, Between, From, Growing, Opening, Part, opening_of
 from sealscope.units import LITRE_PER_MINUTE, parse_quantity
@@ -148,14 +148,12 @@ class Fault:
         return self.opening.onset()
 
     def effects(self, rig: Rig) -> tuple[Effect, ...]:
-        """Return what it changes in the machine; InputError where it cannot be on this rig."""
+        """Return what it changes, in the machine or at a sensor; InputError where it cannot be on this rig."""
         row = self.row
         if row.needs is not None and rig[name := row.needs[0].format(at=self.at)] == 0:
             raise InputError(f"{row.needs[1]} {name} > 0, got 0 ({self})")
         if self.name in _EFFECTS:
             return _EFFECTS[self.name](self, rig)
-        if row.of_sensor:
-            return ()
         if row.factor:
             step = SHARE_RESOLUTION * max(abs(self.value - 1.0), 1e-3)
             return tuple(
@@ -166,11 +164,6 @@ class Fault:
             )
         size = self.value if row.over is None else self.value / float(rig[row.over])
         return tuple(self._plus(name, size) for name in self._parameters())
-
-    def adjustments(self) -> tuple[Adjustment, ...]:
-        """Return what it changes at the instruments."""
-        changed = self._parameters() if self.row.of_sensor else ()
-        return tuple(Adjustment(name, lambda t: self.value * self.opening.share(t), added=True) for name in changed)
 
     def holds(self) -> tuple[Hold, ...]:
         """Return the readings that it makes repeat themselves."""

@@ -100,7 +100,7 @@ def refuse(experiment: Experiment, place: int) -> None:
         raise no(f"a leak that opens abruptly or evenly, got {experiment.leaks[0].opening}")
     if experiment.rig.motor.integrator == "euler":
         raise no("motor.integrator = state, got euler")
-    if any(fault.adjustments() or fault.holds() for fault in experiment.faults):
+    if any(fault.row.of_sensor for fault in experiment.faults):
         raise no(f"no fault of a sensor, got {', '.join(str(fault) for fault in experiment.faults)}")
     if experiment.rig.daq.jitter != 0:
         raise no(f"daq.jitter = 0, got {experiment.rig.daq.jitter}")
@@ -469,7 +469,7 @@ class SetRun:
     @cached_property
     def _steady(self) -> Array | None:
         """The instruments of all groups, None where some change within a run."""
-        if any(member.experiment.readings().adjustments for member in self.part.members):
+        if any(member.experiment.readings().effects for member in self.part.members):
             return None
         return in_lanes(instrument_rows(self.part.members, 0, self.samples), self.width)
 
