@@ -180,15 +180,12 @@ class Experiment:
                 f"a controller must have a target to follow ('position 50 mm sin(2t)'), got {self.command}"
             )
         else:
-            self._check_command()
+            command, u_max = self.commanded, self.rig.daq.u_max
+            if not (isinstance(command, Sine) and abs(command.offset) + abs(command.amplitude) <= u_max):
+                check_command(command, self.sample_times(), u_max)
         for drift in self.drifts:
             drift.check(np.linspace(0.0, self.duration, 2001))
         self._effects()
-
-    def _check_command(self) -> None:
-        command, u_max = self.commanded, self.rig.daq.u_max
-        if not (isinstance(command, Sine) and abs(command.offset) + abs(command.amplitude) <= u_max):
-            check_command(command, self.sample_times(), u_max)
 
     @classmethod
     @checked_call
@@ -243,21 +240,23 @@ class Experiment:
             from sealscope.control import controller_named
 
             controller = controller_named(controller, loaded)
+        quantities = (("duration", duration, "s"), ("x_0", x_0, "m"), ("step", step, "s"), ("error", error, "Pa"))
         return cls(
             rig=loaded.with_overrides(overrides) if overrides else loaded,
             command=command,
-            duration=parse_quantity(duration, "s", name="duration", finite=False),
             leaks=_each(leak, Leak, parse_leak, "leak"),
             seed=int(seed),
-            x_0=parse_quantity(x_0, "m", name="x_0", finite=False),
             method=method,
-            step=None if step is None else parse_quantity(step, "s", name="step", finite=False),
             allow_unresolved=allow_unresolved,
             faults=_each(fault, Fault, parse_fault, "fault"),
             drifts=tuple(drifts),
-            error=None if error is None else parse_quantity(error, "Pa", name="error", finite=False),
             load=parse_force(load) if isinstance(load, str) else load,
             controller=controller,
+            **{
+                name: parse_quantity(value, unit, name=name, finite=False)
+                for name, value, unit in quantities
+                if value is not None
+            },  # type: ignore[arg-type]
         )
 
     def __repr__(self) -> str:
