@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import tracemalloc
 from dataclasses import replace
 
@@ -10,7 +11,7 @@ import pytest
 from scipy import stats
 
 from sealscope.compiled import kernel
-from sealscope.errors import InputError, SimulationFailed
+from sealscope.errors import InputError, MissingExtra, SimulationFailed
 from sealscope.parameters import load_rig
 from sealscope.physics.lanes import WIDTH, load, store
 from sealscope.simulation.batch.batch import DETAILS, simulate_batch
@@ -332,3 +333,35 @@ def test_valve_controlled_runs_side_by_side_are_what_they_are_by_themselves(rms_
         alone = simulate_with_truth(one)
         np.testing.assert_allclose(batch.rms[k], rms_of(alone.recording, bounds), rtol=1e-6)
         assert batch.mean_leak_lpm[k] == pytest.approx(alone.truth.mean_leak_lpm, rel=1e-4, abs=1e-12)
+
+
+def test_a_batch_tells_its_numbers_by_name(monkeypatch):
+    runs = [Experiment.of(duration=4.0, seed=seed) for seed in range(2)]
+    batch = simulate_batch(runs, bounds=[0.0, 1.5, 2.5, 4.0])
+    assert (len(batch), repr(batch)) == (2, "<Batch: 2 runs, segments between 0, 1.5, 2.5, 4 s>")
+    np.testing.assert_array_equal(batch.rms_of("p_B", "d3d4"), batch.rms[:, 1, :, 4])
+    with pytest.raises(InputError, match="channel must be one of p_A, p_B, got 'p_C'"):
+        batch.changes("p_C", "d3")
+    with pytest.raises(InputError, match="detail must be one of d1, d2, d3, d4, d3d4, got 'd5'"):
+        batch.rms_of("p_A", "d5")
+    pytest.importorskip("pandas")
+    table = batch.to_pandas()
+    assert list(table["run"]) == [0, 0, 0, 1, 1, 1]
+    assert list(table["stop [s]"]) == [1.5, 2.5, 4.0] * 2
+    np.testing.assert_array_equal(table["d3 of p_A [Pa]"], batch.rms_of("p_A", "d3").ravel())
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(MissingExtra, match="a table needs pandas"):
+        batch.to_pandas()
+
+
+@pytest.mark.parametrize(
+    ("parts", "rule"),
+    [
+        ({"experiments": ["3 sin(4t)"]}, r"a batch must have experiments .*, got '3 sin\(4t\)'"),
+        ({"error": "20[m]"}, "error must have a unit of pressure"),
+        ({"thread": 1}, "simulate_batch has no argument 'thread'; did you mean 'threads'"),
+    ],
+)
+def test_a_wrong_batch_is_refused_by_name(parts, rule):
+    with pytest.raises(InputError, match=rule):
+        simulate_batch(**{"experiments": [Experiment.of(duration=1.0)], **parts})
