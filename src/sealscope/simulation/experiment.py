@@ -240,23 +240,21 @@ class Experiment:
             from sealscope.control import controller_named
 
             controller = controller_named(controller, loaded)
-        quantities = (("duration", duration, "s"), ("x_0", x_0, "m"), ("step", step, "s"), ("error", error, "Pa"))
         return cls(
             rig=loaded.with_overrides(overrides) if overrides else loaded,
             command=command,
+            duration=parse_quantity(duration, "s", name="duration", finite=False),
             leaks=_each(leak, Leak, parse_leak, "leak"),
             seed=int(seed),
+            x_0=parse_quantity(x_0, "m", name="x_0", finite=False),
             method=method,
+            step=None if step is None else parse_quantity(step, "s", name="step", finite=False),
             allow_unresolved=allow_unresolved,
             faults=_each(fault, Fault, parse_fault, "fault"),
             drifts=tuple(drifts),
+            error=None if error is None else parse_quantity(error, "Pa", name="error", finite=False),
             load=parse_force(load) if isinstance(load, str) else load,
             controller=controller,
-            **{
-                name: parse_quantity(value, unit, name=name, finite=False)
-                for name, value, unit in quantities
-                if value is not None
-            },  # type: ignore[arg-type]
         )
 
     def __repr__(self) -> str:
