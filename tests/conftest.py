@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,8 @@ from threadpoolctl import threadpool_limits
 
 from sealscope.diagnosis import registry
 from sealscope.parameters import Rig, load_rig
+from sealscope.recordings import Recording
+from sealscope.signals.details import details
 from sealscope.simulation.integrate import Trajectory, integrate
 
 #: The rig of the independent results: 26.7 rad/s per volt, 0.25 MPa everywhere at the start, line volumes of 50 cm^3.
@@ -70,6 +72,24 @@ class Driven:
 
     def largest(self, t: np.ndarray) -> tuple[float, float]:
         return self.G, self.C
+
+
+@pytest.fixture(scope="session")
+def details_of() -> Callable[..., np.ndarray]:
+    """RMS of d1..d4 and d3d4 of both chambers between bounds [s], straight from the transform: (2, segments, 5)."""
+
+    def rms(recording: Recording, bounds: Sequence[float]) -> np.ndarray:
+        result = np.empty((2, len(bounds) - 1, 5))
+        for channel, name in enumerate(("p_A", "p_B")):
+            one = details(recording[name])
+            inside = one.inside()
+            at = np.clip(np.round(np.asarray(bounds) * recording.rate).astype(int), inside.start, inside.stop)
+            rows = np.vstack([one.values, one.product()[None]])
+            for k in range(len(bounds) - 1):
+                result[channel, k] = np.sqrt(np.mean(rows[:, at[k] : at[k + 1]] ** 2, axis=1))
+        return result
+
+    return rms
 
 
 @pytest.fixture(scope="session")

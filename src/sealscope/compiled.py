@@ -162,10 +162,10 @@ class _Cache(FunctionCache):  # type: ignore[misc]
 
 @register_pass(mutates_CFG=False, analysis_only=False)  # type: ignore[untyped-decorator]
 class _SettledLaws(FunctionPass):  # type: ignore[misc]
-    """Replace len(p.law) by its number, `p` an argument that is a named tuple and `law` a field that is a tuple.
+    """Replace len(p.law) by its number, `p` an argument that is a named tuple or a record, `law` a tuple or an array.
 
-    So is len(choice) of an argument that is a tuple itself.
-    Branches on it are then settled before types are inferred, and a law that is absent is not even compiled.
+    So is len(choice) of an argument that is a tuple itself. Branches on it are then settled before types are inferred,
+    and a law that is absent is not even compiled.
     """
 
     _name = "sealscope_settled_laws"
@@ -180,23 +180,24 @@ class _SettledLaws(FunctionPass):  # type: ignore[misc]
         def definition(variable: Any) -> Any:
             return guard(get_definition, code, variable)
 
+        def type_of(given: Any) -> Any:
+            if isinstance(given, ir.Arg):
+                return state.args[given.index]
+            numbers = definition(given.value) if getattr(given, "op", None) == "getattr" else None
+            kind = state.args[numbers.index] if isinstance(numbers, ir.Arg) else None
+            if isinstance(kind, types.BaseNamedTuple) and given.attr in kind.fields:
+                return kind.types[kind.fields.index(given.attr)]
+            return kind.typeof(given.attr) if isinstance(kind, types.Record) and given.attr in kind.fields else None
+
         def length(value: Any) -> int | None:
             if getattr(value, "op", None) != "call" or len(value.args) != 1:
                 return None
-            given = definition(value.args[0])
             if getattr(definition(value.func), "value", None) is not len:
                 return None
-            if isinstance(given, ir.Arg):
-                kind = state.args[given.index]
-                return kind.count if isinstance(kind, types.BaseTuple) else None
-            if getattr(given, "op", None) != "getattr":
-                return None
-            numbers = definition(given.value)
-            kind = state.args[numbers.index] if isinstance(numbers, ir.Arg) else None
-            if not isinstance(kind, types.BaseNamedTuple) or given.attr not in kind.fields:
-                return None
-            law = kind.types[kind.fields.index(given.attr)]
-            return law.count if isinstance(law, types.BaseTuple) else None
+            kind = type_of(definition(value.args[0]))
+            if isinstance(kind, types.NestedArray):
+                return int(kind.shape[0])
+            return kind.count if isinstance(kind, types.BaseTuple) else None
 
         for block in code.blocks.values():
             for statement in block.body:

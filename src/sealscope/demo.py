@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from sealscope.diagnosis.commissioned.machine import CommissionedMachine, commission
 from sealscope.diagnosis.commissioned.machine_file import write_machine
@@ -16,15 +15,12 @@ from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import Progress, Truth, simulate_with_truth
 from sealscope.storage.folders import make_folder
 
-#: The demo's machine and duty: the thesis's rig with both throttles half closed (its Table 4.3 d).
-DUTY: dict[str, Any] = {
-    "command": "3 sin(4t)",
-    "set": {"line.orifices": "present", "line.closed_A": "50[%]", "line.closed_B": "50[%]"},
-}
+#: The command of the demo, on the thesis's rig.
+COMMAND = "3 sin(4t)"
 #: Healthy recordings that the machine is commissioned on, and the length of each, and of the healthy one judged [s].
 HEALTHY, SECONDS = 5, 20.0
 #: What is judged as leaking: the thesis's smallest leak, from half time on.
-LEAKING = {"leak": "0.0042 L/min from 30 s", "duration": 60.0}
+LEAK = "0.0042 L/min from 30 s"
 
 
 @dataclass(frozen=True)
@@ -46,10 +42,10 @@ def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> D
     names = [*(f"healthy/run{k + 1}.nc" for k in range(HEALTHY)), "healthy.nc"]
     recordings = {}
     for k, name in enumerate(names):
-        without = Experiment.of(**DUTY, duration=SECONDS, seed=len(names) * seed + k)
+        without = Experiment.of(command=COMMAND, duration=SECONDS, seed=len(names) * seed + k)
         recordings[name] = simulate_with_truth(without).recording
         update("simulating healthy recordings", (k + 1) / len(names))
-    experiment = Experiment.of(**DUTY, **LEAKING, seed=seed)  # type: ignore[arg-type]
+    experiment = Experiment.of(command=COMMAND, leak=LEAK, duration=60.0, seed=seed)
     result = simulate_with_truth(experiment, progress)
     file, page = folder / "recording.nc", folder / "report.html"
     make_folder(folder / "healthy")
@@ -69,7 +65,7 @@ def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> D
         rig=experiment.rig,
         truth_onset_s=result.truth.onset_s,
         truth_leak_lpm=result.truth.mean_leak_lpm,
-        title=f"Sealscope demo: a leak of {LEAKING['leak']}",
+        title=f"Sealscope demo: a leak of {LEAK}",
     )
     update("writing the page", 1.0)
     return Demo(machine, healthy, diagnosis, result.truth, machine_file, file, page)

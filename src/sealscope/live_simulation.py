@@ -65,16 +65,7 @@ def simulated_sources(settings: MonitorSettings, say: Callable[[str], None]) -> 
 
 def _experiment(actuator: ActuatorSettings, words: SimulateSettings) -> Experiment:
     try:
-        experiment = Experiment.of(
-            rig=actuator.rig,
-            command=words.command,
-            load=words.load,
-            leak=words.leak,
-            fault=words.fault,
-            duration=words.duration,
-            rate=words.rate,
-            seed=words.seed,
-        )
+        experiment = Experiment.of(rig=actuator.rig, **words.model_dump(exclude={"speed"}))
         if experiment.duration / BLOCK_S > KEPT_IDENTITIES:
             raise InputError(f"duration must be at most {KEPT_IDENTITIES * BLOCK_S:g} s, got {experiment.duration:g} s")
     except InputError as error:

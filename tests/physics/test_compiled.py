@@ -83,14 +83,13 @@ def test_an_edited_law_in_another_file_is_seen_and_the_old_code_comes_back_with_
     before, hits, folder = ask(copy, SMALL, cache)
     assert hits == 0
     assert str(cache) in folder
-    assert ask(copy, SMALL, cache)[:2] == (before, 1)  # from the cache
     edit(copy, "restrictors.py", law, doubled)
     after, hits, other = ask(copy, SMALL, cache)
     assert after == pytest.approx(2.0 * before, rel=1e-14)
     assert hits == 0
     assert other != folder
     edit(copy, "restrictors.py", doubled, law)
-    assert ask(copy, SMALL, cache) == (before, 1, folder)
+    assert ask(copy, SMALL, cache) == (before, 1, folder)  # from the cache
 
 
 @pytest.mark.slow

@@ -25,16 +25,7 @@ from sealscope.physics.lanes import (
 )
 from sealscope.physics.motor import winding_current_rate
 from sealscope.physics.restrictors import implicit_orifice_flow, orifice_flow
-from sealscope.physics.rig import CHOICES, NUMBERS, OUTPUTS, RigNumbers, rig_numbers
-from sealscope.physics.solvers.rk4 import RK4_NODES
-from sealscope.physics.standstill import initial_state
-from sealscope.physics.vector.runs import (
-    ACCOUNTS,
-    CHANNELS,
-    LEAK_ROWS,
-    LEAST,
-    advance_lanes_rk4,
-)
+from sealscope.physics.rig import CHOICES, NUMBERS, rig_numbers
 
 
 @contracted
@@ -137,45 +128,6 @@ def test_the_laws_are_the_same_on_lanes_and_on_numbers():
     laws_in_lanes(x, y, out)
     one_by_one = np.array([[laws(a, b) for a, b in zip(*rows, strict=True)] for rows in zip(x, y, strict=True)])
     np.testing.assert_allclose(out, one_by_one, rtol=1e-10)
-
-
-def test_the_fields_of_a_lane_are_all_the_numbers_of_a_rig(check_rig):
-    numbers = rig_numbers(check_rig())
-    assert {name for name in RigNumbers._fields if isinstance(getattr(numbers, name), float)} == set(NUMBERS)
-
-
-def test_every_lane_has_numbers_of_its_own(check_rig, drive):
-    """Eight rigs that differ in one number each, side by side, are the eight rigs by themselves."""
-    changed = {
-        "q_b": 5e-6,
-        "K_oil": 7.5e8,
-        "M_eq": 14.0,
-        "F_v": 350.0,
-        "V": 2.2e-4,
-        "k_p": 1.4,
-        "B_M": 9e-4,
-        "v_th": 0.02,
-    }
-    rigs = [check_rig(**{name: value}) for name, value in changed.items()]
-    h, n = 5e-4, 2000
-    nodes = np.array(RK4_NODES) * h
-    shape = np.sin(4.0 * (np.arange(n)[:, None] * h + nodes))
-    table = np.array([[getattr(rig_numbers(rig), name) for name in NUMBERS] for rig in rigs]).T[None, None]
-    state = np.ascontiguousarray(np.array([initial_state(rig, 0.0) for rig in rigs]).T[None])
-    drive_rows = np.zeros((1, 2, WIDTH))
-    drive_rows[:, 0] = 3.0
-    pressures, account = np.zeros((1, n, CHANNELS, WIDTH)), np.zeros((1, ACCOUNTS, WIDTH))
-    account[:, LEAST] = np.inf
-    advance_lanes_rk4(
-        (0, 1), state, h, 0, nodes, shape, drive_rows, np.zeros((1, LEAK_ROWS, WIDTH)), np.ascontiguousarray(table),
-        np.array([0, n]), rig_numbers(rigs[0]), 1, pressures, 0, account,
-    )  # fmt: skip
-    for lane, rig in enumerate(rigs):
-        alone = drive(rig, n * h, rate=2000.0, step=h)
-        np.testing.assert_allclose(pressures[0, :, 0, lane], alone["p_A"], rtol=0, atol=1e-4)
-        assert account[0, LEAST, lane] == pytest.approx(min(alone["p_A"].min(), alone["p_B"].min()), abs=1e-4)
-    assert np.ptp(pressures[0, -1, 0]) > 1000.0
-    assert len(OUTPUTS) == 21
 
 
 def test_the_machine_code_works_on_whole_registers():

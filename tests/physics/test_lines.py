@@ -19,7 +19,6 @@ from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.physics.cylinder import opposing_force
 from sealscope.physics.fluid import kinematic_viscosity, thermal_density, thermal_stiffness
-from sealscope.physics.lanes import WIDTH
 from sealscope.physics.pump import friction_torque, loss_coefficients, turbulent_slip
 from sealscope.physics.restrictors import (
     behind_shut_off,
@@ -30,11 +29,9 @@ from sealscope.physics.restrictors import (
     implicit_orifice_flow,
     orifice_flow,
 )
-from sealscope.physics.rig import NUMBERS, rig_numbers
-from sealscope.physics.solvers.imex import IMEX_NODES
+from sealscope.physics.rig import rig_numbers
 from sealscope.physics.standstill import initial_state
-from sealscope.physics.vector.runs import ACCOUNTS, CHANNELS, LEAK_ROWS, advance_lanes_imex
-from sealscope.simulation.batch.run import in_lanes
+from sealscope.simulation.batch.batch import simulate_batch
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults import Fault, parse_fault
 from sealscope.simulation.leaks import Between
@@ -49,6 +46,8 @@ PARTS = {
     **{"R_A": 2e9, "R_B": 5e9, "open_B": 0.3, "G_circ": 1e-9, "B_M": 1e-3},
     **{"A_opp": "100[mm^2]", "p_opp": "1 MPa", "C_opp": 1e-7},
 }
+QUIET = {f"sensors.{channel}.{what}": 0.0 for channel in ("p_A", "p_B") for what in ("noise", "drift")}
+QUIET["sensors.common_noise"] = 0.0
 #: The line shuts and the pump's oil circulates meanwhile.
 OPERATED = ("shut-off A to 0 % from 1 s to 1.6 s within 0.2 s", "circulation from 1 s to 1.6 s within 0.2 s")
 
@@ -301,27 +300,16 @@ def clogged_R(V, R, k):
 
 
 @pytest.mark.slow
-def test_lanes_run_all_parts_as_a_run_by_itself_does(drive):
-    """Two rigs side by side, each with numbers of its own, held still."""
+def test_lanes_run_all_parts_as_a_run_by_itself_does(details_of):
+    """Two rigs side by side, each with numbers of its own."""
     clogging = {**PARTS, "k_clog_A": 2e5, "k_clog_B": 1e5, "n_clog": 1.5, "p_bypass": 5e4, "G_bypass": 1e-9}
     other = {"R_A": 8e9, "T_f": 0.2, "C_opp": 2e-7, "open_A": 0.4, "k_clog_A": 5e5, "n_clog": 1.0, "p_bypass": 3e4}
-    rigs = [rig_with(**clogging), rig_with(**{**clogging, **other})]
-    h, n = 2.5e-4, 1600
-    nodes = np.array(IMEX_NODES) * h
-    shape = np.sin(4.0 * (np.arange(n)[:, None] * h + nodes))
-    numbers = [[getattr(rig_numbers(rig), name) for name in NUMBERS] for rig in rigs]
-    states = in_lanes(np.array([initial_state(rig, 0.0) for rig in rigs]), WIDTH)
-    drive_rows = in_lanes(np.array([[3.0, 0.0], [3.0, 0.0]]), WIDTH)
-    pressures, account = np.zeros((1, n, CHANNELS, WIDTH)), np.full((1, ACCOUNTS, WIDTH), np.inf)
-    advance_lanes_imex(
-        (0, 1), states, h, 0, nodes, shape, drive_rows, np.zeros((1, LEAK_ROWS, WIDTH)),
-        in_lanes(np.array(numbers)[:, None], WIDTH), np.array([0, n]), rig_numbers(rigs[0]), 1,
-        pressures, 0, account,
-    )  # fmt: skip
-    for lane, rig in enumerate(rigs):
-        alone = drive(rig, n * h, rate=4000.0, step=h)
-        np.testing.assert_allclose(pressures[0, :, 0, lane], alone["p_A"], rtol=0, atol=1e-3)
-    assert np.abs(np.diff(pressures[0, :, 0, :2])).max() > 1e3
+    options = {"command": "3 sin(4t)", "duration": 2.0, "step": 2.5e-4, "allow_unresolved": True}
+    runs = [Experiment.of(rig=rig_with(**{**clogging, **QUIET, **more}), **options) for more in ({}, other)]
+    batch = simulate_batch(runs, bounds=[0.0, 2.0])
+    for k, one in enumerate(runs):
+        np.testing.assert_allclose(batch.rms[k], details_of(simulate_with_truth(one).recording, [0.0, 2.0]), rtol=1e-6)
+    assert np.abs(batch.rms[0] / batch.rms[1] - 1.0).max() > 0.01
 
 
 @pytest.mark.parametrize(
@@ -347,13 +335,6 @@ def test_an_impossible_line_is_one_line(values, fault, rule):
     with pytest.raises(InputError, match=rule) as refused:
         Experiment.of(set=values, fault=fault, duration=3.0)
     assert "\n" not in str(refused.value)
-
-
-def test_a_batch_refuses_thinning_leaks():
-    from sealscope.simulation.batch.run import refuse
-
-    with pytest.raises(InputError, match=r"no leak while the oil's temperature changes"):
-        refuse(Experiment.of(leak="0.01 L/min", fault="oil +5 K", duration=2.0), 0)
 
 
 def test_operations_are_read_back_from_their_own_words():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import tracemalloc
 from dataclasses import replace
 
@@ -10,10 +11,9 @@ import pytest
 from scipy import stats
 
 from sealscope.compiled import kernel
-from sealscope.errors import InputError, SimulationFailed
+from sealscope.errors import InputError, MissingExtra, SimulationFailed
 from sealscope.parameters import load_rig
 from sealscope.physics.lanes import WIDTH, load, store
-from sealscope.signals.details import details
 from sealscope.simulation.batch.batch import DETAILS, simulate_batch
 from sealscope.simulation.batch.noise import half_turn_sine, keys, logarithm, normals
 from sealscope.simulation.bench.machines import draw
@@ -28,17 +28,13 @@ NAMES = ("p_A", "p_B")
 COMMON = {"step": 5e-4, "allow_unresolved": True}
 
 
-def rms_of(recording, bounds):
-    """RMS of d1..d4 and d3d4 of both chambers between bounds [s], straight from the transform: (2, segments, 5)."""
-    result = np.empty((2, len(bounds) - 1, 5))
-    for channel, name in enumerate(NAMES):
-        one = details(recording[name])
-        inside = one.inside()
-        at = np.clip(np.round(np.asarray(bounds) * recording.rate).astype(int), inside.start, inside.stop)
-        rows = np.vstack([one.values, one.product()[None]])
-        for k in range(len(bounds) - 1):
-            result[channel, k] = np.sqrt(np.mean(rows[:, at[k] : at[k + 1]] ** 2, axis=1))
-    return result
+#: Rigs that differ in one number each.
+CHANGED = [{"q_b": 5e-6}, {"K_oil": 7.5e8}, {"M_eq": 14.0}, {"F_v": 350.0}, {"V": 2.2e-4}, {"k_p": 1.4}, {"v_th": 0.02}]
+
+
+@pytest.fixture
+def rms_of(details_of):
+    return details_of
 
 
 @pytest.mark.parametrize(
@@ -50,19 +46,19 @@ def rms_of(recording, bounds):
         pytest.param("fixed", True, id="fixed-throttled", marks=pytest.mark.slow),
     ],
 )
-def test_each_run_is_what_it_is_by_itself(check_rig, throttled, volumes):
+def test_each_run_is_what_it_is_by_itself(check_rig, rms_of, throttled, volumes):
     leaks = [None, "G = 6e-13 from 4 s", "C = 2e-10 from 3 s", "G = 1e-12 growing from 2 s to 9 s", "G = 6e-13"]
     bounds = [0.0, 2.5, 4.0, 10.0]
     experiments = [
         Experiment.of(
-            rig=check_rig(throttled, volumes=volumes, p_charge="0.5[MPa]", F_v=280.0 + 20.0 * k, **QUIET),
+            rig=check_rig(throttled, volumes=volumes, p_charge="0.5[MPa]", **QUIET, **changed),
             command=f"{2 + 0.2 * k} sin(4t {'+ 0.2' if k % 2 else ''}) + 0.05",
-            leak=leak,
+            leak=leaks[k % len(leaks)],
             duration=10.0,
             seed=k,
             **COMMON,
         )
-        for k, leak in enumerate(leaks)
+        for k, changed in enumerate(CHANGED)
     ]
     batch = simulate_batch(experiments, bounds=bounds)
     for k, one in enumerate(experiments):
@@ -79,7 +75,7 @@ def test_each_run_is_what_it_is_by_itself(check_rig, throttled, volumes):
 
 
 @pytest.mark.slow
-def test_single_rods_run_side_by_side():
+def test_single_rods_run_side_by_side(rms_of):
     rig = load_rig("single-rod-eha").with_overrides({**FINE, "sensors.p_A.range_hi": 1e8})
     options = {"command": "5 sin(2t)", "duration": 4.0, "step": 1e-4, "allow_unresolved": True}
     experiments = [
@@ -93,7 +89,7 @@ def test_single_rods_run_side_by_side():
     assert np.all(np.ptp(batch.rms, axis=0) > 0)
 
 
-def test_hum_is_read_as_by_itself_up_to_its_phase(check_rig):
+def test_hum_is_read_as_by_itself_up_to_its_phase(check_rig, rms_of):
     values = {**FINE, "sensors.p_A.hum": 1e5, "sensors.p_A.hum_frequency": 50.0}
     one = Experiment.of(rig=check_rig(**values), command="0 sin(t)", duration=8.0)
     batch = simulate_batch([one], bounds=[0.0, 8.0])
@@ -101,24 +97,26 @@ def test_hum_is_read_as_by_itself_up_to_its_phase(check_rig):
     assert batch.rms[0, 0, 0, 2] > 1e4
 
 
-def test_other_commands_and_drifting_machines_are_what_they_are_by_themselves():
-    for seed in (3, 4):
-        machine = draw("bench", seed, duration=12.0)
-        one = machine.experiment(duration=12.0)
-        one = replace(one, rig=one.rig.with_overrides(FINE), step=5e-4 if one.rig.line.orifices == "absent" else 1e-3)
-        one = replace(one, allow_unresolved=True)
-        assert one.drifts
-        bounds = [0.0, 6.0, 12.0]
-        # drifts are held over other cells than in a run by itself, and the ringing answers to friction's last per cent
-        np.testing.assert_allclose(
-            simulate_batch([one], bounds=bounds).rms[0], rms_of(simulate_with_truth(one).recording, bounds), rtol=3e-2
-        )
+@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.slow)])  # without throttles, and with
+def test_drifting_machines_are_what_they_are_by_themselves(rms_of, seed):
+    one = draw("bench", seed, duration=12.0).experiment(duration=12.0)
+    one = replace(one, rig=one.rig.with_overrides(FINE), step=5e-4 if one.rig.line.orifices == "absent" else 1e-3)
+    one = replace(one, allow_unresolved=True)
+    assert one.drifts
+    bounds = [0.0, 6.0, 12.0]
+    # drifts are held over other cells than in a run by itself, and the ringing answers to friction's last per cent
+    np.testing.assert_allclose(
+        simulate_batch([one], bounds=bounds).rms[0], rms_of(simulate_with_truth(one).recording, bounds), rtol=3e-2
+    )
+
+
+def test_other_commands_are_what_they_are_by_themselves(rms_of):
     noisy = Experiment.of(command="prbs 1 every 0.5 s seed 4", set=QUIET, duration=8.0, **COMMON)
     result = simulate_batch([noisy], bounds=[0.0, 8.0]).rms[0]
     np.testing.assert_allclose(result, rms_of(simulate_with_truth(noisy).recording, [0.0, 8.0]), rtol=1e-6)
 
 
-def test_a_fault_of_the_machine_comes_in_when_it_does_by_itself():
+def test_a_fault_of_the_machine_comes_in_when_it_does_by_itself(rms_of):
     one = Experiment.of(fault="friction x1.5 from 5.13 s", set=QUIET, duration=10.0, **COMMON)
     bounds = [0.0, 5.0, 10.0]
     result = simulate_batch([one], bounds=bounds).rms[0]
@@ -126,7 +124,7 @@ def test_a_fault_of_the_machine_comes_in_when_it_does_by_itself():
     assert np.abs(result[0, 1] / result[0, 0] - 1.0).max() > 0.05
 
 
-def test_valves_in_the_lines_move_as_they_do_by_themselves(check_rig):
+def test_valves_in_the_lines_move_as_they_do_by_themselves(check_rig, rms_of):
     rig = check_rig(True, volumes="position", p_charge="2 MPa", G_circ=2e-10, **QUIET)
     moves = [f"{what} from 2 s to 3.1 s within 0.2 s" for what in ("shut-off A to 0 %", "circulation")]
     options = {"rig": rig, "command": "3 sin(4t)", "duration": 5.0, "step": 2.5e-4, "allow_unresolved": True}
@@ -142,7 +140,7 @@ def test_valves_in_the_lines_move_as_they_do_by_themselves(check_rig):
 
 
 @pytest.mark.slow
-def test_loads_push_side_by_side_as_they_do_by_themselves(check_rig):
+def test_loads_push_side_by_side_as_they_do_by_themselves(check_rig, rms_of):
     """Over time, two kinds of them, and over position and velocity."""
     loads = [
         "300 N sin(3t)",
@@ -162,7 +160,7 @@ def test_loads_push_side_by_side_as_they_do_by_themselves(check_rig):
 
 
 @pytest.mark.slow
-def test_oil_boils_side_by_side_as_it_does_by_itself(check_rig):
+def test_oil_boils_side_by_side_as_it_does_by_itself(check_rig, rms_of):
     values = {"p_vap": "2 kPa", "p_charge": "0 Pa", "F_v": 6000.0, **QUIET, "sensors.p_A.range_lo": -2e5}
     rig, bounds = check_rig(**values, **{"sensors.p_B.range_lo": -2e5}), [0.0, 6.0]
     one = Experiment.of(rig=rig, command="9 sin(4t)", duration=6.0, **COMMON)
@@ -266,7 +264,7 @@ def test_memory_does_not_grow_with_the_length_of_the_runs(check_rig):
     assert peak(80.0) < 1.1 * peak(20.0)
 
 
-def test_the_changes_are_those_of_the_thesis_s_statistic(check_rig):
+def test_the_changes_are_those_of_the_thesis_s_statistic(check_rig, rms_of):
     one = Experiment.of(rig=check_rig(**QUIET), leak="G = 3e-12 from 10 s", duration=20.0, step=5e-4)
     batch = simulate_batch([one])
     expected = rms_of(simulate_with_truth(one).recording, [0.0, 10.0, 20.0])
@@ -282,6 +280,7 @@ def test_the_changes_are_those_of_the_thesis_s_statistic(check_rig):
         ({"fault": "sensor p_A offset -2 psi from 2 s"}, r"no fault of a sensor, got .* \(run 1\)"),
         ({"set": {"sensors.p_B.drop_rate": 0.1}}, r"sensors\.p_B\.drop_rate = 0, got 0\.1 \(run 1\)"),
         ({"set": {"motor.integrator": "euler"}}, r"motor\.integrator = state, got euler \(run 1\)"),
+        ({"leak": "0.01 L/min", "fault": "oil +5 K"}, r"no leak while the oil.s temperature changes \(run 1\)"),
         ({"duration": 5.0}, r"one duration, got 4 and 5 \(run 1\)"),
     ],
 )
@@ -303,7 +302,7 @@ def test_bad_calls_and_bad_runs_are_refused(check_rig):
         simulate_batch([replace(good, step=1 / 500)])
 
 
-def test_late_channels_are_read_late(check_rig):
+def test_late_channels_are_read_late(check_rig, rms_of):
     values = {**QUIET, "sensors.p_A.delay": "0.7 [ms]", "sensors.p_B.delay": "3 [ms]"}
     one = Experiment.of(rig=check_rig(**values), duration=6.0, step=5e-4)
     prompt = Experiment.of(rig=check_rig(**QUIET), duration=6.0, step=5e-4)
@@ -315,7 +314,7 @@ def test_late_channels_are_read_late(check_rig):
 
 
 @pytest.mark.slow
-def test_valve_controlled_runs_side_by_side_are_what_they_are_by_themselves():
+def test_valve_controlled_runs_side_by_side_are_what_they_are_by_themselves(rms_of):
     bounds = [0.0, 2.5, 5.0]
     experiments = [
         Experiment.of(
@@ -334,3 +333,35 @@ def test_valve_controlled_runs_side_by_side_are_what_they_are_by_themselves():
         alone = simulate_with_truth(one)
         np.testing.assert_allclose(batch.rms[k], rms_of(alone.recording, bounds), rtol=1e-6)
         assert batch.mean_leak_lpm[k] == pytest.approx(alone.truth.mean_leak_lpm, rel=1e-4, abs=1e-12)
+
+
+def test_a_batch_tells_its_numbers_by_name(monkeypatch):
+    runs = [Experiment.of(duration=4.0, seed=seed) for seed in range(2)]
+    batch = simulate_batch(runs, bounds=[0.0, 1.5, 2.5, 4.0])
+    assert (len(batch), repr(batch)) == (2, "<Batch: 2 runs, segments between 0, 1.5, 2.5, 4 s>")
+    np.testing.assert_array_equal(batch.rms_of("p_B", "d3d4"), batch.rms[:, 1, :, 4])
+    with pytest.raises(InputError, match="channel must be one of p_A, p_B, got 'p_C'"):
+        batch.changes("p_C", "d3")
+    with pytest.raises(InputError, match="detail must be one of d1, d2, d3, d4, d3d4, got 'd5'"):
+        batch.rms_of("p_A", "d5")
+    pytest.importorskip("pandas")
+    table = batch.to_pandas()
+    assert list(table["run"]) == [0, 0, 0, 1, 1, 1]
+    assert list(table["stop [s]"]) == [1.5, 2.5, 4.0] * 2
+    np.testing.assert_array_equal(table["d3 of p_A [Pa]"], batch.rms_of("p_A", "d3").ravel())
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(MissingExtra, match="a table needs pandas"):
+        batch.to_pandas()
+
+
+@pytest.mark.parametrize(
+    ("parts", "rule"),
+    [
+        ({"experiments": ["3 sin(4t)"]}, r"a batch must have experiments .*, got '3 sin\(4t\)'"),
+        ({"error": "20[m]"}, "error must have a unit of pressure"),
+        ({"thread": 1}, "simulate_batch has no argument 'thread'; did you mean 'threads'"),
+    ],
+)
+def test_a_wrong_batch_is_refused_by_name(parts, rule):
+    with pytest.raises(InputError, match=rule):
+        simulate_batch(**{"experiments": [Experiment.of(duration=1.0)], **parts})

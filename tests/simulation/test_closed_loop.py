@@ -11,7 +11,7 @@ import pytest
 from sealscope.control import Measured, PositionPI
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.parameters import load_rig
-from sealscope.physics.rig import rig_numbers
+from sealscope.physics.rig import packed, rig_numbers
 from sealscope.physics.solvers.advance import EXPLICIT, advance
 from sealscope.physics.standstill import initial_state
 from sealscope.simulation.batch.batch import simulate_batch
@@ -112,7 +112,7 @@ def test_a_voltage_acts_after_its_delay_until_the_next_and_the_encoder_counts():
 
 def step_by_step(experiment, path):
     """Return the rows of a run whose voltages are known, one call of the solver from output to output."""
-    p, y, rows = rig_numbers(experiment.rig), initial_state(experiment.rig, 0.0, 0.0), np.empty_like(path.rows)
+    p, y, rows = packed(rig_numbers(experiment.rig)), initial_state(experiment.rig, 0.0, 0.0), np.empty_like(path.rows)
     every = round((path.t[1] - path.t[0]) / path.step)
     u, none = np.empty((every, 3)), np.zeros((every, 3))
     for k, volts in enumerate(path.volts):

@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from itertools import pairwise
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig
-from sealscope.physics.rig import rig_numbers
 from sealscope.simulation.changes import (
-    LONGEST_BLOCK,
-    RESOLUTION,
-    Effect,
     Linear,
     ParameterDrift,
-    Schedule,
     TabulatedDrift,
     Wander,
 )
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.faults import parse_fault
 from sealscope.simulation.instruments import FILTER_REACH, decimate
 from sealscope.simulation.simulate import simulate, simulate_with_truth
 
@@ -99,30 +90,6 @@ def test_the_oil_s_modulus_may_drift_without_making_oil():
     rig = load_rig().with_overrides(values)
     held = rig.cylinder.V * (o["p_A"] + o["p_B"]) + rig.line.V_1 * (o["p_1"] + o["p_2"])
     np.testing.assert_allclose(held, held[0], rtol=1e-9)
-
-
-def test_blocks_are_short_where_it_changes_fast_and_long_where_nothing_changes():
-    base, rate = rig_numbers(load_rig()), 2000.0
-    assert len(Schedule([], base, 10_000, rate).numbers) == 1
-    fault = parse_fault("friction x1.5")
-    step = [
-        replace(e, jumps=(2.2001,), change=lambda t: np.where(t >= 2.2001, 1.5, 1.0)) for e in fault.effects(load_rig())
-    ]
-    result = Schedule(step, base, 10_000, rate)
-    np.testing.assert_array_equal(result.bounds, [0, 4401, 10_000])  # the next output instant
-    assert [one.F_v for one in result.numbers] == [300.0, 450.0]
-    slow = Effect("F_v", lambda t: 1.0 + 1e-4 * t, RESOLUTION)
-    quick = Effect("K_oil", lambda t: 1.0 + np.where(t > 3.0, 1e-2 * (t - 3.0), 0.0), RESOLUTION, jumps=(3.0,))
-    result = Schedule([slow, quick], base, 10_000, rate)
-    lengths = np.diff(result.bounds) / rate
-    assert lengths.max() == LONGEST_BLOCK
-    assert lengths[result.bounds[:-1] / rate >= 3.0].max() <= 0.05 + 1e-9
-    moved = np.abs(np.diff([one.K_oil for one in result.numbers])) / base.K_oil
-    assert moved.max() <= RESOLUTION * 1.001
-    covered = [part for first in range(0, 10_000, 700) for part in result.within(first, min(first + 700, 10_000))]
-    assert covered[0][0] == 0
-    assert covered[-1][1] == 10_000
-    assert all(one[1] == other[0] for one, other in pairwise(covered))
 
 
 @pytest.mark.parametrize(

@@ -57,7 +57,9 @@ class Started:
     def __call__(self, measured: Measured) -> float:
         """Return the voltage [V] of the next sample."""
         self._measured[:] = measured
-        return float(self._call(*self._blocks))
+        volts = float(self._call(*self._blocks))
+        raise_within(self._law)
+        return volts
 
     @property
     def compensated(self) -> float:
@@ -70,6 +72,44 @@ class Started:
 
 #: The type of a law's function in C.
 LAW = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p)
+
+
+class _Called:
+    """A controller in Python as a law that is called by its address."""
+
+    def __init__(self, voltage: Callable[[Measured], float]) -> None:
+        self._voltage, self._memory = voltage, np.full(1, math.nan)
+        self.raised: BaseException | None = None
+        self._function = LAW(self._volts)
+        address = ctypes.cast(self._function, ctypes.c_void_p).value
+        assert address is not None
+        self.law = CompiledLaw(address, self._memory, self)
+
+    def _volts(self, _memory: int, measured: int) -> float:
+        try:
+            numbers = (ctypes.c_double * len(Measured._fields)).from_address(measured)
+            volts = float(self._voltage(Measured(*numbers)))
+            flow = getattr(self._voltage, "compensated", None)
+            self._memory[0] = math.nan if flow is None else flow
+        except BaseException as error:  # an exception cannot pass through C
+            self.raised = error
+            return math.nan
+        return volts
+
+
+def law_of(controller: Controller) -> CompiledLaw:
+    """Return a controller's law for one run from its beginning: in machine code, or in Python behind an address."""
+    law: CompiledLaw | None = controller.compiled() if hasattr(controller, "compiled") else None
+    return _Called(controller.start()).law if law is None else law
+
+
+def raise_within(law: CompiledLaw) -> None:
+    """Raise what a controller in Python raised when this law, or one within it, was called."""
+    kept: Any = law
+    while isinstance(kept, CompiledLaw):
+        kept = kept.kept
+    if isinstance(kept, _Called) and kept.raised is not None:
+        raise kept.raised
 
 
 class Controller(Protocol):

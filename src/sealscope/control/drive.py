@@ -62,8 +62,21 @@ def check_numbers(what: str, positive: dict[str, float], not_negative: dict[str,
             raise InputError(f"{name} of {what} must be >= 0, got {value}")
 
 
+class _Invertible:
+    """What turns a flow into a voltage by its block of numbers."""
+
+    def block(self, rate: float, dead: float = 0.0) -> Array:
+        """Return the numbers of the inverse, called at `rate` [Hz], as `drive_voltage` takes them."""
+        raise NotImplementedError
+
+    def inverse(self, rate: float) -> Callable[[float, float], float]:
+        """Return the voltage [V] as a function of its flow [m^3/s] and p_A - p_B [Pa], called at `rate` [Hz]."""
+        block = self.block(rate)
+        return lambda flow, dp: float(drive_voltage(block, flow, dp))
+
+
 @dataclass(frozen=True)
-class Drive:
+class Drive(_Invertible):
     """What a controller assumes of pump and drive.
 
     Eqs. (4.3), (4.4) without the winding's inductance: k_p (omega_d - omega) + K_i integral = C_e omega + R_c i, so
@@ -95,13 +108,6 @@ class Drive:
         shortfall, corner = (motor.C_e / motor.k_p, motor.K_i / motor.k_p) if motor.k_p > 0 else (0.0, 0.0)
         droop = motor.R_c * displacement / (motor.C_m * motor.C_e)
         return cls(displacement, motor.omega_per_volt, shortfall, corner, droop)
-
-    def inverse(self, rate: float) -> Callable[[float, float], float]:
-        """Return a function of a flow [m^3/s] and a pressure difference [Pa], called at `rate` [Hz]: the voltage [V].
-
-        The voltage makes the pump give the flow against the pressure difference (p_A - p_B).
-        """
-        return _inverse(self.block(rate))
 
     @property
     def lag(self) -> float:
@@ -140,7 +146,7 @@ class Drive:
 
 
 @dataclass(frozen=True)
-class ValveDrive:
+class ValveDrive(_Invertible):
     """What a controller assumes of a servo valve and its supply.
 
     Q = Q_N u/u_N sqrt((p_s - sign(Q) dp)/(2 dp_N)) of a valve with equal edges, half of the pressure lost at each of
@@ -166,13 +172,6 @@ class ValveDrive:
         pumped = rig.pump.q_b / (2.0 * math.pi) * supply.omega_P
         return cls(valve.Q_N, valve.dp_N, valve.u_N, supply.p_set + pumped / supply.G_set)
 
-    def inverse(self, rate: float) -> Callable[[float, float], float]:
-        """Return a function of a flow [m^3/s] and a pressure difference [Pa], called at `rate` [Hz]: the voltage [V].
-
-        The voltage makes the valve give the flow against the pressure difference (p_A - p_B).
-        """
-        return _inverse(self.block(rate))
-
     def block(self, rate: float, dead: float = 0.0) -> Array:
         """Return the numbers of the inverse as `drive_voltage` takes them.
 
@@ -187,10 +186,6 @@ class ValveDrive:
     def largest(self, u_max: float) -> float:
         """Return the flow [m^3/s] at the voltage `u_max` [V], without a load."""
         return u_max / self.steady(1.0)
-
-
-def _inverse(block: Array) -> Callable[[float, float], float]:
-    return lambda flow, dp: float(drive_voltage(block, flow, dp))
 
 
 def drive_of(rig: Rig) -> Drive | ValveDrive:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from sealscope.compiled import address_of, call_at, entry, pointer_at
-from sealscope.control.controller import ANGLE, P_A, P_B, CompiledLaw, Controller, Measured, Started, X
+from sealscope.control.controller import ANGLE, P_A, P_B, CompiledLaw, Controller, Measured, Started, X, law_of
 from sealscope.control.drive import DRIVE_BLOCK, Drive, check_numbers, drive_voltage
 from sealscope.control.leak_observer import SHUT, Balance, conductance, observed, observer_block
 from sealscope.control.position import PositionPI
@@ -29,18 +29,16 @@ _SIGNIFICANT = 4.0
 _COUNTS = 0.5
 #: Blocks that the observer must have used.
 _FEWEST = 4
-#: Places of the law's numbers in its block: law and memory of the inner one, as addresses, or 0 and its voltage where
-#: it is no machine code; the last are those of the drive's inverse and of the observer.
-_COMPENSATED, _INNER, _ITS_MEMORY, _ITS_VOLTAGE, _U_MAX, _ASSUMED, _KNOWN, _AVERAGED, _BLENDED = range(9)
-_MEAN_A, _MEAN_B, _G, _STANDS_OUT, _X_STEP, _AREA, _DRIVE = range(9, 16)
+#: Places of the law's numbers in its block: law and memory of the inner one, as addresses; the last are those of the
+#: drive's inverse and of the observer.
+_COMPENSATED, _INNER, _ITS_MEMORY, _U_MAX, _ASSUMED, _KNOWN, _AVERAGED, _BLENDED = range(8)
+_MEAN_A, _MEAN_B, _G, _STANDS_OUT, _X_STEP, _AREA, _DRIVE = range(8, 15)
 _OBSERVER = _DRIVE + DRIVE_BLOCK
 
 
 @entry
 def _tolerant_law(m: Any, measured: Any) -> Any:
-    u = m[_ITS_VOLTAGE]
-    if m[_INNER] != 0.0:
-        u = call_at(int(m[_INNER]), int(m[_ITS_MEMORY]), address_of(measured))
+    u = call_at(int(m[_INNER]), int(m[_ITS_MEMORY]), address_of(measured))
     if math.isnan(m[_MEAN_A]):
         m[_MEAN_A], m[_MEAN_B] = measured[P_A], measured[P_B]
     m[_MEAN_A] += m[_AVERAGED] * (measured[P_A] - m[_MEAN_A])
@@ -122,40 +120,16 @@ class FaultTolerant:
 
     def start(self) -> Callable[[Measured], float]:
         """Return a function from what is measured to the voltage [V], for one run from its beginning."""
-        law = self.compiled()
-        return _Beside(self) if law is None else Started(law)
+        return Started(self.compiled())
 
-    def compiled(self) -> CompiledLaw | None:
-        """Return the law in machine code, for one run from its beginning; None where the inner one has none."""
-        inner = self.inner.compiled() if hasattr(self.inner, "compiled") else None
-        return None if inner is None else self.around(inner)
-
-    def around(self, inner: CompiledLaw | None) -> CompiledLaw:
-        """Return the law around an inner one, or around the voltage that it is given (`_Beside`)."""
-        balance, rate = self.balance, self.rate
+    def compiled(self) -> CompiledLaw:
+        """Return the law in machine code, for one run from its beginning; it calls the inner one."""
+        inner, balance, rate = law_of(self.inner), self.balance, self.rate
         m = np.zeros(_OBSERVER)
-        if inner is not None:
-            m[_INNER], m[_ITS_MEMORY] = inner.address, inner.memory.ctypes.data  # below 2^53: exact as doubles
+        m[_INNER], m[_ITS_MEMORY] = inner.address, inner.memory.ctypes.data  # below 2^53: exact as doubles
         m[_U_MAX], m[_ASSUMED], m[_KNOWN] = self.u_max, self.G_assumed, self.known is not None
         m[_AVERAGED], m[_BLENDED] = (1.0 - math.exp(-1.0 / (rate * lag)) for lag in (_PRESSURE_LAG, _BLEND))
         m[_MEAN_A] = m[_MEAN_B] = math.nan
         m[_G], m[_X_STEP], m[_AREA] = self.known or 0.0, balance.x_step, min(balance.area_A, balance.area_B)
         m[_DRIVE:_OBSERVER] = self.drive.block(rate)
         return CompiledLaw(_tolerant_law.address, np.r_[m, observer_block(balance, rate)], inner)
-
-
-class _Beside:
-    """One run of a fault-tolerant controller around one in Python."""
-
-    def __init__(self, law: FaultTolerant) -> None:
-        self._inner, self._law = law.inner.start(), law.around(None)
-        self._outer = Started(self._law)
-
-    def __call__(self, measured: Measured) -> float:
-        self._law.memory[_ITS_VOLTAGE] = self._inner(measured)
-        return self._outer(measured)
-
-    @property
-    def compensated(self) -> float:
-        """Leakage flow that is made good [m^3/s]."""
-        return self._outer.compensated

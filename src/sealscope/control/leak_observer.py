@@ -139,30 +139,16 @@ class LeakObserver:
     for side B; dtheta_in is what the pump turned towards that side, whose oil it draws at the other pressure. Beside G
     the filter holds the errors of 1/K and of the area, as shares. Friction and load do not enter.
 
-    `G` [m^3/(s Pa)] and `sd`; `blocks`: how many were used. The law is `observed`, compiled.
+    The law is `observed`, compiled.
     """
 
     def __init__(self, balance: Balance, rate: float) -> None:
         self._block = observer_block(balance, rate)
 
-    @property
-    def G(self) -> float:
-        """Estimated conductance [m^3/(s Pa)]."""
-        return float(conductance(self._block)[0])
-
-    @property
-    def sd(self) -> float:
-        """Deviation of the estimate [m^3/(s Pa)]."""
-        return float(conductance(self._block)[1])
-
-    @property
-    def blocks(self) -> int:
-        """How many blocks were used."""
-        return round(conductance(self._block)[2])
-
-    def update(self, theta: float, x: float, p_A: float, p_B: float) -> None:
-        """Take a sample in: angle [rad], position [m], pressures [Pa]."""
+    def update(self, theta: float, x: float, p_A: float, p_B: float) -> tuple[float, float, float]:
+        """Take a sample in: angle [rad], position [m], pressures [Pa]; return the estimate (`conductance`)."""
         observed(self._block, float(theta), float(x), float(p_A), float(p_B))
+        return conductance(self._block)  # type: ignore[no-any-return]
 
 
 def observer_block(balance: Balance, rate: float) -> Array:

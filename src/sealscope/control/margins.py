@@ -78,7 +78,7 @@ def margins(rig: Rig, controller: Controller, speed: float = 0.0, load: float = 
 
 
 def _linearised(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array, Array, Array]:
-    from sealscope.physics.rig import rig_numbers
+    from sealscope.physics.rig import packed, rig_numbers
     from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, advance, nodes_of
     from sealscope.physics.solvers.limits import longest_step
     from sealscope.physics.standstill import initial_state
@@ -93,7 +93,7 @@ def _linearised(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array
         n = samples * steps
         after, rows = np.array(y), np.empty((samples, len(OUTPUTS)))
         volts, none, force = np.full((n, nodes), u), np.zeros((n, nodes)), np.full((n, nodes), load)
-        advance(implicit, after, h, volts, none, none, force, p, euler, steps, rows)
+        advance(implicit, after, h, volts, none, none, force, packed(p), euler, steps, rows)
         return after
 
     y, u = initial_state(rig, 0.0, load), 0.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Literal
 
 from sealscope.parameters.fields import Part, choice, quantity
 
@@ -16,28 +16,28 @@ class Cylinder(Part):
     Double-rod where A_A = A_B, single-rod where not.
     """
 
-    A_A: Annotated[float, quantity("piston area on side A", "m^2", gt=0, le=10)]
-    A_B: Annotated[float, quantity("piston area on side B", "m^2", gt=0, le=10)]
-    L: Annotated[float, quantity("stroke", "m", gt=0, le=100)]
-    M_eq: Annotated[float, quantity("moving mass", "kg", gt=0, le=1e6)]
-    V: Annotated[float, quantity("volume of each side at mid-stroke", "m^3", gt=0, le=100)]
-    V_rod: Annotated[float, quantity("rod in side B at mid-stroke: V less this is left", "m^3", absent=0, ge=0, le=100)]
-    volumes: Annotated[Literal["fixed", "position"], choice("chamber volumes: constant V, or V + A_A x and V - A_B x")]
-    balance: Annotated[
-        Literal["mass", "volume"], choice("what chambers balance where volumes move with the piston", absent="mass")
-    ]
-    k_stop: Annotated[float, quantity("stiffness of the end stop", "N/m", gt=0, le=1e12)]
-    d_stop: Annotated[float, quantity("damping of the end stop", "N s/m", ge=0, le=1e9)]
-    V_hose_A: Annotated[float, quantity("hose on side A: volume beside the chamber's", "m^3", absent=0, ge=0, le=1)]
-    V_hose_B: Annotated[float, quantity("hose on side B: volume beside the chamber's", "m^3", absent=0, ge=0, le=1)]
-    k_load: Annotated[float, quantity("spring of the load about mid-stroke", "N/m", absent=0, ge=0, le=1e9)]
-    d_load: Annotated[float, quantity("damper of the load", "N s/m", absent=0, ge=0, le=1e9)]
-    A_opp: Annotated[float, quantity("piston area of an opposing cylinder (0: none)", "m^2", absent=0, ge=0, le=10)]
-    p_opp: Annotated[float, quantity("pressure that feeds the opposing cylinder", "Pa", absent=0, ge=0, le=1e9)]
-    C_opp: Annotated[float, quantity("coefficient of the orifice in that feed", "m^3/(s Pa^0.5)", absent=1, gt=0, le=1)]
-    F_l: Annotated[float, quantity("constant external load", "N", ge=-1e8, le=1e8)]
-    G_ext_A: Annotated[float, quantity("leakage conductance of the rod seal of A", "m^3/(s Pa)", ge=0, le=1e-6)]
-    G_ext_B: Annotated[float, quantity("leakage conductance of the rod seal of B", "m^3/(s Pa)", ge=0, le=1e-6)]
+    A_A: float = quantity("piston area on side A", "m^2", gt=0, le=10)
+    A_B: float = quantity("piston area on side B", "m^2", gt=0, le=10)
+    L: float = quantity("stroke", "m", gt=0, le=100)
+    M_eq: float = quantity("moving mass", "kg", gt=0, le=1e6)
+    V: float = quantity("volume of each side at mid-stroke", "m^3", gt=0, le=100)
+    V_rod: float = quantity("rod in side B at mid-stroke: V less this is left", "m^3", absent=0, ge=0, le=100)
+    volumes: Literal["fixed", "position"] = choice("chamber volumes: constant V, or V + A_A x and V - A_B x")
+    balance: Literal["mass", "volume"] = choice(
+        "what chambers balance where volumes move with the piston", absent="mass"
+    )
+    k_stop: float = quantity("stiffness of the end stop", "N/m", gt=0, le=1e12)
+    d_stop: float = quantity("damping of the end stop", "N s/m", ge=0, le=1e9)
+    V_hose_A: float = quantity("hose on side A: volume beside the chamber's", "m^3", absent=0, ge=0, le=1)
+    V_hose_B: float = quantity("hose on side B: volume beside the chamber's", "m^3", absent=0, ge=0, le=1)
+    k_load: float = quantity("spring of the load about mid-stroke", "N/m", absent=0, ge=0, le=1e9)
+    d_load: float = quantity("damper of the load", "N s/m", absent=0, ge=0, le=1e9)
+    A_opp: float = quantity("piston area of an opposing cylinder (0: none)", "m^2", absent=0, ge=0, le=10)
+    p_opp: float = quantity("pressure that feeds the opposing cylinder", "Pa", absent=0, ge=0, le=1e9)
+    C_opp: float = quantity("coefficient of the orifice in that feed", "m^3/(s Pa^0.5)", absent=1, gt=0, le=1)
+    F_l: float = quantity("constant external load", "N", ge=-1e8, le=1e8)
+    G_ext_A: float = quantity("leakage conductance of the rod seal of A", "m^3/(s Pa)", ge=0, le=1e-6)
+    G_ext_B: float = quantity("leakage conductance of the rod seal of B", "m^3/(s Pa)", ge=0, le=1e-6)
 
     @property
     def unevenness(self) -> float:
@@ -53,19 +53,15 @@ class Cylinder(Part):
 class Friction(Part):
     """Coulomb, Stribeck and viscous friction of the piston, eqs. (4.20)-(4.22), or another law with the same forces."""
 
-    F_pr: Annotated[float, quantity("preload force of the seals", "N", ge=0, le=1e7)]
-    F_cfr: Annotated[float, quantity("Coulomb friction per pressure", "N/Pa", ge=0, le=1)]
-    C_c: Annotated[float, quantity("transition coefficient", "s/m", gt=0, le=1e6)]
-    K_brk: Annotated[float, quantity("breakaway force over Coulomb force", "1", ge=1, le=100)]
-    F_v: Annotated[float, quantity("viscous friction coefficient", "N s/m", ge=0, le=1e8)]
-    v_th: Annotated[float, quantity("velocity below which friction is linear", "m/s", gt=0, le=10)]
-    coulomb_pressure: Annotated[Literal["sum", "difference"], choice("pressure in the Coulomb force, eq. (4.20)")]
-    law: Annotated[
-        Literal["stribeck", "karnopp", "lugre"], choice("law of friction near standstill", absent="stribeck")
-    ]
-    sigma_0: Annotated[float, quantity("stiffness of the contact, LuGre", "N/m", absent=1e6, gt=0, le=1e12)]
-    sigma_1: Annotated[float, quantity("damping of the contact, LuGre", "N s/m", absent=1e3, ge=0, le=1e9)]
-    backward: Annotated[
-        float, quantity("friction of motion towards -x over that towards +x", "1", absent=1, gt=0, le=100)
-    ]
-    bracket: Annotated[Literal["continuous", "literal"], choice("bracketing of the linear part, eq. (4.22)")]
+    F_pr: float = quantity("preload force of the seals", "N", ge=0, le=1e7)
+    F_cfr: float = quantity("Coulomb friction per pressure", "N/Pa", ge=0, le=1)
+    C_c: float = quantity("transition coefficient", "s/m", gt=0, le=1e6)
+    K_brk: float = quantity("breakaway force over Coulomb force", "1", ge=1, le=100)
+    F_v: float = quantity("viscous friction coefficient", "N s/m", ge=0, le=1e8)
+    v_th: float = quantity("velocity below which friction is linear", "m/s", gt=0, le=10)
+    coulomb_pressure: Literal["sum", "difference"] = choice("pressure in the Coulomb force, eq. (4.20)")
+    law: Literal["stribeck", "karnopp", "lugre"] = choice("law of friction near standstill", absent="stribeck")
+    sigma_0: float = quantity("stiffness of the contact, LuGre", "N/m", absent=1e6, gt=0, le=1e12)
+    sigma_1: float = quantity("damping of the contact, LuGre", "N s/m", absent=1e3, ge=0, le=1e9)
+    backward: float = quantity("friction of motion towards -x over that towards +x", "1", absent=1, gt=0, le=100)
+    bracket: Literal["continuous", "literal"] = choice("bracketing of the linear part, eq. (4.22)")

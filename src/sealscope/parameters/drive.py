@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Literal
 
 from sealscope.parameters.fields import Part, choice, quantity
 
@@ -10,20 +10,20 @@ from sealscope.parameters.fields import Part, choice, quantity
 class Motor(Part):
     """PI-controlled servo motor, eqs. (4.2)-(4.6)."""
 
-    R_c: Annotated[float, quantity("winding resistance", "ohm", gt=0, le=1e4)]
-    L_c: Annotated[float, quantity("winding inductance", "H", gt=0, le=10)]
-    C_e: Annotated[float, quantity("back electromotive force constant", "V s/rad", gt=0, le=1e3)]
-    C_m: Annotated[float, quantity("torque constant", "N m/A", gt=0, le=1e3)]
-    J_M: Annotated[float, quantity("moment of inertia of motor and pump", "kg m^2", gt=0, le=1e3)]
-    B_M: Annotated[float, quantity("viscous damping of motor and pump", "N m s/rad", ge=0, le=1e3)]
-    k_p: Annotated[float, quantity("proportional gain of the speed loop", "V s/rad", ge=0, le=1e6)]
-    K_i: Annotated[float, quantity("integral gain of the speed loop", "V/rad", ge=0, le=1e6)]
-    omega_per_volt: Annotated[float, quantity("commanded speed per volt", "rad/(s V)", gt=0, le=1e4)]
-    V_max: Annotated[float, quantity("largest motor voltage", "V", gt=0, le=1e5)]
-    i_max: Annotated[float, quantity("largest motor current", "A", gt=0, le=1e5)]
-    T_f: Annotated[float, quantity("friction torque of motor and pump", "N m", absent=0, ge=0, le=1e4)]
-    omega_f: Annotated[float, quantity("speed below which that friction is linear", "rad/s", absent=1, gt=0, le=1e3)]
-    integrator: Annotated[Literal["state", "euler"], choice("integral of the speed error, eq. (4.2)")]
+    R_c: float = quantity("winding resistance", "ohm", gt=0, le=1e4)
+    L_c: float = quantity("winding inductance", "H", gt=0, le=10)
+    C_e: float = quantity("back electromotive force constant", "V s/rad", gt=0, le=1e3)
+    C_m: float = quantity("torque constant", "N m/A", gt=0, le=1e3)
+    J_M: float = quantity("moment of inertia of motor and pump", "kg m^2", gt=0, le=1e3)
+    B_M: float = quantity("viscous damping of motor and pump", "N m s/rad", ge=0, le=1e3)
+    k_p: float = quantity("proportional gain of the speed loop", "V s/rad", ge=0, le=1e6)
+    K_i: float = quantity("integral gain of the speed loop", "V/rad", ge=0, le=1e6)
+    omega_per_volt: float = quantity("commanded speed per volt", "rad/(s V)", gt=0, le=1e4)
+    V_max: float = quantity("largest motor voltage", "V", gt=0, le=1e5)
+    i_max: float = quantity("largest motor current", "A", gt=0, le=1e5)
+    T_f: float = quantity("friction torque of motor and pump", "N m", absent=0, ge=0, le=1e4)
+    omega_f: float = quantity("speed below which that friction is linear", "rad/s", absent=1, gt=0, le=1e3)
+    integrator: Literal["state", "euler"] = choice("integral of the speed error, eq. (4.2)")
 
 
 class Pump(Part):
@@ -32,22 +32,19 @@ class Pump(Part):
     Laminar slip is `G_pump`, viscous drag is within `motor.B_M`, constant friction within `motor.T_f`.
     """
 
-    q_b: Annotated[float, quantity("displacement", "m^3/rev", gt=0, le=0.1)]
-    G_pump: Annotated[float, quantity("internal leakage conductance of the pump", "m^3/(s Pa)", ge=0, le=1e-6)]
-    G_healthy: Annotated[
-        float,
-        quantity(
-            "most that pump and piston of a healthy machine pass together, as a conductance (0: not known)",
-            "m^3/(s Pa)",
-            absent=0,
-            ge=0,
-            le=1e-6,
-        ),
-    ]
-    C_st: Annotated[float, quantity("turbulent slip coefficient", "1", absent=0, ge=0, le=1)]
-    C_f: Annotated[float, quantity("friction torque over that of the pressure", "1", absent=0, ge=0, le=1)]
-    C_h: Annotated[float, quantity("hydrodynamic torque coefficient", "1", absent=0, ge=0, le=1e6)]
-    omega_max: Annotated[float, quantity("speed limit (informative)", "rad/s", gt=0, le=1e4)]
+    q_b: float = quantity("displacement", "m^3/rev", gt=0, le=0.1)
+    G_pump: float = quantity("internal leakage conductance of the pump", "m^3/(s Pa)", ge=0, le=1e-6)
+    G_healthy: float = quantity(
+        "most that pump and piston of a healthy machine pass together, as a conductance (0: not known)",
+        "m^3/(s Pa)",
+        absent=0,
+        ge=0,
+        le=1e-6,
+    )
+    C_st: float = quantity("turbulent slip coefficient", "1", absent=0, ge=0, le=1)
+    C_f: float = quantity("friction torque over that of the pressure", "1", absent=0, ge=0, le=1)
+    C_h: float = quantity("hydrodynamic torque coefficient", "1", absent=0, ge=0, le=1e6)
+    omega_max: float = quantity("speed limit (informative)", "rad/s", gt=0, le=1e4)
 
 
 class HydraulicLine(Part):
@@ -58,58 +55,51 @@ class HydraulicLine(Part):
     bypass valve. A circulation valve connects the ports of the pump; it is shut unless a run opens it.
     """
 
-    orifices: Annotated[Literal["absent", "present"], choice("throttles and line volumes in the model")]
-    C_d: Annotated[float, quantity("discharge coefficient of the throttle", "1", gt=0, le=1)]
-    d_line: Annotated[float, quantity("bore of the line", "m", gt=0, le=0.5)]
-    closed_A: Annotated[float, quantity("closed fraction of the throttle at A", "1", ge=0, le=0.99)]
-    closed_B: Annotated[float, quantity("closed fraction of the throttle at B", "1", ge=0, le=0.99)]
-    closed_means: Annotated[Literal["area", "diameter"], choice("what the closed fraction is a fraction of")]
-    metering: Annotated[Literal["meter-out", "literal"], choice("which flow is throttled, eqs. (4.9)-(4.12)")]
-    dp_0: Annotated[float, quantity("pressure difference below which the throttle is laminar", "Pa", gt=0, le=1e6)]
-    V_1: Annotated[float, quantity("volume of the line at pump port 1", "m^3", gt=0, le=1)]
-    V_2: Annotated[float, quantity("volume of the line at pump port 2", "m^3", gt=0, le=1)]
-    open_A: Annotated[float, quantity("opening of the shut-off valve in line A", "1", absent=1, ge=0, le=1)]
-    open_B: Annotated[float, quantity("opening of the shut-off valve in line B", "1", absent=1, ge=0, le=1)]
-    G_circ: Annotated[
-        float, quantity("conductance of the circulation valve where it is open", "m^3/(s Pa)", absent=0, ge=0, le=1e-6)
-    ]
-    R_A: Annotated[float, quantity("resistance of the filter in line A", "Pa s/m^3", absent=0, ge=0, le=1e13)]
-    R_B: Annotated[float, quantity("resistance of the filter in line B", "Pa s/m^3", absent=0, ge=0, le=1e13)]
-    k_clog_A: Annotated[
-        float, quantity("rise of R_A per volume that passed, over R_A, at first", "1/m^3", absent=0, ge=0, le=1e9)
-    ]
-    k_clog_B: Annotated[
-        float, quantity("rise of R_B per volume that passed, over R_B, at first", "1/m^3", absent=0, ge=0, le=1e9)
-    ]
-    n_clog: Annotated[
-        float, quantity("law of clogging: 0 cake, 1 intermediate, 1.5 standard, 2 complete", "1", absent=0, ge=0, le=2)
-    ]
-    p_bypass: Annotated[
-        float, quantity("pressure that opens a filter's bypass valve", "Pa", absent=3.5e5, gt=0, le=1e8)
-    ]
-    G_bypass: Annotated[
-        float, quantity("conductance of a filter's bypass above that pressure", "m^3/(s Pa)", absent=0, ge=0, le=1e-6)
-    ]
+    orifices: Literal["absent", "present"] = choice("throttles and line volumes in the model")
+    C_d: float = quantity("discharge coefficient of the throttle", "1", gt=0, le=1)
+    d_line: float = quantity("bore of the line", "m", gt=0, le=0.5)
+    closed_A: float = quantity("closed fraction of the throttle at A", "1", ge=0, le=0.99)
+    closed_B: float = quantity("closed fraction of the throttle at B", "1", ge=0, le=0.99)
+    closed_means: Literal["area", "diameter"] = choice("what the closed fraction is a fraction of")
+    metering: Literal["meter-out", "literal"] = choice("which flow is throttled, eqs. (4.9)-(4.12)")
+    dp_0: float = quantity("pressure difference below which the throttle is laminar", "Pa", gt=0, le=1e6)
+    V_1: float = quantity("volume of the line at pump port 1", "m^3", gt=0, le=1)
+    V_2: float = quantity("volume of the line at pump port 2", "m^3", gt=0, le=1)
+    open_A: float = quantity("opening of the shut-off valve in line A", "1", absent=1, ge=0, le=1)
+    open_B: float = quantity("opening of the shut-off valve in line B", "1", absent=1, ge=0, le=1)
+    G_circ: float = quantity(
+        "conductance of the circulation valve where it is open", "m^3/(s Pa)", absent=0, ge=0, le=1e-6
+    )
+    R_A: float = quantity("resistance of the filter in line A", "Pa s/m^3", absent=0, ge=0, le=1e13)
+    R_B: float = quantity("resistance of the filter in line B", "Pa s/m^3", absent=0, ge=0, le=1e13)
+    k_clog_A: float = quantity(
+        "rise of R_A per volume that passed, over R_A, at first", "1/m^3", absent=0, ge=0, le=1e9
+    )
+    k_clog_B: float = quantity(
+        "rise of R_B per volume that passed, over R_B, at first", "1/m^3", absent=0, ge=0, le=1e9
+    )
+    n_clog: float = quantity(
+        "law of clogging: 0 cake, 1 intermediate, 1.5 standard, 2 complete", "1", absent=0, ge=0, le=2
+    )
+    p_bypass: float = quantity("pressure that opens a filter's bypass valve", "Pa", absent=3.5e5, gt=0, le=1e8)
+    G_bypass: float = quantity(
+        "conductance of a filter's bypass above that pressure", "m^3/(s Pa)", absent=0, ge=0, le=1e-6
+    )
 
 
 class Fluid(Part):
     """The oil, the air in it, and the pressure the closed circuit is charged to."""
 
-    K_oil: Annotated[float, quantity("effective bulk modulus", "Pa", gt=0, le=1e11)]
-    rho: Annotated[float, quantity("density", "kg/m^3", gt=0, le=1e4)]
-    p_charge: Annotated[float, quantity("charge pressure: all pressures at the start", "Pa", ge=0, le=1e8)]
-    air: Annotated[float, quantity("free air in the oil, by volume of oil at atmospheric pressure", "1", ge=0, le=0.5)]
-    n_air: Annotated[float, quantity("polytropic exponent of the air in the oil", "1", ge=1, le=1.4)]
-    p_vap: Annotated[
-        float,
-        quantity("vapour pressure of the oil, absolute; 0: it does not boil", "Pa", absent=0.0, ge=0, le=1e5),
-    ]
-    T_oil: Annotated[
-        float, quantity("temperature of the oil at which the rig's values hold", "K", absent=313.15, gt=200, lt=500)
-    ]
-    nu_40: Annotated[float, quantity("kinematic viscosity at 40 deg C", "m^2/s", absent=32e-6, gt=2e-6, le=1e-2)]
-    nu_100: Annotated[float, quantity("kinematic viscosity at 100 deg C", "m^2/s", absent=5.4e-6, gt=1.5e-6, le=1e-2)]
-    alpha: Annotated[float, quantity("thermal expansion of the oil", "1/K", absent=7e-4, ge=0, le=1e-2)]
+    K_oil: float = quantity("effective bulk modulus", "Pa", gt=0, le=1e11)
+    rho: float = quantity("density", "kg/m^3", gt=0, le=1e4)
+    p_charge: float = quantity("charge pressure: all pressures at the start", "Pa", ge=0, le=1e8)
+    air: float = quantity("free air in the oil, by volume of oil at atmospheric pressure", "1", ge=0, le=0.5)
+    n_air: float = quantity("polytropic exponent of the air in the oil", "1", ge=1, le=1.4)
+    p_vap: float = quantity("vapour pressure of the oil, absolute; 0: it does not boil", "Pa", absent=0.0, ge=0, le=1e5)
+    T_oil: float = quantity("temperature of the oil at which the rig's values hold", "K", absent=313.15, gt=200, lt=500)
+    nu_40: float = quantity("kinematic viscosity at 40 deg C", "m^2/s", absent=32e-6, gt=2e-6, le=1e-2)
+    nu_100: float = quantity("kinematic viscosity at 100 deg C", "m^2/s", absent=5.4e-6, gt=1.5e-6, le=1e-2)
+    alpha: float = quantity("thermal expansion of the oil", "1/K", absent=7e-4, ge=0, le=1e-2)
 
 
 class MakeUp(Part):
@@ -119,23 +109,18 @@ class MakeUp(Part):
     the pressure of the other side opens, also let oil back: what the rod of a single-rod cylinder displaces.
     """
 
-    check_valves: Annotated[
-        Literal["absent", "present", "pilot-operated"], choice("make-up from an accumulator in the model")
-    ]
-    p_crack: Annotated[float, quantity("pressure that opens a check valve", "Pa", ge=0, le=1e7)]
-    G_check: Annotated[float, quantity("conductance of an open check valve", "m^3/(s Pa)", gt=0, le=1e-6)]
-    V_gas: Annotated[float, quantity("gas in the accumulator at the charge pressure", "m^3", gt=0, le=10)]
-    n_gas: Annotated[float, quantity("polytropic exponent of the gas in the accumulator", "1", absent=1, ge=1, le=2)]
-    k_pilot: Annotated[float, quantity("pilot ratio of a pilot-operated check valve", "1", absent=3, gt=0, le=100)]
-    p_open: Annotated[
-        float,
-        quantity(
-            "pressure from cracking to full opening of a pilot-operated check valve", "Pa", absent=5e4, gt=0, le=1e7
-        ),
-    ]
-    p_relief: Annotated[
-        float, quantity("pressure above the accumulator's that opens a relief valve", "Pa", absent=2e7, gt=0, le=1e9)
-    ]
-    G_relief: Annotated[
-        float, quantity("conductance of a relief valve above its pressure", "m^3/(s Pa)", absent=0, ge=0, le=1e-6)
-    ]
+    check_valves: Literal["absent", "present", "pilot-operated"] = choice("make-up from an accumulator in the model")
+    p_crack: float = quantity("pressure that opens a check valve", "Pa", ge=0, le=1e7)
+    G_check: float = quantity("conductance of an open check valve", "m^3/(s Pa)", gt=0, le=1e-6)
+    V_gas: float = quantity("gas in the accumulator at the charge pressure", "m^3", gt=0, le=10)
+    n_gas: float = quantity("polytropic exponent of the gas in the accumulator", "1", absent=1, ge=1, le=2)
+    k_pilot: float = quantity("pilot ratio of a pilot-operated check valve", "1", absent=3, gt=0, le=100)
+    p_open: float = quantity(
+        "pressure from cracking to full opening of a pilot-operated check valve", "Pa", absent=5e4, gt=0, le=1e7
+    )
+    p_relief: float = quantity(
+        "pressure above the accumulator's that opens a relief valve", "Pa", absent=2e7, gt=0, le=1e9
+    )
+    G_relief: float = quantity(
+        "conductance of a relief valve above its pressure", "m^3/(s Pa)", absent=0, ge=0, le=1e-6
+    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Self
+from typing import Self
 
 from pydantic import model_validator
 
@@ -12,21 +12,21 @@ from sealscope.parameters.fields import Part, quantity, with_unit
 class PressureTransducer(Part):
     """One pressure channel; its white noise is independent of the other channels' and of `sensors.common_noise`."""
 
-    range_lo: Annotated[float, quantity("lower end of the range", "Pa", ge=-1e9, le=1e9)]
-    range_hi: Annotated[float, quantity("upper end of the range", "Pa", gt=0, le=1e9)]
-    noise: Annotated[float, quantity("own white noise, standard deviation of a sample", "Pa", ge=0, le=1e8)]
-    offset: Annotated[float, quantity("zero offset", "Pa", ge=-1e8, le=1e8)]
-    gain_error: Annotated[float, quantity("relative gain error", "1", gt=-1, le=1)]
-    drift: Annotated[float, quantity("random walk of the zero, deviation per root second", "Pa/s^0.5", ge=0, le=1e8)]
-    hum: Annotated[float, quantity("amplitude of mains hum", "Pa", ge=0, le=1e8)]
-    hum_frequency: Annotated[float, quantity("frequency of mains hum", "Hz", gt=0, le=1e3)]
-    stuck_rate: Annotated[float, quantity("rate at which the reading gets stuck", "1/s", ge=0, le=1e3)]
-    drop_rate: Annotated[float, quantity("rate of lost samples", "1/s", ge=0, le=1e6)]
-    delay: Annotated[float, quantity("delay: the reading is the pressure of this time before", "s", ge=0, le=1)]
-    lag: Annotated[float, quantity("time constant of the transducer, first order", "s", absent=0, ge=0, le=10)]
-    hum_harmonics: Annotated[
-        float, quantity("amplitude of each harmonic of the hum over the one before it", "1", absent=0, ge=0, le=1)
-    ]
+    range_lo: float = quantity("lower end of the range", "Pa", ge=-1e9, le=1e9)
+    range_hi: float = quantity("upper end of the range", "Pa", gt=0, le=1e9)
+    noise: float = quantity("own white noise, standard deviation of a sample", "Pa", ge=0, le=1e8)
+    offset: float = quantity("zero offset", "Pa", ge=-1e8, le=1e8)
+    gain_error: float = quantity("relative gain error", "1", gt=-1, le=1)
+    drift: float = quantity("random walk of the zero, deviation per root second", "Pa/s^0.5", ge=0, le=1e8)
+    hum: float = quantity("amplitude of mains hum", "Pa", ge=0, le=1e8)
+    hum_frequency: float = quantity("frequency of mains hum", "Hz", gt=0, le=1e3)
+    stuck_rate: float = quantity("rate at which the reading gets stuck", "1/s", ge=0, le=1e3)
+    drop_rate: float = quantity("rate of lost samples", "1/s", ge=0, le=1e6)
+    delay: float = quantity("delay: the reading is the pressure of this time before", "s", ge=0, le=1)
+    lag: float = quantity("time constant of the transducer, first order", "s", absent=0, ge=0, le=10)
+    hum_harmonics: float = quantity(
+        "amplitude of each harmonic of the hum over the one before it", "1", absent=0, ge=0, le=1
+    )
 
     @model_validator(mode="after")
     def _range_is_a_range(self) -> Self:
@@ -38,29 +38,29 @@ class PressureTransducer(Part):
 class PositionEncoder(Part):
     """Encoder of the piston's position."""
 
-    resolution: Annotated[float, quantity("length of one count (0: no quantisation)", "m", ge=0, le=0.1)]
-    noise: Annotated[float, quantity("white noise before counting, standard deviation", "m", ge=0, le=0.1)]
-    scale_error: Annotated[float, quantity("relative error of the scale", "1", gt=-1, le=1)]
+    resolution: float = quantity("length of one count (0: no quantisation)", "m", ge=0, le=0.1)
+    noise: float = quantity("white noise before counting, standard deviation", "m", ge=0, le=0.1)
+    scale_error: float = quantity("relative error of the scale", "1", gt=-1, le=1)
 
 
 class AngleEncoder(Part):
     """Encoder of the motor's angle."""
 
-    counts: Annotated[int, quantity("counts per revolution", "count/rev", gt=0, le=100_000_000)]
+    counts: int = quantity("counts per revolution", "count/rev", gt=0, le=100_000_000)
 
 
 class FlowMeter(Part):
     """Flow meter in the bypass across the piston; it reads both directions."""
 
-    range_hi: Annotated[float, quantity("largest flow read, either way", "m^3/s", gt=0, le=1)]
-    resolution: Annotated[float, quantity("smallest step of the reading (0: none)", "m^3/s", ge=0, le=1)]
-    noise: Annotated[float, quantity("white noise, standard deviation of a sample", "m^3/s", ge=0, le=1)]
+    range_hi: float = quantity("largest flow read, either way", "m^3/s", gt=0, le=1)
+    resolution: float = quantity("smallest step of the reading (0: none)", "m^3/s", ge=0, le=1)
+    noise: float = quantity("white noise, standard deviation of a sample", "m^3/s", ge=0, le=1)
 
 
 class Sensors(Part):
     """Every sensor, by the name of its channel, and the noise that the pressure channels share."""
 
-    common_noise: Annotated[float, quantity("white noise common to the pressure channels", "Pa", ge=0, le=1e8)]
+    common_noise: float = quantity("white noise common to the pressure channels", "Pa", ge=0, le=1e8)
     p_1: PressureTransducer
     p_2: PressureTransducer
     p_A: PressureTransducer
@@ -73,13 +73,13 @@ class Sensors(Part):
 class Daq(Part):
     """Data acquisition board; a transducer's range is spread over `sensor_volts_lo` .. `sensor_volts_hi`."""
 
-    bits: Annotated[int, quantity("resolution of the conversion", "bit", ge=2, le=32)]
-    range: Annotated[float, quantity("input range: plus and minus this voltage", "V", gt=0, le=1e3)]
-    sample_rate: Annotated[float, quantity("sampling rate", "Hz", gt=0, le=1e6)]
-    jitter: Annotated[float, quantity("jitter of the clock, standard deviation", "s", absent=0, ge=0, le=1e-3)]
-    sensor_volts_lo: Annotated[float, quantity("transducer output at range_lo", "V", ge=-1e3, le=1e3)]
-    sensor_volts_hi: Annotated[float, quantity("transducer output at range_hi", "V", ge=-1e3, le=1e3)]
-    u_max: Annotated[float, quantity("largest command: plus and minus this voltage", "V", gt=0, le=1e3)]
+    bits: int = quantity("resolution of the conversion", "bit", ge=2, le=32)
+    range: float = quantity("input range: plus and minus this voltage", "V", gt=0, le=1e3)
+    sample_rate: float = quantity("sampling rate", "Hz", gt=0, le=1e6)
+    jitter: float = quantity("jitter of the clock, standard deviation", "s", absent=0, ge=0, le=1e-3)
+    sensor_volts_lo: float = quantity("transducer output at range_lo", "V", ge=-1e3, le=1e3)
+    sensor_volts_hi: float = quantity("transducer output at range_hi", "V", ge=-1e3, le=1e3)
+    u_max: float = quantity("largest command: plus and minus this voltage", "V", gt=0, le=1e3)
 
     @model_validator(mode="after")
     def _outputs_fit_the_input(self) -> Self:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
+from string import Template
 
 from sealscope.errors import InputError
 from sealscope.parameters.load import load_rig
@@ -47,59 +49,29 @@ def rig_text(name: str, area_A: float, area_B: float, stroke: float, displacemen
     V = (0.5 + _DEAD) * larger * stroke
     size = V / base.cylinder.V
     mass = base.cylinder.M_eq * size
-    stated = "stated when this file was written: replace by drawing or data sheet"
     scaled = f"assumed: that of {base.name}, scaled with the"
-    k_stop = base.cylinder.k_stop
     # side B is the smaller one in V_rod; a rod on side A leaves V to B
     V_rod = max(0.5 * (area_A - area_B) * stroke, 0.0)
-    lines = [
-        f"# {name}: written by `sealscope rigs new`. Each entry has a value, a unit and a source; a source that begins",
-        f'# with "assumed:" is a guess to be replaced. What is not stated here is that of {base.name}:',
-        f"# `sealscope parameters {base.name}`.",
-        "",
-        "[rig]",
-        f'name = "{name}"',
-        f'title = "{"Single" if single else "Double"}-rod cylinder, {1e6 * displacement:g} cm^3 pump"',
-        f'extends = "{base.name}"',
-        "",
-        "# Speed of the motor for a volt of command, speed loop and winding (motor.omega_per_volt, k_p, K_i, R_c, ...)",
-        "# are worth stating next: `sealscope parameters` lists them.",
-        "[pump]",
-        f'q_b = {{ value = {1e6 * displacement:.6g}, unit = "cm^3/rev", source = "{stated}" }}',
-        "",
-        "[cylinder]",
-        f'A_A = {{ value = {1e6 * area_A:.6g}, unit = "mm^2", source = "{stated}" }}',
-        f'A_B = {{ value = {1e6 * area_B:.6g}, unit = "mm^2", source = "{stated}" }}',
-        f'L = {{ value = {1e3 * stroke:.6g}, unit = "mm", source = "{stated}" }}',
-        f'V = {{ value = {1e6 * V:.6g}, unit = "cm^3", source = "assumed: half the swept volume, and a quarter of it '
-        'in dead volume and hoses" }',
-        f'V_rod = {{ value = {1e6 * V_rod:.6g}, unit = "cm^3", source = "assumed: (A_A - A_B) L/2, so that both sides '
-        'have the same dead volume" }',
-        'volumes = { value = "position", source = "assumed: the stroke moves the volumes" }',
-        f'M_eq = {{ value = {mass:.4g}, unit = "kg", source = "{scaled} volume" }}',
-        f'd_stop = {{ value = {math.sqrt(k_stop * mass):.4g}, unit = "N s/m", source = "assumed: half of critical '
-        'damping of the stop" }',
-        "",
-        "[friction]",
-    ]
-    lines += [
-        f'{symbol} = {{ value = {getattr(base.friction, symbol) * factor:.4g}, unit = "{unit}", source = "{scaled} '
-        f'{with_}" }}'
-        for symbol, factor, unit, with_ in (
-            ("F_pr", bore, "N", "bore"),
-            ("F_cfr", bore**2, "N/Pa", "area"),
-            ("F_v", bore, "N s/m", "bore"),
-        )
-    ]
-    if single:
-        gas = _GAS * abs(area_A - area_B) * stroke
-        valve = base.makeup.G_check * size
-        lines += [
-            "",
-            "[makeup]",
-            f'V_gas = {{ value = {1e3 * gas:.4g}, unit = "L", source = "assumed: five times the oil that the rod '
-            'displaces" }',
-            f'G_check = {{ value = {valve:.4g}, unit = "m^3/(s Pa)", source = "{scaled} volume" }}',
-            f'G_relief = {{ value = {valve:.4g}, unit = "m^3/(s Pa)", source = "{scaled} volume" }}',
-        ]
-    return "\n".join(lines) + "\n"
+    friction = base.friction
+    text = Template(Path(__file__).with_name("new_rig.toml.txt").read_text(encoding="utf-8")).substitute(
+        name=name,
+        kind="Single" if single else "Double",
+        base=base.name,
+        stated="stated when this file was written: replace by drawing or data sheet",
+        scaled=scaled,
+        q_b=f"{1e6 * displacement:g}",
+        displacement=f"{1e6 * displacement:.6g}",
+        area_A=f"{1e6 * area_A:.6g}",
+        area_B=f"{1e6 * area_B:.6g}",
+        stroke=f"{1e3 * stroke:.6g}",
+        V=f"{1e6 * V:.6g}",
+        V_rod=f"{1e6 * V_rod:.6g}",
+        M_eq=f"{mass:.4g}",
+        d_stop=f"{math.sqrt(base.cylinder.k_stop * mass):.4g}",
+        F_pr=f"{friction.F_pr * bore:.4g}",
+        F_cfr=f"{friction.F_cfr * bore**2:.4g}",
+        F_v=f"{friction.F_v * bore:.4g}",
+        V_gas=f"{1e3 * _GAS * abs(area_A - area_B) * stroke:.4g}",
+        G_check=f"{base.makeup.G_check * size:.4g}",
+    )
+    return text if single else text[: text.index("\n[makeup]")]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+from typing import Any, Literal, Self
 
 from pydantic import model_validator
 
@@ -22,22 +22,21 @@ class ServoValve(Part):
     orifice whose area grows evenly with the spool's way beyond its overlap.
     """
 
-    spool: Annotated[Literal["absent", "present"], choice("servo valve between supply and cylinder", absent="absent")]
-    Q_N: Annotated[float, quantity("rated flow of an edge at full stroke", "m^3/s", absent=1.6e-4, gt=0, le=1)]
-    dp_N: Annotated[float, quantity("pressure drop of an edge at its rated flow", "Pa", absent=3.5e6, gt=0, le=1e9)]
-    dp_lam: Annotated[
-        float,
-        quantity("pressure difference below which an edge of the valve is laminar", "Pa", absent=5e4, gt=0, le=1e7),
-    ]
-    u_N: Annotated[float, quantity("command at full stroke of the spool", "V", absent=10, gt=0, le=1e3)]
-    x_max: Annotated[float, quantity("stroke of the spool, either way", "m", absent=5e-4, gt=0, le=0.1)]
-    o_PA: Annotated[float, _overlap("P to A")]
-    o_AT: Annotated[float, _overlap("A to T")]
-    o_PB: Annotated[float, _overlap("P to B")]
-    o_BT: Annotated[float, _overlap("B to T")]
-    omega_s: Annotated[float, quantity("natural frequency of the spool", "rad/s", absent=600, gt=0, le=1e5)]
-    zeta_s: Annotated[float, quantity("damping ratio of the spool", "1", absent=0.7, gt=0, le=100)]
-    v_max: Annotated[float, quantity("largest speed of the spool", "m/s", absent=0.1, gt=0, le=1e3)]
+    spool: Literal["absent", "present"] = choice("servo valve between supply and cylinder", absent="absent")
+    Q_N: float = quantity("rated flow of an edge at full stroke", "m^3/s", absent=1.6e-4, gt=0, le=1)
+    dp_N: float = quantity("pressure drop of an edge at its rated flow", "Pa", absent=3.5e6, gt=0, le=1e9)
+    dp_lam: float = quantity(
+        "pressure difference below which an edge of the valve is laminar", "Pa", absent=5e4, gt=0, le=1e7
+    )
+    u_N: float = quantity("command at full stroke of the spool", "V", absent=10, gt=0, le=1e3)
+    x_max: float = quantity("stroke of the spool, either way", "m", absent=5e-4, gt=0, le=0.1)
+    o_PA: float = _overlap("P to A")
+    o_AT: float = _overlap("A to T")
+    o_PB: float = _overlap("P to B")
+    o_BT: float = _overlap("B to T")
+    omega_s: float = quantity("natural frequency of the spool", "rad/s", absent=600, gt=0, le=1e5)
+    zeta_s: float = quantity("damping ratio of the spool", "1", absent=0.7, gt=0, le=100)
+    v_max: float = quantity("largest speed of the spool", "m/s", absent=0.1, gt=0, le=1e3)
 
     @model_validator(mode="after")
     def _edges_open_within_the_stroke(self) -> Self:
@@ -57,24 +56,15 @@ class Supply(Part):
     `drive = "absent"`: none. The pump draws from the return and feeds the line V_1 with an accumulator on it.
     """
 
-    drive: Annotated[
-        Literal["absent", "constant-speed"],
-        choice("drive of the pump that supplies a servo valve", absent="absent"),
-    ]
-    omega_P: Annotated[float, quantity("speed of the supply's pump", "rad/s", absent=157, gt=0, le=1e4)]
-    p_set: Annotated[
-        float,
-        quantity("pressure above the return that opens the relief valve", "Pa", absent=7e6, gt=0, le=1e9),
-    ]
-    G_set: Annotated[
-        float,
-        quantity(
-            "conductance of the supply's relief valve above its pressure", "m^3/(s Pa)", absent=5e-10, gt=0, le=1e-6
-        ),
-    ]
-    p_return: Annotated[float, quantity("pressure of the return line", "Pa", absent=0, ge=0, le=1e8)]
-    V_acc: Annotated[float, quantity("gas in the accumulator at p_pre (0: none)", "m^3", absent=0, ge=0, le=10)]
-    p_pre: Annotated[float, quantity("pressure of the gas in the empty accumulator", "Pa", absent=5e6, ge=0, le=1e9)]
-    n_acc: Annotated[
-        float, quantity("polytropic exponent of the gas in the supply's accumulator", "1", absent=1, ge=1, le=2)
-    ]
+    drive: Literal["absent", "constant-speed"] = choice(
+        "drive of the pump that supplies a servo valve", absent="absent"
+    )
+    omega_P: float = quantity("speed of the supply's pump", "rad/s", absent=157, gt=0, le=1e4)
+    p_set: float = quantity("pressure above the return that opens the relief valve", "Pa", absent=7e6, gt=0, le=1e9)
+    G_set: float = quantity(
+        "conductance of the supply's relief valve above its pressure", "m^3/(s Pa)", absent=5e-10, gt=0, le=1e-6
+    )
+    p_return: float = quantity("pressure of the return line", "Pa", absent=0, ge=0, le=1e8)
+    V_acc: float = quantity("gas in the accumulator at p_pre (0: none)", "m^3", absent=0, ge=0, le=10)
+    p_pre: float = quantity("pressure of the gas in the empty accumulator", "Pa", absent=5e6, ge=0, le=1e9)
+    n_acc: float = quantity("polytropic exponent of the gas in the supply's accumulator", "1", absent=1, ge=1, le=2)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections import namedtuple
+from functools import cache
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
@@ -22,48 +23,10 @@ import numpy as np
 from sealscope.compiled import contracted, law
 from sealscope.parameters import Rig
 from sealscope.parameters.fields import leaves, unit_of
-from sealscope.physics.cylinder import (
-    chamber_volumes,
-    force_over,
-    hard_stop_force,
-    load_force,
-    opposing_force,
-    piston_acceleration,
-    pressure_rate,
-)
-from sealscope.physics.external import (
-    accumulator_compliance,
-    accumulator_pressure,
-    check_valve_flow,
-    external_leakage,
-    gas_volume,
-    pilot_valve_flow,
-    polytropic_pressure,
-)
+from sealscope.physics import cylinder, external, friction, motor, pump, restrictors, valve
 from sealscope.physics.fluid import P_ATM, effective_bulk_modulus, mixture_density_ratio, oil_density_ratio
-from sealscope.physics.friction import (
-    bristle_rate,
-    coulomb_friction,
-    karnopp_friction,
-    lugre_friction,
-    stribeck_friction,
-    stribeck_level,
-    stuck_velocity,
-)
 from sealscope.physics.lanes import select
 from sealscope.physics.leakage import piston_leakage
-from sealscope.physics.motor import controller_voltage, shaft_acceleration, winding_current_rate
-from sealscope.physics.pump import friction_torque, loss_coefficients, pump_flow, pump_torque, turbulent_slip
-from sealscope.physics.restrictors import (
-    behind_valve,
-    clogged_resistance,
-    filtered_flow,
-    flow_through_filter,
-    implicit_orifice_flow,
-    one_way_coefficient,
-    orifice_coefficient,
-    orifice_flow,
-)
 from sealscope.physics.state import (
     BRISTLE,
     CURRENT,
@@ -85,13 +48,6 @@ from sealscope.physics.state import (
     pressures_moved,
 )
 from sealscope.physics.state import OUTPUTS as OUTPUTS  # noqa: PLC0414
-from sealscope.physics.valve import (
-    edge_flow,
-    spool_acceleration,
-    spool_speed,
-    spool_target,
-    spool_within_stroke,
-)
 
 #: Parameters that no law takes under its own symbol: informative ones, those within the throttles' coefficients, the
 #: pump's losses or the volumes of a side, and those of what only changes within a run.
@@ -146,32 +102,9 @@ if TYPE_CHECKING:
         """A rig's parameters as the compiled laws take them: SI floats, choices as truth values."""
 
         _fields: tuple[str, ...]
-        position_dependent: bool
-        coulomb_of_difference: bool
-        literal_bracket: bool
-        made_up: bool
-        throttled: tuple[bool, ...]
-        aerated: tuple[bool, ...]
-        open_circuit: tuple[bool, ...]
-        conserving: tuple[bool, ...]
-        sticking: tuple[bool, ...]
-        bristled: tuple[bool, ...]
-        one_sided: tuple[bool, ...]
-        piloted: tuple[bool, ...]
-        relieved: tuple[bool, ...]
-        polytropic: tuple[bool, ...]
-        damped: tuple[bool, ...]
-        pushed: tuple[Any, ...]
-        valved: tuple[bool, ...]
-        filtered: tuple[bool, ...]
-        lossy: tuple[bool, ...]
-        opposed: tuple[bool, ...]
-        boiling: tuple[bool, ...]
-        clogging: tuple[bool, ...]
-        bypassed: tuple[bool, ...]
 
         def __init__(self, *values: Any, **fields: Any) -> None: ...
-        def __getattr__(self, name: str) -> float: ...
+        def __getattr__(self, name: str) -> Any: ...
         def _replace(self, **fields: Any) -> RigNumbers: ...
         def _asdict(self) -> dict[str, Any]: ...
 
@@ -197,11 +130,14 @@ def coefficients_of_throttles(
     flow towards the cylinder and throttled return on both sides (the text and Appendix A); `literal`: as eqs.
     (4.9)-(4.12) are printed, side B the other way round. Shut-off valves are in series with them (`behind_valve`).
     """
-    free = orifice_coefficient(C_d, math.pi / 4.0 * d_line**2, rho)  # eq. (4.7)
+    free = restrictors.orifice_coefficient(C_d, math.pi / 4.0 * d_line**2, rho)  # eq. (4.7)
     throttled_A = free * (1.0 - closed_A) ** exponent  # eq. (4.8)
     throttled_B = free * (1.0 - closed_B) ** exponent
-    A_in, A_out = behind_valve(free, free, open_A), behind_valve(throttled_A, free, open_A)
-    B_free, B_throttled = behind_valve(free, free, open_B), behind_valve(throttled_B, free, open_B)
+    A_in, A_out = restrictors.behind_valve(free, free, open_A), restrictors.behind_valve(throttled_A, free, open_A)
+    B_free, B_throttled = (
+        restrictors.behind_valve(free, free, open_B),
+        restrictors.behind_valve(throttled_B, free, open_B),
+    )
     if literal:
         return A_in, A_out, B_throttled, B_free
     return A_in, A_out, B_free, B_throttled
@@ -230,7 +166,7 @@ def derived_numbers(
     c_A_in, c_A_out, c_B_in, c_B_out = coefficients_of_throttles(
         C_d, d_line, closed_A, closed_B, open_A, open_B, rho, exponent, literal
     )
-    c_slip, k_h = loss_coefficients(q_b, C_st, C_h, rho)
+    c_slip, k_h = pump.loss_coefficients(q_b, C_st, C_h, rho)
     return c_A_in, c_A_out, c_B_in, c_B_out, V + V_hose_A, V - V_rod + V_hose_B, c_slip, k_h
 
 
@@ -281,6 +217,25 @@ def rig_numbers(rig: Rig) -> RigNumbers:
     )
 
 
+@cache
+def _record(lengths: tuple[int, ...]) -> np.dtype[Any]:
+    """Return the type of the record of `packed`, by the lengths of the laws."""
+    truths = [(name, "?") for name in CHOICES if name not in LAWS]
+    laws = [(name, "f8", (length,)) for name, length in zip(LAWS, lengths, strict=True)]
+    return np.dtype([*((name, "f8") for name in NUMBERS), *truths, *laws], align=True)  # type: ignore[list-item]
+
+
+def packed(p: RigNumbers) -> Any:
+    """Return the numbers as a record, which compiled functions hand on as one address and so compile faster.
+
+    The tables of a load have no place in it: numbers with them are returned as they are.
+    """
+    lengths = tuple(len(getattr(p, name)) for name in LAWS)
+    if len(p.pushed) > 1:
+        return p
+    return np.array([tuple(p)], _record(lengths)).view(np.recarray)[0]
+
+
 @contracted
 def within_limits(y: State, p: RigNumbers) -> State:
     """Return the state after a step: the drive's current is held within its limits.
@@ -295,7 +250,7 @@ def within_limits(y: State, p: RigNumbers) -> State:
     x_s, v_s = 0.0, 0.0
     if len(p.valved) > 0:
         p_1, p_2 = y[P_1], p.p_return
-        x_s, v_s = spool_within_stroke(y[SPOOL], y[SPOOL_SPEED], p.x_max, p.v_max)
+        x_s, v_s = valve.spool_within_stroke(y[SPOOL], y[SPOOL_SPEED], p.x_max, p.v_max)
     if len(p.clogging) > 0:
         x_s, v_s = y[PASSED_A], y[PASSED_B]
     return y[0], current, y[2], y[3], y[4], y[5], y[6], y[7], p_1, p_2, fed, z, x_s, v_s
@@ -312,7 +267,7 @@ def vapour_floor(q: float, p: RigNumbers) -> float:
     """
     if len(p.boiling) == 0:
         return q
-    return max(q, p.p_vap - P_ATM)
+    return max(q, p.p_vap - P_ATM)  # type: ignore[no-any-return]
 
 
 @contracted
@@ -325,8 +280,8 @@ def pressures_of(y: State, p: RigNumbers) -> Pressures:
 def speed_error(y: State, u: float, p: RigNumbers) -> float:
     """Commanded less actual motor speed [rad/s]; the pump of a servo valve's supply has one speed."""
     if len(p.valved) > 0:
-        return p.omega_P - y[OMEGA]
-    return p.omega_per_volt * u - y[OMEGA]
+        return p.omega_P - y[OMEGA]  # type: ignore[no-any-return]
+    return p.omega_per_volt * u - y[OMEGA]  # type: ignore[no-any-return]
 
 
 @contracted
@@ -345,18 +300,20 @@ def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, floa
     `applied` [N]: all other forces on the piston. Eqs. (4.20)-(4.22), unless the rig has another law.
     """
     v = y[VELOCITY]
-    F_C = coulomb_friction(vapour_floor(y[P_A], p), vapour_floor(y[P_B], p), p.F_pr, p.F_cfr, p.coulomb_of_difference)
+    F_C = friction.coulomb_friction(
+        vapour_floor(y[P_A], p), vapour_floor(y[P_B], p), p.F_pr, p.F_cfr, p.coulomb_of_difference
+    )
     F_v, breakaway = p.F_v, p.K_brk * F_C
     if len(p.one_sided) > 0:
         breakaway = select(applied < 0.0, p.backward * breakaway, breakaway)
         side = select(v < 0.0, p.backward, 1.0)
         F_C, F_v = side * F_C, side * F_v
     if len(p.sticking) > 0:
-        return karnopp_friction(v, applied, breakaway, F_C, p.K_brk, p.C_c, F_v, p.v_th), 0.0 * v
+        return friction.karnopp_friction(v, applied, breakaway, F_C, p.K_brk, p.C_c, F_v, p.v_th), 0.0 * v
     if len(p.bristled) > 0:
-        dz = bristle_rate(v, y[BRISTLE], stribeck_level(abs(v), F_C, p.K_brk, p.C_c), p.sigma_0)
-        return lugre_friction(v, y[BRISTLE], dz, p.sigma_0, p.sigma_1, F_v, p.v_th), dz
-    return stribeck_friction(v, F_C, p.K_brk, p.C_c, F_v, p.v_th, p.literal_bracket), 0.0 * v
+        dz = friction.bristle_rate(v, y[BRISTLE], friction.stribeck_level(abs(v), F_C, p.K_brk, p.C_c), p.sigma_0)
+        return friction.lugre_friction(v, y[BRISTLE], dz, p.sigma_0, p.sigma_1, F_v, p.v_th), dz
+    return friction.stribeck_friction(v, F_C, p.K_brk, p.C_c, F_v, p.v_th, p.literal_bracket), 0.0 * v
 
 
 @contracted
@@ -364,8 +321,8 @@ def filter_resistances(y: State, p: RigNumbers) -> tuple[float, float]:
     """Resistances [Pa s/m^3] of the filters in line A and B, as the oil that passed has clogged them."""
     if len(p.clogging) == 0:
         return p.R_A, p.R_B
-    R_A = clogged_resistance(p.R_A, y[PASSED_A], p.k_clog_A, p.n_clog)
-    return R_A, clogged_resistance(p.R_B, y[PASSED_B], p.k_clog_B, p.n_clog)
+    R_A = restrictors.clogged_resistance(p.R_A, y[PASSED_A], p.k_clog_A, p.n_clog)
+    return R_A, restrictors.clogged_resistance(p.R_B, y[PASSED_B], p.k_clog_B, p.n_clog)
 
 
 @contracted
@@ -379,11 +336,13 @@ def implicit_flows(
     if len(p.filtered) > 0:
         R_A, R_B = filter_resistances(y, p)
         if len(p.bypassed) > 0:
-            Q_A = filtered_flow(total_A, g_A, R_A, p.p_bypass, p.G_bypass, p.c_A_in, p.c_A_out, p.dp_0)
-            return Q_A, filtered_flow(total_B, g_B, R_B, p.p_bypass, p.G_bypass, p.c_B_out, p.c_B_in, p.dp_0)
+            Q_A = restrictors.filtered_flow(total_A, g_A, R_A, p.p_bypass, p.G_bypass, p.c_A_in, p.c_A_out, p.dp_0)
+            return Q_A, restrictors.filtered_flow(
+                total_B, g_B, R_B, p.p_bypass, p.G_bypass, p.c_B_out, p.c_B_in, p.dp_0
+            )
         g_A, g_B = g_A + R_A, g_B + R_B
-    Q_A = implicit_orifice_flow(total_A, g_A, p.c_A_in, p.c_A_out, p.dp_0)
-    return Q_A, implicit_orifice_flow(total_B, g_B, p.c_B_out, p.c_B_in, p.dp_0)
+    Q_A = restrictors.implicit_orifice_flow(total_A, g_A, p.c_A_in, p.c_A_out, p.dp_0)
+    return Q_A, restrictors.implicit_orifice_flow(total_B, g_B, p.c_B_out, p.c_B_in, p.dp_0)
 
 
 @contracted
@@ -394,8 +353,8 @@ def passing_filters(y: State, p: RigNumbers) -> tuple[float, float]:
         return abs(Q_A), abs(Q_B)
     R_A, R_B = filter_resistances(y, p)
     return (
-        flow_through_filter(Q_A, R_A, p.p_bypass, p.G_bypass),
-        flow_through_filter(Q_B, R_B, p.p_bypass, p.G_bypass),
+        restrictors.flow_through_filter(Q_A, R_A, p.p_bypass, p.G_bypass),
+        restrictors.flow_through_filter(Q_B, R_B, p.p_bypass, p.G_bypass),
     )
 
 
@@ -410,21 +369,21 @@ def throttle_flows(y: State, p: RigNumbers) -> tuple[float, float]:
     dp_A, dp_B = p_1 - p_A, p_B - p_2
     if len(p.filtered) > 0:
         return implicit_flows(dp_A, dp_B, 0.0, 0.0, y, p)
-    Q_A = orifice_flow(dp_A, one_way_coefficient(dp_A, p.c_A_in, p.c_A_out), p.dp_0)
-    return Q_A, orifice_flow(dp_B, one_way_coefficient(dp_B, p.c_B_out, p.c_B_in), p.dp_0)
+    Q_A = restrictors.orifice_flow(dp_A, restrictors.one_way_coefficient(dp_A, p.c_A_in, p.c_A_out), p.dp_0)
+    return Q_A, restrictors.orifice_flow(dp_B, restrictors.one_way_coefficient(dp_B, p.c_B_out, p.c_B_in), p.dp_0)
 
 
 @contracted
 def volumes_at(x: float, p: RigNumbers) -> tuple[float, float]:
     """Oil volumes [m^3] of both sides, hoses and chambers, at piston position x [m]."""
-    return chamber_volumes(x, p.V_A, p.V_B, p.A_A, p.A_B, p.position_dependent)
+    return cylinder.chamber_volumes(x, p.V_A, p.V_B, p.A_A, p.A_B, p.position_dependent)
 
 
 @contracted
 def bulk_modulus(pressure: float, p: RigNumbers) -> float:
     """Bulk modulus [Pa] of the oil and its air in a volume at `pressure` [Pa]."""
     if len(p.aerated) == 0:
-        return p.K_oil
+        return p.K_oil  # type: ignore[no-any-return]
     return effective_bulk_modulus(vapour_floor(pressure, p), p.K_oil, p.air, p.n_air)
 
 
@@ -462,10 +421,10 @@ def throttle_rates(y: State, Q_A: float, Q_B: float, p: RigNumbers) -> Pressures
     from_1, to_A = volumes_exchanged(Q_A, y[P_1], y[P_A], p)
     from_B, to_2 = volumes_exchanged(Q_B, y[P_B], y[P_2], p)
     return (
-        pressure_rate(to_A, V_A, bulk_modulus(y[P_A], p)),  # eq. (4.18)
-        pressure_rate(-from_B, V_B, bulk_modulus(y[P_B], p)),  # eq. (4.19)
-        pressure_rate(-from_1, p.V_1, bulk_modulus(y[P_1], p)),  # eq. (4.16)
-        pressure_rate(to_2, p.V_2, bulk_modulus(y[P_2], p)),  # eq. (4.17)
+        cylinder.pressure_rate(to_A, V_A, bulk_modulus(y[P_A], p)),  # eq. (4.18)
+        cylinder.pressure_rate(-from_B, V_B, bulk_modulus(y[P_B], p)),  # eq. (4.19)
+        cylinder.pressure_rate(-from_1, p.V_1, bulk_modulus(y[P_1], p)),  # eq. (4.16)
+        cylinder.pressure_rate(to_2, p.V_2, bulk_modulus(y[P_2], p)),  # eq. (4.17)
     )
 
 
@@ -473,8 +432,8 @@ def throttle_rates(y: State, Q_A: float, Q_B: float, p: RigNumbers) -> Pressures
 def supply_pressure(y: State, p: RigNumbers) -> float:
     """Pressure [Pa] of the make-up's accumulator."""
     if len(p.polytropic) > 0:
-        return polytropic_pressure(y[MADE_UP], p.p_charge, p.V_gas, p.n_gas)
-    return accumulator_pressure(y[MADE_UP], p.p_charge, p.V_gas)
+        return external.polytropic_pressure(y[MADE_UP], p.p_charge, p.V_gas, p.n_gas)
+    return external.accumulator_pressure(y[MADE_UP], p.p_charge, p.V_gas)
 
 
 @contracted
@@ -488,15 +447,15 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
     if len(p.throttled) == 0:
         p_1, p_2 = p_A, p_B
     if len(p.piloted) > 0:
-        up_1 = pilot_valve_flow(supply - p_1, p_2 - supply, p.p_crack, p.G_check, p.k_pilot, p.p_open)
-        up_2 = pilot_valve_flow(supply - p_2, p_1 - supply, p.p_crack, p.G_check, p.k_pilot, p.p_open)
+        up_1 = external.pilot_valve_flow(supply - p_1, p_2 - supply, p.p_crack, p.G_check, p.k_pilot, p.p_open)
+        up_2 = external.pilot_valve_flow(supply - p_2, p_1 - supply, p.p_crack, p.G_check, p.k_pilot, p.p_open)
     else:
         G_check = p.G_check if p.made_up else 0.0 * p.G_check
-        up_1 = check_valve_flow(supply - p_1, p.p_crack, G_check)
-        up_2 = check_valve_flow(supply - p_2, p.p_crack, G_check)
+        up_1 = external.check_valve_flow(supply - p_1, p.p_crack, G_check)
+        up_2 = external.check_valve_flow(supply - p_2, p.p_crack, G_check)
     if len(p.relieved) > 0:
-        up_1 = up_1 - check_valve_flow(p_1 - supply, p.p_relief, p.G_relief)
-        up_2 = up_2 - check_valve_flow(p_2 - supply, p.p_relief, p.G_relief)
+        up_1 = up_1 - external.check_valve_flow(p_1 - supply, p.p_relief, p.G_relief)
+        up_2 = up_2 - external.check_valve_flow(p_2 - supply, p.p_relief, p.G_relief)
     return up_1, up_2
 
 
@@ -509,16 +468,16 @@ def outer_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
     V_A, V_B = volumes_at(y[POSITION], p)
     K_A, K_B = bulk_modulus(y[P_A], p), bulk_modulus(y[P_B], p)
     up_1, up_2 = make_up_flows(y, p)
-    out_A, out_B = external_leakage(y[P_A], p.G_ext_A), external_leakage(y[P_B], p.G_ext_B)
+    out_A, out_B = external.external_leakage(y[P_A], p.G_ext_A), external.external_leakage(y[P_B], p.G_ext_B)
     supply = supply_pressure(y, p)
     given_1, up_1 = volumes_exchanged(up_1, supply, y[P_1] if len(p.throttled) > 0 else y[P_A], p)
     given_2, up_2 = volumes_exchanged(up_2, supply, y[P_2] if len(p.throttled) > 0 else y[P_B], p)
     fed = given_1 + given_2
     if len(p.throttled) > 0:
-        rate_1 = pressure_rate(up_1, p.V_1, bulk_modulus(y[P_1], p))
-        rate_2 = pressure_rate(up_2, p.V_2, bulk_modulus(y[P_2], p))
-        return (-pressure_rate(out_A, V_A, K_A), -pressure_rate(out_B, V_B, K_B), rate_1, rate_2), fed
-    rate_1, rate_2 = pressure_rate(up_1 - out_A, V_A, K_A), pressure_rate(up_2 - out_B, V_B, K_B)
+        rate_1 = cylinder.pressure_rate(up_1, p.V_1, bulk_modulus(y[P_1], p))
+        rate_2 = cylinder.pressure_rate(up_2, p.V_2, bulk_modulus(y[P_2], p))
+        return (-cylinder.pressure_rate(out_A, V_A, K_A), -cylinder.pressure_rate(out_B, V_B, K_B), rate_1, rate_2), fed
+    rate_1, rate_2 = cylinder.pressure_rate(up_1 - out_A, V_A, K_A), cylinder.pressure_rate(up_2 - out_B, V_B, K_B)
     if len(p.valved) > 0:  # a supply's line has no rod seal
         return (rate_1, rate_2, 0.0 * rate_1, 0.0 * rate_2), fed
     return (rate_1, rate_2, rate_1, rate_2), fed
@@ -530,10 +489,10 @@ def valve_flows(y: State, p: RigNumbers) -> tuple[float, float, float, float]:
     x_s, Q_N, dp_N, x_max, dp_lam = y[SPOOL], p.Q_N, p.dp_N, p.x_max, p.dp_lam
     p_A, p_B, p_P, p_T = pressures_of(y, p)
     return (
-        edge_flow(p_P - p_A, x_s, p.o_PA, Q_N, dp_N, x_max, dp_lam),
-        edge_flow(p_A - p_T, -x_s, p.o_AT, Q_N, dp_N, x_max, dp_lam),
-        edge_flow(p_P - p_B, -x_s, p.o_PB, Q_N, dp_N, x_max, dp_lam),
-        edge_flow(p_B - p_T, x_s, p.o_BT, Q_N, dp_N, x_max, dp_lam),
+        valve.edge_flow(p_P - p_A, x_s, p.o_PA, Q_N, dp_N, x_max, dp_lam),
+        valve.edge_flow(p_A - p_T, -x_s, p.o_AT, Q_N, dp_N, x_max, dp_lam),
+        valve.edge_flow(p_P - p_B, -x_s, p.o_PB, Q_N, dp_N, x_max, dp_lam),
+        valve.edge_flow(p_B - p_T, x_s, p.o_BT, Q_N, dp_N, x_max, dp_lam),
     )
 
 
@@ -543,8 +502,9 @@ def supply_compliance(p_1: float, p: RigNumbers) -> float:
 
     (V_1 + V_oil)/K + V_gas/(n p_abs), V_oil = V_acc - V_gas the oil in the accumulator.
     """
-    V_gas = gas_volume(p_1, p.p_pre, p.V_acc, p.n_acc)
-    return (p.V_1 + p.V_acc - V_gas) / bulk_modulus(p_1, p) + accumulator_compliance(p_1, p.p_pre, V_gas, p.n_acc)
+    V_gas = external.gas_volume(p_1, p.p_pre, p.V_acc, p.n_acc)
+    of_oil = (p.V_1 + p.V_acc - V_gas) / bulk_modulus(p_1, p)
+    return of_oil + external.accumulator_compliance(p_1, p.p_pre, V_gas, p.n_acc)  # type: ignore[no-any-return]
 
 
 @contracted
@@ -561,10 +521,10 @@ def valve_rates(y: State, Q_1: float, p: RigNumbers) -> Pressures:
     from_A, _ = volumes_exchanged(Q_AT, p_A, p_T, p)
     from_B, _ = volumes_exchanged(Q_BT, p_B, p_T, p)
     _, fed = volumes_exchanged(Q_1, p_T, p_P, p)
-    relief = check_valve_flow(pump_difference(y, p), p.p_set, p.G_set)
+    relief = external.check_valve_flow(pump_difference(y, p), p.p_set, p.G_set)
     return (
-        pressure_rate(to_A - from_A, V_A, bulk_modulus(p_A, p)),  # eq. (4.18)
-        pressure_rate(to_B - from_B, V_B, bulk_modulus(p_B, p)),  # eq. (4.19)
+        cylinder.pressure_rate(to_A - from_A, V_A, bulk_modulus(p_A, p)),  # eq. (4.18)
+        cylinder.pressure_rate(to_B - from_B, V_B, bulk_modulus(p_B, p)),  # eq. (4.19)
         (fed - relief - given_A - given_B) / supply_compliance(p_P, p),
         0.0 * p_T,
     )
@@ -575,48 +535,48 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
     """dy/dt of everything but the throttles' flows; `u` [V] command, `G`, `C` leakage coefficients, `F` [N] load."""
     p_A, p_B, x, v = vapour_floor(y[P_A], p), vapour_floor(y[P_B], p), y[POSITION], y[VELOCITY]
     if len(p.sticking) > 0:
-        v = stuck_velocity(v, p.v_th)
+        v = friction.stuck_velocity(v, p.v_th)
     dp_pump = pump_difference(y, p)
     error = speed_error(y, u, p)  # eq. (4.2) as a state
-    voltage = controller_voltage(error, y[INTEGRAL], p.k_p, p.K_i, p.V_max)
-    current = winding_current_rate(voltage, y[CURRENT], y[OMEGA], p.R_c, p.L_c, p.C_e, p.i_max)
-    torque = pump_torque(dp_pump, p.q_b)
-    Q_1 = pump_flow(y[OMEGA], dp_pump, p.q_b, p.G_pump)
+    voltage = motor.controller_voltage(error, y[INTEGRAL], p.k_p, p.K_i, p.V_max)
+    current = motor.winding_current_rate(voltage, y[CURRENT], y[OMEGA], p.R_c, p.L_c, p.C_e, p.i_max)
+    torque = pump.pump_torque(dp_pump, p.q_b)
+    Q_1 = pump.pump_flow(y[OMEGA], dp_pump, p.q_b, p.G_pump)
     if len(p.lossy) > 0:
-        torque = torque + friction_torque(y[OMEGA], dp_pump, p.q_b, p.T_f, p.C_f, p.k_h, p.omega_f)
-        Q_1 = Q_1 - turbulent_slip(dp_pump, p.c_slip, p.dp_0)
-    spin = shaft_acceleration(y[CURRENT], y[OMEGA], torque, p.C_m, p.B_M, p.J_M)
-    stop = hard_stop_force(x, v, p.L, p.k_stop, p.d_stop)
-    load = load_force(x, p.F_l, p.k_load)
+        torque = torque + pump.friction_torque(y[OMEGA], dp_pump, p.q_b, p.T_f, p.C_f, p.k_h, p.omega_f)
+        Q_1 = Q_1 - pump.turbulent_slip(dp_pump, p.c_slip, p.dp_0)
+    spin = motor.shaft_acceleration(y[CURRENT], y[OMEGA], torque, p.C_m, p.B_M, p.J_M)
+    stop = cylinder.hard_stop_force(x, v, p.L, p.k_stop, p.d_stop)
+    load = cylinder.load_force(x, p.F_l, p.k_load)
     if len(p.damped) > 0:
         load = load + p.d_load * v
     if len(p.opposed) > 0:
-        load = load + opposing_force(v, p.A_opp, p.p_opp, p.C_opp)
+        load = load + cylinder.opposing_force(v, p.A_opp, p.p_opp, p.C_opp)
     if len(p.pushed) > 0:
         load = load + F
     if len(p.pushed) > 1:
-        load = load + force_over(x, p.pushed[0]) + force_over(v, p.pushed[1])
-    friction, dz = friction_force(y, p_A * p.A_A - p_B * p.A_B - load + stop, p)
-    push = piston_acceleration(p_A, p_B, friction, load, stop, p.A_A, p.A_B, p.M_eq)
+        load = load + cylinder.force_over(x, p.pushed[0]) + cylinder.force_over(v, p.pushed[1])
+    F_f, dz = friction_force(y, p_A * p.A_A - p_B * p.A_B - load + stop, p)
+    push = cylinder.piston_acceleration(p_A, p_B, F_f, load, stop, p.A_A, p.A_B, p.M_eq)
     Q_L = piston_leakage(p_A - p_B, G, C, p.dp_0)
     V_A, V_B = volumes_at(x, p)
     K_A, K_B = bulk_modulus(p_A, p), bulk_modulus(p_B, p)
     from_A, to_B = volumes_exchanged(Q_L, y[P_A], y[P_B], p)
     if len(p.throttled) > 0:
         from_2, to_1 = volumes_exchanged(Q_1, y[P_2], y[P_1], p)
-        rate_A = pressure_rate(-p.A_A * v - from_A, V_A, K_A)
-        rate_B = pressure_rate(p.A_B * v + to_B, V_B, K_B)
-        rate_1 = pressure_rate(to_1, p.V_1, bulk_modulus(y[P_1], p))
-        rate_2 = pressure_rate(-from_2, p.V_2, bulk_modulus(y[P_2], p))
+        rate_A = cylinder.pressure_rate(-p.A_A * v - from_A, V_A, K_A)
+        rate_B = cylinder.pressure_rate(p.A_B * v + to_B, V_B, K_B)
+        rate_1 = cylinder.pressure_rate(to_1, p.V_1, bulk_modulus(y[P_1], p))
+        rate_2 = cylinder.pressure_rate(-from_2, p.V_2, bulk_modulus(y[P_2], p))
     elif len(p.valved) > 0:
         by_valve = valve_rates(y, Q_1, p)
-        rate_A = by_valve[0] + pressure_rate(-p.A_A * v - from_A, V_A, K_A)
-        rate_B = by_valve[1] + pressure_rate(p.A_B * v + to_B, V_B, K_B)
+        rate_A = by_valve[0] + cylinder.pressure_rate(-p.A_A * v - from_A, V_A, K_A)
+        rate_B = by_valve[1] + cylinder.pressure_rate(p.A_B * v + to_B, V_B, K_B)
         rate_1, rate_2 = by_valve[2], by_valve[3]
     else:
         from_2, to_1 = volumes_exchanged(Q_1, y[P_B], y[P_A], p)
-        rate_A = pressure_rate(to_1 - p.A_A * v - from_A, V_A, K_A)
-        rate_B = pressure_rate(-from_2 + p.A_B * v + to_B, V_B, K_B)
+        rate_A = cylinder.pressure_rate(to_1 - p.A_A * v - from_A, V_A, K_A)
+        rate_B = cylinder.pressure_rate(-from_2 + p.A_B * v + to_B, V_B, K_B)
         rate_1, rate_2 = rate_A, rate_B
     fed, d_x_s, d_v_s = 0.0 * v, 0.0 * v, 0.0 * v
     if len(p.open_circuit) > 0:
@@ -624,9 +584,9 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
         rate_A, rate_B = rate_A + outer[0], rate_B + outer[1]
         rate_1, rate_2 = rate_1 + outer[2], rate_2 + outer[3]
     if len(p.valved) > 0:
-        d_x_s = spool_speed(y[SPOOL_SPEED], p.v_max)
-        x_d = spool_target(u, p.u_N, p.x_max)
-        d_v_s = spool_acceleration(y[SPOOL], y[SPOOL_SPEED], x_d, p.omega_s, p.zeta_s, p.v_max)
+        d_x_s = valve.spool_speed(y[SPOOL_SPEED], p.v_max)
+        x_d = valve.spool_target(u, p.u_N, p.x_max)
+        d_v_s = valve.spool_acceleration(y[SPOOL], y[SPOOL_SPEED], x_d, p.omega_s, p.zeta_s, p.v_max)
     if len(p.clogging) > 0:
         d_x_s, d_v_s = passing_filters(y, p)
     return error, current, spin, y[OMEGA], v, push, rate_A, rate_B, rate_1, rate_2, fed, dz, d_x_s, d_v_s  # eq. (4.13)
@@ -650,9 +610,9 @@ def observe(y: State, u: float, G: float, C: float, p: RigNumbers, row: np.ndarr
     row[P_A], row[P_B], row[P_1], row[P_2] = pressures_of(y, p)
     n = len(y)
     dp_pump = pump_difference(y, p)
-    Q_1 = pump_flow(y[OMEGA], dp_pump, p.q_b, p.G_pump)
+    Q_1 = pump.pump_flow(y[OMEGA], dp_pump, p.q_b, p.G_pump)
     if len(p.lossy) > 0:
-        Q_1 = Q_1 - turbulent_slip(dp_pump, p.c_slip, p.dp_0)
+        Q_1 = Q_1 - pump.turbulent_slip(dp_pump, p.c_slip, p.dp_0)
     Q_A, Q_B = throttle_flows(y, p) if len(p.throttled) > 0 else (Q_1, Q_1)
     if len(p.valved) > 0:
         Q_PA, Q_AT, Q_PB, Q_BT = valve_flows(y, p)
@@ -661,9 +621,9 @@ def observe(y: State, u: float, G: float, C: float, p: RigNumbers, row: np.ndarr
     row[n + 1] = Q_A
     row[n + 2] = Q_B
     row[n + 3] = piston_leakage(row[P_A] - row[P_B], G, C, p.dp_0)
-    row[n + 4] = controller_voltage(speed_error(y, u, p), y[INTEGRAL], p.k_p, p.K_i, p.V_max)
+    row[n + 4] = motor.controller_voltage(speed_error(y, u, p), y[INTEGRAL], p.k_p, p.K_i, p.V_max)
     row[n + 5] = row[n + 6] = 0.0
     if len(p.open_circuit) > 0:
-        row[n + 5] = external_leakage(y[P_A], p.G_ext_A) + external_leakage(y[P_B], p.G_ext_B)
+        row[n + 5] = external.external_leakage(y[P_A], p.G_ext_A) + external.external_leakage(y[P_B], p.G_ext_B)
         up_1, up_2 = make_up_flows(y, p)
         row[n + 6] = up_1 + up_2

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sealscope.compiled import kernel, law
+from sealscope.compiled import law
 from sealscope.errors import InputError
 from sealscope.physics.cylinder import hard_stop_force, load_force, opposing_force
 from sealscope.physics.fluid import P_ATM
@@ -27,7 +27,7 @@ def carried_at_standstill(
     return load - hard_stop_force(x, 0.0, L, k_stop, d_stop)
 
 
-@kernel
+@law
 def holding_current(dp: float, q_b: float, C_m: float) -> float:
     """Winding current [A] that holds the pump against dp [Pa]: T_load/C_m, eq. (4.5) at standstill."""
     return pump_torque(dp, q_b) / C_m
@@ -68,7 +68,6 @@ def pressures_behind_valve(force: float, A_A: float, A_B: float, p_1: float, p_2
     return p_A, p_1 + p_2 - p_A
 
 
-@kernel
 def supply_at_standstill(force: float, x: float, p: RigNumbers) -> tuple[float, float, float]:
     """Return p_1, p_A, p_B [Pa] at which pump, relief valve and a servo valve at null let the supply's pressure stay.
 

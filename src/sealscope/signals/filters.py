@@ -99,14 +99,6 @@ def saved_part(state: Any, name: str, what: str) -> Any:
     return state[name]
 
 
-def check_saved(state: Any, name: str, own: object, what: str) -> None:
-    """Raise InputError where a setting in the saved state of `what` is not the stream's `own`."""
-    value = saved_part(state, name, what)
-    value = tuple(value) if isinstance(value, list) else value
-    if type(value) is not type(own) or value != own:
-        raise InputError(f"saved {what}'s {name} must be {own}, got {value!r}")
-
-
 def saved_count(state: Any, name: str, what: str) -> int:
     """Return a whole number >= 0 of the saved state of `what`; raises InputError for anything else."""
     value = saved_part(state, name, what)

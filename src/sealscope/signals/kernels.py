@@ -17,23 +17,28 @@ CHUNK = 64
 
 
 @contracted
-def _filter(rows: Array, source: int, hole: int, taps: Array, m: int, out: Array, to: int) -> None:
-    """``out[to + i] = sum_k taps[k] rows[source + i - hole k]`` for i < m, lanes to a row, eight rows at a time."""
+def filter_rows(
+    rows: Array, source: int, stride: int, hole: int, taps: Array, tap: int, count: int, out: Array, to: int, m: int
+) -> None:
+    """``out[to + i] = sum_k taps[tap + k] rows[source + stride i - hole k]``, i < m, k < count: eight rows at a time.
+
+    Rows and taps hold a number for each lane.
+    """
     i = 0
     while i + 8 <= m:
         s_0, s_1, s_2, s_3 = spread(0.0), spread(0.0), spread(0.0), spread(0.0)
         s_4, s_5, s_6, s_7 = spread(0.0), spread(0.0), spread(0.0), spread(0.0)
-        for k in range(taps.size):
-            t = taps[k]
-            a = source + i - hole * k
+        for k in range(count):
+            t = load(taps, tap + k)
+            a = source + stride * i - hole * k
             s_0 = s_0 + t * load(rows, a)
-            s_1 = s_1 + t * load(rows, a + 1)
-            s_2 = s_2 + t * load(rows, a + 2)
-            s_3 = s_3 + t * load(rows, a + 3)
-            s_4 = s_4 + t * load(rows, a + 4)
-            s_5 = s_5 + t * load(rows, a + 5)
-            s_6 = s_6 + t * load(rows, a + 6)
-            s_7 = s_7 + t * load(rows, a + 7)
+            s_1 = s_1 + t * load(rows, a + stride)
+            s_2 = s_2 + t * load(rows, a + 2 * stride)
+            s_3 = s_3 + t * load(rows, a + 3 * stride)
+            s_4 = s_4 + t * load(rows, a + 4 * stride)
+            s_5 = s_5 + t * load(rows, a + 5 * stride)
+            s_6 = s_6 + t * load(rows, a + 6 * stride)
+            s_7 = s_7 + t * load(rows, a + 7 * stride)
         b = to + i
         store(out, b, s_0)
         store(out, b + 1, s_1)
@@ -46,52 +51,37 @@ def _filter(rows: Array, source: int, hole: int, taps: Array, m: int, out: Array
         i += 8
     while i < m:
         s = spread(0.0)
-        for k in range(taps.size):
-            s = s + taps[k] * load(rows, source + i - hole * k)
+        for k in range(count):
+            s = s + load(taps, tap + k) * load(rows, source + stride * i - hole * k)
         store(out, to + i, s)
         i += 1
 
 
 @contracted
-def _take(
-    samples: Array,
-    done: int,
-    m: int,
-    buffers: Array,
-    start: int,
-    at: int,
-    low: Array,
-    high: Array,
-    levels: int,
-    capacity: int,
-    details: Array,
+def split_levels(
+    buffers: Array, start: int, at: int, m: int, low: Array, high: Array, levels: int, capacity: int, details: Array
 ) -> None:
-    """Take samples[lane, done : done + m] into a channel's buffers (row `start` on); its details into `details`.
+    """Filter m new rows of a channel's first buffer (rows start + at, ..) through all levels, into `details`.
 
     `details`: (levels, CHUNK, WIDTH). Shallower levels are read late, so that a row belongs to one sample.
     """
-    flat = buffers.reshape(-1)
-    for lane in range(samples.shape[0]):
-        to = (start + at) * WIDTH + lane
-        for i in range(m):
-            flat[to + WIDTH * i] = samples[lane, done + i]
-    half = low.size // 2
+    count = low.shape[0]
     for j in range(levels):
         hole = 1 << j
         row = start + j * capacity + at
-        late = half * ((1 << levels) - 2 * hole)
-        _filter(buffers, row - late, hole, high, m, details, j * CHUNK)
+        late = count // 2 * ((1 << levels) - 2 * hole)
+        filter_rows(buffers, row - late, 1, hole, high, 0, count, details, j * CHUNK, m)
         if j + 1 < levels:
-            _filter(buffers, row, hole, low, m, buffers, row + capacity)
+            filter_rows(buffers, row, 1, hole, low, 0, count, buffers, row + capacity, m)
 
 
 @contracted
-def _turn_back(buffers: Array, start: int, levels: int, capacity: int, history: int) -> None:
-    """Move the last `history` rows of each of a channel's buffers back to the front."""
+def turn_back(buffers: Array, start: int, levels: int, capacity: int, fill: int, history: int) -> None:
+    """Move the last `history` of the `fill` rows of each of a channel's buffers back to the front."""
     for j in range(levels):
         row = start + j * capacity
         for i in range(history):
-            store(buffers, row + i, load(buffers, row + capacity - history + i))
+            store(buffers, row + i, load(buffers, row + fill - history + i))
 
 
 @kernel
@@ -113,7 +103,7 @@ def advance_details(
     """
     channels, actuators, n = block.shape
     levels, capacity = buffers.shape[2], buffers.shape[3]
-    flat = details.reshape(-1)
+    flat, given = details.reshape(-1), buffers.reshape(-1)
     at = fill
     for g in range(groups[0], groups[1]):
         lanes = min(WIDTH, actuators - WIDTH * g)
@@ -122,11 +112,13 @@ def advance_details(
             at, done = fill, 0
             while done < n:
                 if at == capacity:
-                    _turn_back(buffers, start, levels, capacity, history)
+                    turn_back(buffers, start, levels, capacity, at, history)
                     at = history
                 m = min(n - done, capacity - at)
-                samples = block[c, WIDTH * g : WIDTH * g + lanes]
-                _take(samples, done, m, buffers, start, at, low, high, levels, capacity, details)
+                for lane in range(lanes):
+                    for i in range(m):
+                        given[(start + at + i) * WIDTH + lane] = block[c, WIDTH * g + lane, done + i]
+                split_levels(buffers, start, at, m, low, high, levels, capacity, details)
                 for lane in range(lanes):
                     for j in range(levels):
                         for i in range(m):

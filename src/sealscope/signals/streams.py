@@ -8,7 +8,6 @@ they were cut into blocks.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -19,7 +18,6 @@ from numpy.typing import ArrayLike
 from sealscope.errors import InputError
 from sealscope.signals.filters import (
     Array,
-    check_saved,
     checked_levels,
     decomposition_filters,
     reach,
@@ -31,9 +29,6 @@ from sealscope.signals.filters import (
 
 if TYPE_CHECKING:
     from concurrent.futures import ThreadPoolExecutor
-
-
-_SETTINGS = ("channels", "levels", "wavelet")
 
 
 class DetailStream:
@@ -94,14 +89,17 @@ class DetailStream:
         self._table = whole_number(table[0], "channels"), whole_number(table[1], "channels")
         self.channels = self._table if isinstance(channels, tuple) else self._table[1]
         self.levels, self.wavelet, self.threads = checked_levels(levels), wavelet, whole_number(threads, "threads")
-        self._low, self._high = decomposition_filters(wavelet)
+        low, high = (np.repeat(taps[:, None], WIDTH, axis=1) for taps in decomposition_filters(wavelet))
         self.first, self.delay = (int(samples) for samples in reach(wavelet, self.levels)[-1])
         self.settling = self.first + self.delay
         holes = 2 ** np.arange(self.levels)
-        late = self._low.size // 2 * (2**self.levels - 2 * holes)
-        self._history = max(self.delay, int(np.max(late + (self._low.size - 1) * holes)))
+        late = len(low) // 2 * (2**self.levels - 2 * holes)
+        self._history = max(self.delay, int(np.max(late + (len(low) - 1) * holes)))
         groups = -(-self._table[1] // WIDTH)
-        self._buffers = aligned((groups, self._table[0], self.levels, self._history + CHUNK, WIDTH))
+        #: What the kernels take: taps (taps, WIDTH) of low- and high-pass, and the levels' buffers (groups, rows of the
+        #: table, levels, history and CHUNK, WIDTH).
+        self.taps = low, high
+        self.buffers = aligned((groups, self._table[0], self.levels, self._history + CHUNK, WIDTH))
         self._fill, self.samples = self._history, 0
         shares = min(self.threads, groups)
         self._shares = list(pairwise(groups * i // shares for i in range(shares + 1)))
@@ -131,43 +129,32 @@ class DetailStream:
         """
         from sealscope.signals.kernels import advance_details
 
-        x = self.checked(block)
-        leading = np.shape(block)[:-1]
-        shape = (*leading, self.levels, x.shape[-1])
-        out = np.empty(shape) if out is None else checked_out(out, shape)
-        target = out.reshape(*self._table, self.levels, x.shape[-1])
-        self.run(x, lambda share, work: advance_details(share, x, *self.state, work, target))
-        return out
-
-    def checked(self, block: ArrayLike) -> Array:
-        """Return a block as C-contiguous doubles (rows, columns, n) that are only read; raises InputError."""
-        x = np.ascontiguousarray(block, dtype=np.float64)
         wanted = self.channels if isinstance(self.channels, tuple) else (self.channels,)
         single = wanted == (1,) and np.ndim(block) == 1
         if not single and (np.ndim(block) == 0 or np.shape(block)[:-1] != wanted):
             sizes = "" if wanted == (1,) else "".join(f"{size}, " for size in wanted)
             raise InputError(f"block must have shape ({sizes or 'n,'}{'n' if sizes else ''}), got {np.shape(block)}")
-        x = x.reshape(*self._table, np.shape(block)[-1])
-        # one type for what is read, whether the caller's array may be written or not: one compilation
-        x = x.view()
-        x.setflags(write=False)
-        return x
+        n = np.shape(block)[-1]
+        x = np.ascontiguousarray(block, dtype=np.float64).reshape(*self._table, n).view()
+        x.setflags(write=False)  # one type for what is read, whether the caller's array may be written or not
+        shape = (*np.shape(block)[:-1], self.levels, n)
+        if out is None:
+            out = np.empty(shape)
+        elif not (out.shape == shape and out.dtype == np.float64 and out.flags.c_contiguous and out.flags.writeable):
+            raise InputError(
+                f"out must be C-contiguous, writeable doubles of shape {shape}, got {out.dtype} {out.shape}"
+            )
+        if n == 0:
+            return out
+        target = out.reshape(*self._table, self.levels, n)
 
-    @property
-    def state(self) -> tuple[Array, int, int, Array, Array]:
-        """Buffers, rows of them in use, rows needed again, and taps, as the kernels take them."""
-        return self._buffers, self._fill, self._history, self._low, self._high
+        def advance(share: tuple[int, int], work: Array) -> int:
+            return advance_details(share, x, self.buffers, self._fill, self._history, *self.taps, work, target)
 
-    def run(self, x: Array, call: Callable[[tuple[int, int], Array], int]) -> None:
-        """Make `call(groups, work)` for every share of the groups, and count the samples of `x` as taken."""
-        if x.shape[-1] == 0:
-            return
-        if len(self._shares) == 1:
-            fill = call(self._shares[0], self._work[0])
-        else:
-            fill = max(self._pool.map(call, self._shares, self._work))
-        self._fill = int(fill)
-        self.samples += x.shape[-1]
+        run = map if len(self._shares) == 1 else self._pool.map
+        self._fill = max(run(advance, self._shares, self._work))
+        self.samples += n
+        return out
 
     @cached_property
     def _pool(self) -> ThreadPoolExecutor:
@@ -177,34 +164,28 @@ class DetailStream:
 
     def state_dict(self) -> dict[str, Any]:
         """Return all that the stream knows: settings, number of samples, and the `history` to filter with."""
-        history = self._buffers[:, :, :, self._fill - self._history : self._fill]
+        history = np.moveaxis(self.buffers[:, :, :, self._fill - self._history : self._fill], 0, -2)
         return {
             "channels": self.channels,
             "levels": self.levels,
             "wavelet": self.wavelet,
             "samples": self.samples,
-            "history": unpacked(history, self._table[1]),
+            "history": history.reshape(*history.shape[:-2], -1)[..., : self._table[1]].copy(),
         }
-
-    def load_state(self, state: dict[str, Any], what: str = "detail stream") -> None:
-        """Continue from what `state_dict` of a stream with the same settings returned, bit for bit.
-
-        Raises InputError for a state that is not one of such a stream.
-        """
-        for name in _SETTINGS:
-            check_saved(state, name, getattr(self, name), what)
-        history = saved_array(state, "history", (self._table[0], self.levels, self._history, self._table[1]), what)
-        self._fill, self.samples = self._history, saved_count(state, "samples", what)
-        pack(history, self._buffers[:, :, :, : self._history])
 
     @classmethod
     def from_state(cls, state: dict[str, Any], *, threads: int = 1) -> DetailStream:
         """Return the stream that `state_dict` described, bit for bit; raises InputError for a wrong state."""
-        channels, levels, wavelet = (saved_part(state, name, "detail stream") for name in _SETTINGS)
-        stream = cls(
-            tuple(channels) if isinstance(channels, list) else channels, levels, wavelet=wavelet, threads=threads
-        )
-        stream.load_state(state)
+        what = "detail stream"
+        channels, levels, wavelet = (saved_part(state, name, what) for name in ("channels", "levels", "wavelet"))
+        table = tuple(channels) if isinstance(channels, list) else channels
+        stream = cls(table, levels, wavelet=wavelet, threads=threads)
+        shape = (stream._table[0], stream.levels, stream._history, stream._table[1])
+        history = saved_array(state, "history", shape, what)
+        stream.samples = saved_count(state, "samples", what)
+        groups, width = stream.buffers.shape[0], stream.buffers.shape[-1]
+        lanes = np.pad(history, [(0, 0)] * 3 + [(0, groups * width - shape[-1])]).reshape(*shape[:3], groups, width)
+        stream.buffers[:, :, :, : stream._history] = np.moveaxis(lanes, -2, 0)
         return stream
 
 
@@ -213,25 +194,3 @@ def aligned(shape: tuple[int, ...]) -> Array:
     values = np.zeros(math.prod(shape) + 8)
     skip = -(values.ctypes.data // 8) % 8
     return values[skip : skip + math.prod(shape)].reshape(shape)
-
-
-def checked_out(out: Array, shape: tuple[int, ...], *, at_least: bool = False) -> Array:
-    """Return `out` where it can be written to; raises InputError. `at_least`: its first axis may be longer."""
-    given = (shape[0], *out.shape[1:]) if at_least and out.ndim and out.shape[0] >= shape[0] else out.shape
-    if not (given == shape and out.dtype == np.float64 and out.flags.c_contiguous and out.flags.writeable):
-        raise InputError(f"out must be C-contiguous, writeable doubles of shape {shape}, got {out.dtype} {out.shape}")
-    return out
-
-
-def unpacked(lanes: Array, actuators: int) -> Array:
-    """Return lanes (groups, ..., WIDTH) as values (..., actuators)."""
-    last = np.moveaxis(lanes, 0, -2)
-    return last.reshape(*last.shape[:-2], -1)[..., :actuators].copy()
-
-
-def pack(values: Array, lanes: Array) -> None:
-    """Write values (..., actuators) into lanes (groups, ..., WIDTH)."""
-    groups, width = lanes.shape[0], lanes.shape[-1]
-    whole = np.zeros((*values.shape[:-1], groups * width))
-    whole[..., : values.shape[-1]] = values
-    lanes[...] = np.moveaxis(whole.reshape(*values.shape[:-1], groups, width), -2, 0)

@@ -67,12 +67,7 @@ def windowed_rms(
     if isinstance(series, Details):
         inside = series.inside()
         return windowed_rms(series.values[:, inside], size, step, first=first + inside.start)
-    size, step = whole_number(size, "size", " sample"), whole_number(step, "step", " sample")
-    x = finite_array(series, "series")
-    piece = math.gcd(size, step)
-    values = _rms_of_pieces(_piece_sums(x, piece), size, step)
-    ends = first + size + step * np.arange(values.shape[-1], dtype=np.int64)
-    return WindowedRms(ends, values)
+    return RmsStream(size, step, first=first).update(finite_array(series, "series"))
 
 
 class RmsStream:

@@ -1,7 +1,7 @@
 """What changes within a run: numbers of the machine over time, held in short blocks, and readings of its instruments.
 
-Drifts (here) and faults (`faults`) say which: an `Effect` is a number of the compiled laws that changes, an
-`Adjustment` a parameter of an instrument, a `Hold` a reading that repeats itself.
+Drifts (here) and faults (`faults`) say which: an `Effect` is a number of the compiled laws or a parameter of an
+instrument that changes, a `Hold` a reading that repeats itself.
 """
 
 from __future__ import annotations
@@ -46,8 +46,9 @@ _OF_INSTRUMENTS = {"noise", "hum", "offset", "gain_error", "scale_error", "commo
 class Effect:
     """One number of the rig that changes: value = (own value + sum of `added`) x product of the others.
 
-    `change(t)` at times t [s]: what is added, or the factor; `resolution`: most that it may change from one block to
-    the next; `jumps`: times [s] at which it may jump or bend; `shortest`: length [s] below which no block is cut.
+    `field`: a number of the compiled laws, or the dotted name of an instrument's parameter. `change(t)` at times t [s]:
+    what is added, or the factor; `resolution`: most that it may change from one block to the next; `jumps`: times [s]
+    at which it may jump or bend; `shortest`: length [s] below which no block is cut.
     """
 
     field: str
@@ -56,6 +57,11 @@ class Effect:
     added: bool = False
     jumps: tuple[float, ...] = ()
     shortest: float = SHORTEST_BLOCK
+
+    @property
+    def of_instrument(self) -> bool:
+        """Whether an instrument changes, not the machine."""
+        return self.field.startswith("sensors.")
 
 
 def values_of(effects: Sequence[Effect], base: RigNumbers, t: Array) -> dict[str, Array]:
@@ -153,15 +159,6 @@ class Schedule:
 
 
 @dataclass(frozen=True)
-class Adjustment:
-    """One parameter of an instrument over time: `change(t)` is added to it, or multiplies it as 1 + change."""
-
-    parameter: str
-    change: Callable[[Array], Array]
-    added: bool
-
-
-@dataclass(frozen=True)
 class Hold:
     """A channel that repeats its reading of `start` until `stop` [s]."""
 
@@ -174,16 +171,15 @@ class Hold:
 class Readings:
     """All that changes at the instruments of a run; nothing by default."""
 
-    adjustments: tuple[Adjustment, ...] = ()
+    effects: tuple[Effect, ...] = ()
     holds: tuple[Hold, ...] = ()
 
     def value(self, parameter: str, own: float, t: Array) -> Array | float:
         """Return the parameter at times t [s], its own value where nothing changes it."""
         value: Array | float = own
-        for adjustment in sorted(self.adjustments, key=lambda adjustment: not adjustment.added):
-            if adjustment.parameter == parameter:
-                change = adjustment.change(t)
-                value = value + change if adjustment.added else value * (1.0 + change)
+        for effect in sorted(self.effects, key=lambda effect: not effect.added):
+            if effect.field == parameter:
+                value = value + effect.change(t) if effect.added else value * effect.change(t)
         return value
 
     def held(self, channel: str, read: Array, t: Array) -> Array:
@@ -329,22 +325,17 @@ class ParameterDrift:
             raise InputError(f"a relative drift must stay above -100 %, got {100 * least:.4g} % ({self.parameter})")
 
     def effects(self) -> tuple[Effect, ...]:
-        """Return what it changes in the machine."""
-        if self._of_instruments():
-            return ()
+        """Return what it changes, in the machine or at the instruments."""
         table = isinstance(self.shape, TabulatedDrift) and self.shape.t.size < 1000
         jumps = tuple(map(float, self.shape.t)) if table else ()  # type: ignore[attr-defined]
 
         def effect(field: str, power: float) -> Effect:
             if self.absolute:
-                return Effect(field, self.shape.at, _STEPS[field], added=True, jumps=jumps)
+                return Effect(field, self.shape.at, _STEPS.get(field, math.inf), added=True, jumps=jumps)
             return Effect(field, lambda t: (1.0 + self.shape.at(t)) ** power, RESOLUTION, jumps=jumps)
 
-        return tuple(effect(field, power) for field, power in fields_of(self.parameter))
-
-    def adjustments(self) -> tuple[Adjustment, ...]:
-        """Return what it changes at the instruments."""
-        return (Adjustment(self.parameter, self.shape.at, self.absolute),) if self._of_instruments() else ()
+        fields = ((self.parameter, 1.0),) if self._of_instruments() else fields_of(self.parameter)
+        return tuple(effect(field, power) for field, power in fields)
 
 
 @cache

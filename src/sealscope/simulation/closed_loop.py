@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
-from collections.abc import Callable
 
 import numpy as np
 
-from sealscope.control.controller import LAW, CompiledLaw, Controller, Measured
+from sealscope.control.controller import Controller, Measured, law_of, raise_within
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.parameters import Rig
 from sealscope.physics.fluid import P_ATM
@@ -62,7 +60,6 @@ class Feedback:
         self._given = given
         floor = rig.fluid.p_vap - P_ATM if rig.fluid.p_vap > 0 else -math.inf
         self._numbers = sensors.x.resolution, 2.0 * math.pi / sensors.theta.counts, floor, rig.daq.u_max, 0.0
-        self._called: _Called | None = None
         self.loop: Loop
         self.restart()
 
@@ -70,27 +67,22 @@ class Feedback:
         """Begin the run anew."""
         controller, samples = self._controller, len(self._given)
         measured = np.empty(len(Measured._fields))
-        law: CompiledLaw | None = controller.compiled() if hasattr(controller, "compiled") else None
-        self._called = None
-        if law is None:
-            self._called = _Called(controller.start(), measured)
-            law = self._called.law
-        self._law, memory = law, law.memory
+        self._law = law_of(controller)
+        memory = self._law.memory
         self.loop = Loop(
             self._given,
             np.zeros(samples + controller.delay),
             np.zeros(samples),
             measured,
             memory,
-            np.array([law.address, memory.ctypes.data, measured.ctypes.data]),
+            np.array([self._law.address, memory.ctypes.data, measured.ctypes.data]),
             np.array(self._numbers),
             np.array([self._apart, controller.delay, 0, 0]),
         )
 
     def refuse(self) -> None:
         """Raise what a controller in Python raised, or else SimulationFailed for its voltage that is not finite."""
-        if self._called is not None and self._called.raised is not None:
-            raise self._called.raised
+        raise_within(self._law)
         t = self._given[self.loop.whole[TAKEN], 0]
         raise SimulationFailed(
             f"the controller must give a finite voltage, got {self.loop.numbers[ASKED]} at t = {t:.4g} s"
@@ -105,25 +97,3 @@ class Feedback:
         if not self.loop.whole[REPORTED]:
             return None
         return np.asarray(self.loop.compensated[np.arange(outputs) // self._apart])
-
-
-class _Called:
-    """A controller in Python as a law that is called by its address."""
-
-    def __init__(self, voltage: Callable[[Measured], float], measured: Array) -> None:
-        self._voltage, self._measured, self._memory = voltage, measured, np.full(1, math.nan)
-        self.raised: BaseException | None = None
-        function = LAW(self._volts)
-        address = ctypes.cast(function, ctypes.c_void_p).value
-        assert address is not None
-        self.law = CompiledLaw(address, self._memory, function)
-
-    def _volts(self, _memory: int, _measured: int) -> float:
-        try:
-            volts = float(self._voltage(Measured(*self._measured.tolist())))
-            flow = getattr(self._voltage, "compensated", None)
-            self._memory[0] = math.nan if flow is None else flow
-        except BaseException as error:  # an exception cannot pass through C
-            self.raised = error
-            return math.nan
-        return volts

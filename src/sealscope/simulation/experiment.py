@@ -180,15 +180,12 @@ class Experiment:
                 f"a controller must have a target to follow ('position 50 mm sin(2t)'), got {self.command}"
             )
         else:
-            self._check_command()
+            command, u_max = self.commanded, self.rig.daq.u_max
+            if not (isinstance(command, Sine) and abs(command.offset) + abs(command.amplitude) <= u_max):
+                check_command(command, self.sample_times(), u_max)
         for drift in self.drifts:
             drift.check(np.linspace(0.0, self.duration, 2001))
-        self.effects()
-
-    def _check_command(self) -> None:
-        command, u_max = self.commanded, self.rig.daq.u_max
-        if not (isinstance(command, Sine) and abs(command.offset) + abs(command.amplitude) <= u_max):
-            check_command(command, self.sample_times(), u_max)
+        self._effects()
 
     @classmethod
     @checked_call
@@ -296,6 +293,9 @@ class Experiment:
 
     def effects(self) -> tuple[Effect, ...]:
         """Return what changes in the machine within the run."""
+        return tuple(effect for effect in self._effects() if not effect.of_instrument)
+
+    def _effects(self) -> tuple[Effect, ...]:
         drifting = [effect for drift in self.drifts for effect in drift.effects()]
         return (*drifting, *(effect for fault in self.faults for effect in fault.effects(self.rig)))
 
@@ -319,11 +319,8 @@ class Experiment:
 
     def readings(self) -> Readings:
         """Return what changes at the instruments within the run."""
-        drifting = [adjustment for drift in self.drifts for adjustment in drift.adjustments()]
-        return Readings(
-            (*drifting, *(adjustment for fault in self.faults for adjustment in fault.adjustments())),
-            tuple(hold for fault in self.faults for hold in fault.holds()),
-        )
+        effects = tuple(effect for effect in self._effects() if effect.of_instrument)
+        return Readings(effects, tuple(hold for fault in self.faults for hold in fault.holds()))
 
     @property
     def error_allowed(self) -> float:

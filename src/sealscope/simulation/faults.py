@@ -1,4 +1,4 @@
-"""Faults of machine, sensors and duty over time, as data and as text: a table of what each changes, and one class.
+"""Faults of machine, sensors and duty over time, as data and as text: the table `faults.toml`, and one class.
 
 A text such as ``pump leak x3 growing from 1 min to 2 min`` is read by `parse_fault`; leaks across the piston stand in
 `leaks`.
@@ -9,15 +9,17 @@ from __future__ import annotations
 import math
 import re
 import sys
+import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sealscope.errors import InputError
 from sealscope.recordings.recording import CHANNEL_UNITS, Array
-from sealscope.simulation.changes import GROUPS, RESOLUTION, THROTTLES, Adjustment, Effect, Hold, fields_of
+from sealscope.simulation.changes import RESOLUTION, THROTTLES, Effect, Hold, fields_of
 from sealscope.simulation.commands import NUMBER, TIME, UNSIGNED, Command, number_text, plain_text, seconds
 from sealscope.simulation.leaks import WHEN, Between, From, Growing, Opening, Part, opening_of
 from sealscope.units import LITRE_PER_MINUTE, parse_quantity
@@ -35,63 +37,72 @@ GAINS = {
 }
 #: A valve that moves is held within blocks of one output of the solver, whatever their length [s].
 _VALVE_BLOCK = 0.0
-#: When a valve is operated, or a sensor stuck: `from 60 s`, `from 60 s to 90 s`, and `within 0.5 s` of a valve.
 _SPAN = rf"(?:\s+from\s+(?P<since>{TIME})(?:\s+to\s+(?P<until>{TIME}))?)?"
-_WITHIN = rf"{_SPAN}(?:\s+within\s+(?P<ramp>{TIME}))?"
-_FACTOR = rf"(?:x\s*(?P<times>{NUMBER})|(?P<percent>[-+]\s*{UNSIGNED})\s*%)"
-_SHARE = rf"(?P<share>{NUMBER})\s*(?P<sign>%?)"
-_SIZE = rf"(?P<size>{NUMBER}\s*(?:\[[^\]]+\]|[a-zA-Z][a-zA-Z0-9^/_]*))"
-_SENSOR = r"sensor\s+(?P<at>\w+)"
-_SEAL = r"(?:rod\s+seal|external\s+leak(?:age)?)\s+(?P<at>[ABab])"
+#: When a fault is there: `from 60 s`, `growing from ..`; `from 60 s to 90 s` of a stuck sensor, `within 0.5 s` of a
+#: valve that is operated.
+_WHEN = {"grows": WHEN, "lasts": _SPAN, "operated": rf"{_SPAN}(?:\s+within\s+(?P<ramp>{TIME}))?"}
+#: What stands in braces in the patterns of `faults.toml`.
+_PATTERNS = {
+    "number": NUMBER,
+    "factor": rf"(?:x\s*(?P<times>{NUMBER})|(?P<percent>[-+]\s*{UNSIGNED})\s*%)",
+    "share": rf"(?P<share>{NUMBER})\s*(?P<sign>%?)",
+    "size": rf"(?P<size>{NUMBER}\s*(?:\[[^\]]+\]|[a-zA-Z][a-zA-Z0-9^/_]*))",
+    "difference": rf"(?P<value>[-+]\s*{UNSIGNED})",
+    "sensor": r"sensor\s+(?P<at>\w+)",
+    "seal": r"(?:rod\s+seal|external\s+leak(?:age)?)\s+(?P<at>[ABab])",
+}
 
 
 def _number(text: str | None) -> float:
     return float((text or "0").replace(" ", ""))
 
 
-def _factor(part: Part) -> float:
-    return _number(part["times"]) if part["times"] is not None else 1.0 + _number(part["percent"]) / 100.0
-
-
-def _share(part: Part) -> float:
-    return _number(part["share"]) / (100.0 if part["sign"] else 1.0)
-
-
-def _between(part: Part) -> Between:
-    until = math.inf if part["until"] is None else seconds(part["until"])
-    return Between(seconds(part["since"]), until, seconds(part.get("ramp")))
-
-
 @dataclass(frozen=True)
 class FaultRow:
-    """What a fault of a kind changes, in what words: a row of `FAULTS`.
-
-    `pattern` reads its words: the group `at` is a side or a channel, the `value` a factor, or what is added in SI
-    units; `words` write them. `parameters` are multiplied by the value where it is a `factor`; otherwise it is added to
-    them, over the rig's parameter `over`. `needs`: a parameter that must be > 0 on the rig, and who needs it; `least`,
-    `most`: of the value, as `allowed` says after `what`. `effects` stand in place of parameters where more changes.
-    """
+    """What a fault of a kind changes, in what words: an entry of `faults.toml`, whose head says what its keys are."""
 
     kind: str
     pattern: str
-    value: Callable[[Part], float]
     words: str
     what: str = ""
     parameters: tuple[str, ...] = ()
     factor: bool = False
     needs: tuple[str, str] | None = None
     over: str | None = None
+    unit: str = ""
     least: float = 0.0
     most: float = sys.float_info.max
     allowed: str = "change by a factor >= 0"
-    when: str = WHEN
-    opening: Callable[[Part], Opening] = opening_of
-    effects: Callable[[Fault, Rig], tuple[Effect, ...]] | None = None
+    when: str = "grows"
 
     @property
     def of_sensor(self) -> bool:
         """Whether it is a fault of a sensor."""
         return self.kind.startswith("sensor")
+
+    def match(self, text: str) -> Part | None:
+        """Return the groups of a text that is such a fault; None for any other."""
+        pattern = self.pattern.format(**_PATTERNS).replace(" ", r"\s+") + _WHEN[self.when]
+        match = re.fullmatch(pattern, text)
+        return None if match is None else match.groupdict()
+
+    def value(self, part: Part) -> float:
+        """Return the value that the groups of a text state."""
+        if part.get("size") is not None:
+            unit = CHANNEL_UNITS.get(part["at"] or "", "Pa") if self.of_sensor else self.unit
+            return parse_quantity(part["size"] or "", unit, name=self.what)
+        if part.get("percent") is not None:
+            return 1.0 + _number(part["percent"]) / 100.0
+        if part.get("share") is not None:
+            return _number(part["share"]) / (100.0 if part["sign"] else 1.0)
+        return _number(part.get("times") or part.get("value") or ("1" if self.factor else "0"))
+
+    def opening(self, part: Part) -> Opening:
+        """Return the opening that the groups of a text state."""
+        if self.when == "grows":
+            return opening_of(part)
+        until = math.inf if part["until"] is None else seconds(part["until"])
+        return Between(seconds(part["since"]), until, seconds(part.get("ramp")))
 
 
 @dataclass(frozen=True)
@@ -115,7 +126,7 @@ class Fault:
             raise InputError(f"a faulty sensor must be one of {', '.join(GAINS)}, got {self.at!r}")
         if not row.of_sensor and "{at}" in row.words and self.at not in ("A", "B"):
             raise InputError(f"a {self.name} must be A or B, got {self.at!r}")
-        if not row.least <= self.value <= row.most:
+        if not (math.isfinite(self.value) and row.least <= self.value <= row.most):
             raise InputError(f"{row.what} must {row.allowed}, got {self.value:g}")
         if not 0.0 <= self.pace <= sys.float_info.max:
             raise InputError(f"a duty's frequency must change by a factor >= 0, got {self.pace:g}")
@@ -137,14 +148,12 @@ class Fault:
         return self.opening.onset()
 
     def effects(self, rig: Rig) -> tuple[Effect, ...]:
-        """Return what it changes in the machine; InputError where it cannot be on this rig."""
+        """Return what it changes, in the machine or at a sensor; InputError where it cannot be on this rig."""
         row = self.row
         if row.needs is not None and rig[name := row.needs[0].format(at=self.at)] == 0:
             raise InputError(f"{row.needs[1]} {name} > 0, got 0 ({self})")
-        if row.effects is not None:
-            return row.effects(self, rig)
-        if row.of_sensor:
-            return ()
+        if self.name in _EFFECTS:
+            return _EFFECTS[self.name](self, rig)
         if row.factor:
             step = SHARE_RESOLUTION * max(abs(self.value - 1.0), 1e-3)
             return tuple(
@@ -155,11 +164,6 @@ class Fault:
             )
         size = self.value if row.over is None else self.value / float(rig[row.over])
         return tuple(self._plus(name, size) for name in self._parameters())
-
-    def adjustments(self) -> tuple[Adjustment, ...]:
-        """Return what it changes at the instruments."""
-        changed = self._parameters() if self.row.of_sensor else ()
-        return tuple(Adjustment(name, lambda t: self.value * self.opening.share(t), added=True) for name in changed)
 
     def holds(self) -> tuple[Hold, ...]:
         """Return the readings that it makes repeat themselves."""
@@ -289,81 +293,13 @@ def _warmer(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
     return tuple(Effect(name, factor, RESOLUTION, jumps=fault.opening.bends()) for name, factor in factors)
 
 
-_PUMP_LEAK, _SEAL_LEAK = "a pump leak", "a rod seal's leak"
-_G, _G_OF = rf"G\s*=\s*(?P<G>{NUMBER})", (lambda part: _number(part["G"]))
-_CONDUCTANCE = "be >= 0 m^3/(s Pa) and finite"
-#: What faults change. Adding friction: dry or swollen seals, a side load. Rod seals lose oil as Q = G p, their `flow`
-#: is that at the charge pressure; a closed circuit holds 8e-13 m^3 of oil for each pascal: give the rig a make-up
-#: (`makeup.check_valves = "present"`), or it runs empty. A filter that grows evenly under a steady duty is cake
-#: filtration, R = R_0 (1 + V/V_c) over the volume V that has passed (J. Hermia, Constant pressure blocking filtration
-#: laws, Trans. IChemE 60 (1982) 183-187). Sensors read an offset in the channel's SI unit too much, or a share.
-#: Shut-off and circulation valves are operated (`line.open_A`, `line.open_B`, `line.G_circ`); warm oil and another duty
-#: look like faults.
+#: Faults that change more than a parameter or two.
+_EFFECTS = {"shut-off": _shut_off, "circulation": _circulation, "oil": _warmer}
+#: What faults change, by name.
 FAULTS: Mapping[str, FaultRow] = {
-    "pump leak": FaultRow(
-        "pump leakage", rf"pump\s+leak(?:age)?\s+{_FACTOR}", _factor, "pump leak x{value}", _PUMP_LEAK, ("G_pump",),
-        factor=True, needs=("pump.G_pump", "a pump leak by a factor needs"),
-    ),
-    "pump leak G": FaultRow(
-        "pump leakage", rf"pump\s+leak(?:age)?\s+{_G}", _G_OF, "pump leak G = {value}", _PUMP_LEAK, ("G_pump",),
-        allowed=_CONDUCTANCE,
-    ),
-    "rod seal G": FaultRow(
-        "external leakage", rf"{_SEAL}\s+{_G}", _G_OF, "rod seal {at} G = {value}", _SEAL_LEAK, ("G_ext_{at}",),
-        allowed=_CONDUCTANCE,
-    ),
-    "rod seal": FaultRow(
-        "external leakage", rf"{_SEAL}\s+{_SIZE}",
-        lambda part: parse_quantity(part["size"] or "", "m^3/s", name="a rod seal's leak"),
-        "rod seal {at} {lpm:g} L/min", _SEAL_LEAK, ("G_ext_{at}",), over="fluid.p_charge",
-        needs=("fluid.p_charge", "a rod seal's flow needs"), allowed="be >= 0 m^3/s and finite",
-    ),
-    "friction": FaultRow(
-        "friction", rf"friction\s+{_FACTOR}", _factor, "friction x{value}", "friction",
-        tuple(name.rpartition(".")[2] for name in GROUPS["friction"]), factor=True,
-    ),
-    "air": FaultRow(
-        "air", rf"air\s+{_SHARE}", _share, "air {value}", "air in the oil", ("air",), most=0.5,
-        allowed="be 0 to 0.5 (0 % to 50 %) of its volume",
-    ),
-    "filter": FaultRow(
-        "filter", rf"filter\s+(?P<at>[AB])\s+{_FACTOR}", _factor, "filter {at} x{value}", "a filter's resistance",
-        ("R_{at}",), factor=True, needs=("line.R_{at}", "a filter that clogs must have"),
-    ),
-    "sensor offset": FaultRow(
-        "sensor offset", rf"{_SENSOR}\s+offset\s+{_SIZE}",
-        lambda p: parse_quantity(p["size"] or "", CHANNEL_UNITS.get(p["at"] or "", "Pa"), name="a sensor's offset"),
-        "sensor {at} offset {value} {unit}", "the offset of a faulty sensor", ("sensors.{at}.offset",),
-        least=-sys.float_info.max, allowed="be finite",
-    ),
-    "sensor gain": FaultRow(
-        "sensor gain", rf"{_SENSOR}\s+gain\s+{_SHARE}", _share, "sensor {at} gain {value}",
-        "the gain error of a sensor", ("sensors.{at}.{gain}",), least=math.nextafter(-1.0, 0.0),
-        allowed="be > -100 % and finite",
-    ),
-    "sensor stuck": FaultRow(
-        "sensor stuck", rf"{_SENSOR}\s+stuck", lambda _: 0.0, "sensor {at} stuck", when=_SPAN, opening=_between
-    ),
-    "shut-off": FaultRow(
-        "shut-off valve", rf"shut-off\s+(?P<at>[AB])\s+to\s+{_SHARE}", _share, "shut-off {at} to {percent} %",
-        "a shut-off valve", most=1.0, allowed="open 0 to 1 (0 % to 100 %)", when=_WITHIN, opening=_between,
-        effects=_shut_off,
-    ),
-    "circulation": FaultRow(
-        "circulation valve", "circulation", lambda _: 0.0, "circulation", when=_WITHIN, opening=_between,
-        effects=_circulation,
-    ),
-    "oil": FaultRow(
-        "oil temperature", rf"oil\s+(?P<kelvin>[-+]\s*{UNSIGNED})\s*K", lambda part: _number(part["kelvin"]),
-        "oil {signed} K", "the oil's temperature", least=-100.0, most=100.0, allowed="change by at most 100 K",
-        effects=_warmer,
-    ),
-    "duty": FaultRow(
-        "duty",
-        rf"duty(?=\s+[af])(?:\s+amplitude\s+x\s*(?P<amplitude>{NUMBER}))?(?:\s+frequency\s+x\s*(?P<pace>{NUMBER}))?",
-        lambda part: _number(part["amplitude"] or "1"), "duty", "a duty's amplitude",
-    ),
-}  # fmt: skip
+    name: FaultRow(**row)
+    for name, row in tomllib.loads(Path(__file__).with_name("faults.toml").read_text(encoding="utf-8")).items()
+}
 
 
 def parse_fault(text: str) -> Fault | None:
@@ -380,13 +316,10 @@ def parse_fault(text: str) -> Fault | None:
     if stripped.lower() in ("none", "no fault"):
         return None
     for name, row in FAULTS.items():
-        if match := re.fullmatch(row.pattern + row.when, stripped):
-            part = match.groupdict()
+        if part := row.match(stripped):
             at = part.get("at") or ""
-            return Fault(
-                name, row.value(part), at if row.of_sensor else at.upper(), row.opening(part),
-                _number(part.get("pace") or "1"),
-            )  # fmt: skip
+            at = at if row.of_sensor else at.upper()
+            return Fault(name, row.value(part), at, row.opening(part), _number(part.get("pace") or "1"))
     raise InputError(
         "fault must be like 'pump leak x3 from 90 s', 'rod seal A 0.01 L/min from 90 s', 'friction +20 % growing from "
         "60 s to 120 s', 'air 1 % from 90 s', 'sensor p_A offset 2 psi from 90 s', 'sensor p_A gain 1 %', 'sensor p_A "

@@ -10,7 +10,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -72,88 +72,33 @@ class Trajectory:
         return self.rows[:, OUTPUTS.index(name)]
 
 
-class Inputs(Protocol):
-    """What drives a run: the command [V] and the leakage coefficients G [m^3/(s Pa)] and C [m^3/(s Pa^0.5)]."""
-
-    def at_nodes(self, start: Array, offsets: Array) -> tuple[Array, Array, Array]:
-        """Return command, G and C at times start[:, None] + offsets [s], for evenly spaced starts."""
-        ...
-
-    def largest(self, t: Array) -> tuple[float, float]:
-        """Return the largest G and C at times t [s]."""
-        ...
-
-
-class NodeSines:
-    """A sine at the nodes of steps, block after block.
-
-    The sines of a block's steps are taken once, and turned by the angle at which a block begins. Within some 1e-13 of
-    the sine of each time, as that is by the rounding of its angle.
-    """
-
-    def __init__(self, omega: float, phase: float) -> None:
-        self._omega, self._phase = omega, phase
-        self._steps = np.empty(0)
-        self._sine = self._cosine = np.empty(0)
-
-    def at(self, start: Array, offsets: Array, amplitude: float, offset: float) -> Array:
-        """Return offset + amplitude sin(omega t + phase), (n, m), at evenly spaced t = start[:, None] + offsets [s]."""
-        n = start.size
-        length = float(start[-1] - start[0])
-        if not (n <= self._steps.size and abs(self._steps[n - 1] - length) <= 1e-9 * (1e-3 + length)):
-            self._steps = start - start[0]
-            self._sine, self._cosine = np.sin(self._omega * self._steps), np.cos(self._omega * self._steps)
-        angle, turn = self._omega * float(start[0]) + self._phase, self._omega * offsets
-        s, c = np.sin(angle), np.cos(angle)
-        sine = s * self._cosine[:n] + c * self._sine[:n]
-        cosine = c * self._cosine[:n] - s * self._sine[:n]
-        turned = np.outer(amplitude * sine, np.cos(turn)) + np.outer(amplitude * cosine, np.sin(turn))
-        return np.asarray(offset + turned)
-
-
 class RunInputs:
-    """Command and leakage of an experiment; `leaks` have their coefficients."""
+    """What drives a run: command and leakage of an experiment; `leaks` have their coefficients."""
 
     def __init__(self, experiment: Experiment, leaks: tuple[Leak, ...]) -> None:
         self._leaks = experiment.flowing(leaks)
         # of a target, the controller's voltage takes the place of this (`Feedback`)
         self._command = experiment.commanded if experiment.target is None else Sine(0.0, 0.0)
         self._duration, self._limit = experiment.duration, experiment.rig.daq.u_max
-        self._zero = np.zeros((0, 0))
-        command = self._command
-        within = isinstance(command, Sine) and abs(command.amplitude) + abs(command.offset) <= self._limit
-        self._sines = NodeSines(command.omega, command.phase) if within else None  # type: ignore[attr-defined]
 
     def at_nodes(self, start: Array, offsets: Array) -> tuple[Array, Array, Array]:
-        """Return command [V], G and C at times start[:, None] + offsets [s], for evenly spaced starts."""
-        command = self._command
-        if self._sines is None:
-            t = start[:, None] + offsets
-            return self._within_limit(command.volts(t), t), *self._leakage(t)
-        u = self._sines.at(start, offsets, command.amplitude, command.offset)  # type: ignore[attr-defined]
-        if self._leaks:
-            return u, *self._leakage(start[:, None] + offsets)
-        return u, self._none(u.shape), self._none(u.shape)
+        """Return command [V], G [m^3/(s Pa)] and C [m^3/(s Pa^0.5)] at times start[:, None] + offsets [s]."""
+        t = start[:, None] + offsets
+        return self._within_limit(self._command.volts(t), t), *self._leakage(t)
 
     def largest(self, t: Array) -> tuple[float, float]:
         """Return the largest G and C at times t [s]."""
-        G, C = self._leakage(t) if self._leaks else (np.zeros(1), np.zeros(1))
+        G, C = self._leakage(t)
         return float(G.max(initial=0.0)), float(C.max(initial=0.0))
 
     def _leakage(self, t: Array) -> tuple[Array, Array]:
-        G, C = self._none(t.shape), self._none(t.shape)
+        G, C = np.zeros(t.shape), np.zeros(t.shape)
         for leak in self._leaks:
             if not leak.coefficient or t.max(initial=-math.inf) < leak.opening.onset():
                 continue
             more = leak.coefficient * leak.opening.share(t)
             G, C = (G + more, C) if leak.law == "laminar" else (G, C + more)
         return G, C
-
-    def _none(self, shape: tuple[int, ...]) -> Array:
-        if self._zero.shape != shape:
-            self._zero = np.zeros(shape)
-            self._zero.flags.writeable = False
-        return self._zero
 
     def _within_limit(self, u: Array, t: Array) -> Array:
         if np.abs(u).max(initial=0.0) <= self._limit:
@@ -213,7 +158,7 @@ def trajectory(
 
 def integrate(
     rig: Rig,
-    inputs: Inputs,
+    inputs: RunInputs,
     duration: float,
     rate: float,
     *,
@@ -302,7 +247,7 @@ def integrate(
 class _Run:
     """One run of a rig, to be integrated at one step or another."""
 
-    inputs: Inputs
+    inputs: RunInputs
     schedule: Schedule
     rate: float
     method: Literal["rk4", "imex"]
@@ -321,6 +266,7 @@ class _Run:
 
     def advance(self, y: Array, start: int, stop: int, every: int, rows: Array, origin: int = 0) -> None:
         """Advance the state `y` in place from output `start` to `stop`, `every` steps each; write rows k - origin."""
+        from sealscope.physics.rig import packed
         from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, advance, advance_closed, nodes_of
         from sealscope.physics.solvers.limits import longest_step
 
@@ -333,8 +279,7 @@ class _Run:
         while last < stop:
             first, last = last, min(last + block, stop)
             steps = np.arange(first * every, last * every, dtype=np.float64)
-            # writable, so that a run with a leak takes the kernel that one without (zeros shared by all) has compiled
-            u, G, C = (np.require(a, requirements=("C", "W")) for a in self.inputs.at_nodes(steps * h, nodes))
+            u, G, C = map(np.ascontiguousarray, self.inputs.at_nodes(steps * h, nodes))
             F = unloaded if self.load is None else np.ascontiguousarray(self.load.at(steps[:, None] * h + nodes))
             worst = float(G.max()), float(C.max())
             for k, end, p in self.schedule.within(first, last):
@@ -342,7 +287,7 @@ class _Run:
                     refuse_long(h, longest_step(p, *worst), "the leak")
                 part = slice((k - first) * every, (end - first) * every)
                 out = rows[k - origin : end - origin]
-                inputs, how = (G[part], C[part], F[part]), (p, self.euler, every)
+                inputs, how = (G[part], C[part], F[part]), (packed(p), self.euler, every)
                 if self.feedback is None:
                     outputs, *surveyed = end - k, *advance(implicit, y, h, u[part], *inputs, *how, out)
                 else:

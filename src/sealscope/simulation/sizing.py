@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from sealscope.units import LITRE_PER_MINUTE
 #: the last: where friction sticks under a sampled controller, runs of nearly the same leak scatter by more.
 TOLERANCE, SCATTERED = 1e-3, 1e-2
 MOST_RUNS = 20
+T = TypeVar("T")
 _LEAST_SLOPE = 0.1
 
 
@@ -55,9 +57,42 @@ def scaled_size(mean: float, before: tuple[float, float], now: tuple[float, floa
     return float(c_1 * (mean / q_1) ** (1.0 / slope))
 
 
-def unsettled(leaks: Sequence[Leak]) -> SimulationFailed:
-    """Return the error of a search that does not end."""
-    return SimulationFailed(
+def settled(
+    leaks: Sequence[Leak],
+    sizes: Array,
+    measure: Callable[[Array], tuple[Array, T]],
+    progress: Callable[[str, float], None] | None = None,
+) -> tuple[Array, T]:
+    """Return coefficients (n,) with which each leak of a stated mean has it, and what `measure` returned with them.
+
+    `sizes`: the coefficients to begin with, of the other leaks those that stay; `measure(sizes)`: mean flows while open
+    for a coefficient of 1 (n,), and anything else. A small leak's flow is proportional to its coefficient (friction
+    sets the pressure difference), a large one's grows less. So each coefficient is scaled by (asked/got)^(1/s), s the
+    slope d log flow / d log coefficient of that leak between the last two runs, until every mean is within `TOLERANCE`,
+    starting from the rig without these leaks. Raises SimulationFailed where the search does not settle.
+    """
+    means = np.array([leak.mean or 0.0 for leak in leaks])
+    wanted = np.flatnonzero(means > 0.0)
+    before = np.zeros((2, sizes.size))  # coefficients and mean flows of the run before
+    closest: tuple[float, Array, T] | None = None
+    for attempt in range(MOST_RUNS):
+        if progress is not None:
+            progress("sizing the leak", 1.0 - 0.5**attempt)
+        units, measured = measure(sizes)
+        got = units * sizes
+        worst = float(np.abs(got[wanted] / means[wanted] - 1.0).max(initial=0.0))
+        if worst < (closest[0] if closest else SCATTERED):
+            closest = worst, sizes, measured
+        if closest and (worst <= TOLERANCE or attempt == MOST_RUNS - 1):
+            if progress is not None:
+                progress("sizing the leak", 1.0)
+            return closest[1:]
+        following = sizes.copy()
+        for k in wanted:
+            now = sizes[k], got[k] if sizes[k] > 0.0 else units[k]
+            following[k] = scaled_size(means[k], (before[0, k], before[1, k]), now)
+        before, sizes = np.stack([sizes, got]), following
+    raise SimulationFailed(
         f"no leakage coefficient gives the mean asked for within {TOLERANCE:g}: "
         f"{', '.join(str(leak) for leak in leaks)} is more than this "
         "rig's pressures can drive; ask for a smaller leak"
@@ -85,10 +120,6 @@ def sized_run(
 
     `progress` is called while leaks are sized, `simulating` with the time reached where there is nothing to size.
 
-    A small leak's flow is proportional to its coefficient (friction sets the pressure difference), a large one's grows
-    less. So each coefficient is scaled by (asked/got)^(1/s), s the slope d log flow / d log coefficient of that leak
-    between the last two runs, until every mean is within `TOLERANCE`, starting from the rig without these leaks.
-
     Raises InputError for a leak larger than the pump's mean |Q_1| or never open within the run; SimulationFailed
     where the search does not settle.
     """
@@ -96,40 +127,28 @@ def sized_run(
     current = _unsized(leaks)
     if not any(leak.mean for leak in leaks):
         return current, trajectory(experiment, current, progress=simulating)
-    before: list[tuple[float, float]] = [(0.0, 0.0)] * len(leaks)  # coefficient and mean flow of the run before
-    closest: tuple[float, tuple[Leak, ...], Trajectory] | None = None
-    for attempt in range(MOST_RUNS):
-        if progress is not None:
-            progress("sizing the leak", 1.0 - 0.5**attempt)
-        run = trajectory(experiment, current)
+    first = True
+
+    def measure(sizes: Array) -> tuple[Array, tuple[tuple[Leak, ...], Trajectory]]:
+        nonlocal first
+        now = tuple(replace(leak, coefficient=float(size)) for leak, size in zip(current, sizes, strict=True))
+        run = trajectory(experiment, now)
         pump_flow = float(np.mean(np.abs(run["Q_1"])))
-        dp = run["p_A"] - run["p_B"]
-        worst = 0.0
-        following = []
-        for k, (leak, now) in enumerate(zip(leaks, current, strict=True)):
-            if leak.mean is None or leak.mean == 0.0:
-                following.append(now)
+        units = np.zeros(len(leaks))
+        for k, leak in enumerate(leaks):
+            if not leak.mean:
                 continue
-            if attempt == 0 and leak.mean >= pump_flow:
+            if first and leak.mean >= pump_flow:
                 raise InputError(
                     f"a leak must be smaller than the pump's mean flow, {pump_flow / LITRE_PER_MINUTE:.4g} L/min for "
                     f"this command, got {leak.mean / LITRE_PER_MINUTE:.4g} L/min ({leak})"
                 )
-            size = now.coefficient or 0.0
-            (flowing,) = experiment.flowing((replace(now, coefficient=1.0),))
-            unit = mean_while_open(now, run.t, leak_flow(flowing, run.t, dp, dp_0))
-            if not unit > 0:
+            (flowing,) = experiment.flowing((replace(now[k], coefficient=1.0),))
+            units[k] = mean_while_open(leak, run.t, leak_flow(flowing, run.t, run["p_A"] - run["p_B"], dp_0))
+            if not units[k] > 0:
                 raise InputError(f"a leak with a mean flow must be open within the run, got {leak}")
-            got = unit * size
-            worst = max(worst, abs(got / leak.mean - 1.0))
-            scaled = scaled_size(leak.mean, before[k], (size, got if size > 0.0 else unit))
-            before[k] = (size, got)
-            following.append(replace(now, coefficient=scaled))
-        if worst < (closest[0] if closest else SCATTERED):
-            closest = worst, current, run
-        if closest and (worst <= TOLERANCE or attempt == MOST_RUNS - 1):
-            if progress is not None:
-                progress("sizing the leak", 1.0)
-            return closest[1:]
-        current = tuple(following)
-    raise unsettled(leaks)
+        first = False
+        return units, (now, run)
+
+    sizes = np.array([leak.coefficient or 0.0 for leak in current])
+    return settled(leaks, sizes, measure, progress)[1]

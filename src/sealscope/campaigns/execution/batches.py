@@ -67,7 +67,7 @@ def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
         if group.law == "mixture":
             raise no("leaks of one law each, got a mixture")
         fault = fault_of(group.fault, plan.onset_s) if group.fault else None
-        if fault is not None and (fault.adjustments() or fault.holds()):
+        if fault is not None and fault.row.of_sensor:
             raise no(f"no fault of a sensor, got {group.fault!r}")
     for case in {repr(case.levels): case for case in reversed(cases)}.values():  # one of each cell
         try:

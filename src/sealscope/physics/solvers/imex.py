@@ -14,20 +14,11 @@ from __future__ import annotations
 import numpy as np
 
 from sealscope.compiled import contracted, law
+from sealscope.physics import rig
 from sealscope.physics.cylinder import pressure_rate
 from sealscope.physics.fluid import P_ATM
 from sealscope.physics.lanes import anywhere, select
-from sealscope.physics.rig import (
-    RigNumbers,
-    bulk_modulus,
-    implicit_flows,
-    pressures_of,
-    rates_without_throttles,
-    throttle_flows,
-    throttle_rates,
-    volumes_at,
-    within_limits,
-)
+from sealscope.physics.rig import RigNumbers
 from sealscope.physics.state import (
     P_1,
     P_2,
@@ -89,16 +80,16 @@ def _solved(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
     Return the state with the pressures that the throttles' flows leave, and what these flows add to the rates. Where
     oil boils, the pressure stays whatever flows: such a volume adds nothing to g.
     """
-    V_A, V_B = volumes_at(z[POSITION], p)
+    V_A, V_B = rig.volumes_at(z[POSITION], p)
     step = GAMMA * h
-    p_A, p_B, p_1, p_2 = pressures_of(z, p)
+    p_A, p_B, p_1, p_2 = rig.pressures_of(z, p)
     total_A, total_B = p_1 - p_A, p_B - p_2
     moved = z
     s = (z[P_A], z[P_B], z[P_1], z[P_2])
     turns = AIR_TURNS if len(p.aerated) + len(p.conserving) + len(p.boiling) > 0 else 1
     for _ in range(turns):
-        K_A, K_B = bulk_modulus(moved[P_A], p), bulk_modulus(moved[P_B], p)
-        K_1, K_2 = bulk_modulus(moved[P_1], p), bulk_modulus(moved[P_2], p)
+        K_A, K_B = rig.bulk_modulus(moved[P_A], p), rig.bulk_modulus(moved[P_B], p)
+        K_1, K_2 = rig.bulk_modulus(moved[P_1], p), rig.bulk_modulus(moved[P_2], p)
         r_A, r_B = pressure_rate(1.0, V_A, K_A), pressure_rate(1.0, V_B, K_B)
         r_1, r_2 = pressure_rate(1.0, p.V_1, K_1), pressure_rate(1.0, p.V_2, K_2)
         if len(p.boiling) > 0:
@@ -110,8 +101,8 @@ def _solved(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
             r_A, r_B = select(boils_A, 0.0 * r_A, r_A), select(boils_B, 0.0 * r_B, r_B)
             r_1, r_2 = select(boils_1, 0.0 * r_1, r_1), select(boils_2, 0.0 * r_2, r_2)
         g_A, g_B = step * (r_A + r_1), step * (r_B + r_2)
-        Q_A, Q_B = implicit_flows(total_A, total_B, g_A, g_B, z, p)
-        s = throttle_rates(moved, Q_A, Q_B, p)
+        Q_A, Q_B = rig.implicit_flows(total_A, total_B, g_A, g_B, z, p)
+        s = rig.throttle_rates(moved, Q_A, Q_B, p)
         before = moved
         moved = pressures_moved(z, step, s)
         if turns > 1:
@@ -125,28 +116,28 @@ def _solved(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
 @contracted
 def imex_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, F: Nodes, p: RigNumbers) -> State:
     """Return the state a step of h [s] later; `u`, `G`, `C` and the load `F` at the nodes of the step."""
-    Q_A, Q_B = throttle_flows(y, p)
-    s1 = throttle_rates(y, Q_A, Q_B, p)
-    f1 = rates_without_throttles(y, u[0], G[0], C[0], F[0], p)
+    Q_A, Q_B = rig.throttle_flows(y, p)
+    s1 = rig.throttle_rates(y, Q_A, Q_B, p)
+    f1 = rig.rates_without_throttles(y, u[0], G[0], C[0], F[0], p)
     z, s2 = _solved(_after(y, h, E_2[0], f1, I_2[0], s1), h, p)
-    f2 = rates_without_throttles(z, u[1], G[1], C[1], F[1], p)
+    f2 = rig.rates_without_throttles(z, u[1], G[1], C[1], F[1], p)
     z = _after(_after(y, h, E_3[0], f1, I_3[0], s1), h, E_3[1], f2, I_3[1], s2)
     z, s3 = _solved(z, h, p)
-    f3 = rates_without_throttles(z, u[2], G[2], C[2], F[2], p)
+    f3 = rig.rates_without_throttles(z, u[2], G[2], C[2], F[2], p)
     z = _after(_after(y, h, E_4[0], f1, I_4[0], s1), h, E_4[1], f2, I_4[1], s2)
     z, s4 = _solved(_after(z, h, E_4[2], f3, I_4[2], s3), h, p)
-    f4 = rates_without_throttles(z, u[3], G[3], C[3], F[3], p)
+    f4 = rig.rates_without_throttles(z, u[3], G[3], C[3], F[3], p)
     z = _after(_after(y, h, E_5[0], f1, I_5[0], s1), h, E_5[1], f2, I_5[1], s2)
     z = _after(_after(z, h, E_5[2], f3, I_5[2], s3), h, E_5[3], f4, I_5[3], s4)
     z, s5 = _solved(z, h, p)
-    f5 = rates_without_throttles(z, u[4], G[4], C[4], F[4], p)
+    f5 = rig.rates_without_throttles(z, u[4], G[4], C[4], F[4], p)
     z = _after(_after(y, h, E_6[0], f1, W[0], s1), h, E_6[2], f3, W[2], s3)
     z = _after(_after(moved(z, h * E_6[1], f2), h, E_6[3], f4, W[3], s4), h, E_6[4], f5, W[4], s5)
     z, s6 = _solved(z, h, p)
-    f6 = rates_without_throttles(z, u[5], G[5], C[5], F[5], p)
+    f6 = rig.rates_without_throttles(z, u[5], G[5], C[5], F[5], p)
     z = _after(_after(y, h, W[0], f1, W[0], s1), h, W[2], f3, W[2], s3)
     z = _after(_after(_after(z, h, W[3], f4, W[3], s4), h, W[4], f5, W[4], s5), h, W[5], f6, W[5], s6)
-    return within_limits(z, p)
+    return rig.within_limits(z, p)
 
 
 @law

@@ -17,7 +17,7 @@ from sealscope.physics.rig import CHOICES, NUMBERS, RigNumbers, pressures_of, va
 from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, Implicit
 from sealscope.physics.solvers.imex import imex_step
 from sealscope.physics.solvers.rk4 import rk4_step
-from sealscope.physics.state import P_A, P_B, POSITION, State
+from sealscope.physics.state import P_A, P_B, POSITION, STATES, State
 
 #: Rows that describe a leak of each lane: G [m^3/(s Pa)], C [m^3/(s Pa^0.5)], start [s], slope of the opening [1/s],
 #: and the G and C whose flow goes to the account (those of the leak, or of one that is being sized).
@@ -33,40 +33,22 @@ Account = tuple[float, float, float, float, float]
 FLOW, OPEN, REACH, LEAST, DIVERGED = range(ACCOUNTS)
 
 
-def _lane_numbers() -> Any:
-    """Return the compiled function (table, at, p): the choices of `p`, and the group's numbers from rows at, at + 1, ..
-
-    Numba needs every field written out, so the text is made from the lists of fields.
-    """
-    fields = [f"{name}=load(table, at + {row})" for row, name in enumerate(NUMBERS)]
-    fields += [f"{name}=p.{name}" for name in CHOICES]
-    scope = {"RigNumbers": RigNumbers, "load": load}
-    exec(f"def lane_numbers(table, at, p):\n    return RigNumbers({', '.join(fields)})", scope)
-    return contracted(scope["lane_numbers"])  # type: ignore[type-var]
+def _written(text: str, **scope: Any) -> Any:
+    """Return the compiled law of a text: numba needs every element of a tuple written out."""
+    scope["load"] = load
+    exec(text, scope)
+    return contracted(scope["law"])
 
 
-lane_numbers = _lane_numbers()
+def _rows(count: int) -> Any:
+    """Return the compiled function (array, at): the tuple of the lanes of `count` rows from row `at` on."""
+    return _written(f"def law(array, at):\n    return ({', '.join(f'load(array, at + {k})' for k in range(count))})")
 
 
-@contracted
-def lane_state(y: np.ndarray, at: int) -> State:
-    """Return the state of a group from rows at .. at + 13."""
-    return (
-        load(y, at),
-        load(y, at + 1),
-        load(y, at + 2),
-        load(y, at + 3),
-        load(y, at + 4),
-        load(y, at + 5),
-        load(y, at + 6),
-        load(y, at + 7),
-        load(y, at + 8),
-        load(y, at + 9),
-        load(y, at + 10),
-        load(y, at + 11),
-        load(y, at + 12),
-        load(y, at + 13),
-    )
+lane_state, lane_leak, lane_account = _rows(len(STATES)), _rows(LEAK_ROWS), _rows(ACCOUNTS)
+_FIELDS = [*(f"{name}=load(table, at + {row})" for row, name in enumerate(NUMBERS)), *(f"{c}=p.{c}" for c in CHOICES)]
+#: Of (table, at, p): the choices of `p`, and the group's numbers from rows at, at + 1, ..
+lane_numbers = _written(f"def law(table, at, p):\n    return RigNumbers({', '.join(_FIELDS)})", RigNumbers=RigNumbers)
 
 
 @contracted
@@ -162,23 +144,7 @@ def advance(
     for g in range(groups[0], groups[1]):
         z = lane_state(y, g * states)
         gain = (load(drive, 2 * g), load(drive, 2 * g + 1))
-        a = g * LEAK_ROWS
-        leak = (
-            load(leaks, a),
-            load(leaks, a + 1),
-            load(leaks, a + 2),
-            load(leaks, a + 3),
-            load(leaks, a + 4),
-            load(leaks, a + 5),
-        )
-        a = g * ACCOUNTS
-        noted = (
-            load(account, a),
-            load(account, a + 1),
-            load(account, a + 2),
-            load(account, a + 3),
-            load(account, a + 4),
-        )
+        leak, noted = lane_leak(leaks, g * LEAK_ROWS), lane_account(account, g * ACCOUNTS)
         out = (g * pressures.shape[1] + begin) * CHANNELS
         for cell in range(cells):
             q = lane_numbers(table, (g * cells + cell) * fields, p)
@@ -199,7 +165,7 @@ def advance(
         for m in range(states):
             store(y, g * states + m, z[m])
         for m in range(ACCOUNTS):
-            store(account, a + m, noted[m])
+            store(account, g * ACCOUNTS + m, noted[m])
 
 
 @kernel

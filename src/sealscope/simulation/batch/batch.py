@@ -20,7 +20,7 @@ from sealscope.recordings.recording import Array
 from sealscope.simulation.batch.run import LaneSet, SetRun, sets_of, with_sizes
 from sealscope.simulation.experiment import LONGEST_STEP, PRESSURE_TOLERANCE, Experiment
 from sealscope.simulation.integrate import FINEST, FIRST_WINDOW
-from sealscope.simulation.sizing import scaled_size
+from sealscope.simulation.sizing import settled
 from sealscope.units import LITRE_PER_MINUTE, parse_quantity
 
 if TYPE_CHECKING:
@@ -193,9 +193,8 @@ def _run(part: LaneSet, batch: Batch, error: float, threads: int, progress: Call
     places = [member.place for member in part.members]
     sizes = np.array([member.leak.coefficient or 0.0 for member in part.members])
     step = part.experiment.step or chosen_step(part, sizes, error)
-    means = np.array([member.leak.mean or 0.0 for member in part.members])
-    if np.any(means > 0):
-        sizes = _sized(part, step, sizes, means, threads)
+    if any(member.leak.mean for member in part.members):
+        sizes = _sized(part, step, sizes, threads)
         step = part.experiment.step or min(step, chosen_step(part, sizes, error))
     run = SetRun(part, step, sizes, sizes, batch.bounds)
     run.all(threads, progress)
@@ -245,26 +244,19 @@ def allowed_step(part: LaneSet, sizes: Array) -> float:
     return max(min(limits), LONGEST_STEP / FINEST)
 
 
-def _sized(part: LaneSet, step: float, sizes: Array, means: Array, threads: int) -> Array:
-    """Coefficients that give the leaks' means, as `sizing.sized` finds them, for all members together."""
-    from sealscope.simulation.sizing import MOST_RUNS, TOLERANCE, unsettled
+def _sized(part: LaneSet, step: float, sizes: Array, threads: int) -> Array:
+    """Return coefficients that give the leaks' means, for all members together."""
+    means = np.array([member.leak.mean or 0.0 for member in part.members])
 
-    wanted = means > 0
-    before = np.zeros((2, len(sizes)))
-    for _ in range(MOST_RUNS):
-        fine = part.experiment.step or min(step, allowed_step(part, sizes))
-        run = SetRun(part, fine, sizes, np.where(sizes > 0, sizes, 1.0), None)
+    def measure(sizes: Array) -> tuple[Array, None]:
+        measured = np.where(sizes > 0, sizes, 1.0)
+        run = SetRun(part, part.experiment.step or min(step, allowed_step(part, sizes)), sizes, measured, None)
         run.all(threads, None)
-        got = run.mean_flow()
-        if np.any(got[wanted] <= 0):
-            run_place = part.members[int(np.flatnonzero(wanted & (got <= 0))[0])].place
-            raise InputError(f"a leak with a mean flow must be open within the run (run {run_place})")
-        known = wanted & (sizes > 0)
-        if np.all(known[wanted]) and np.all(np.abs(got[wanted] / means[wanted] - 1.0) <= TOLERANCE):
-            return sizes
-        following = sizes.copy()
-        for k in np.flatnonzero(wanted):
-            following[k] = scaled_size(means[k], (before[0, k], before[1, k]), (sizes[k], got[k]))
-        before = np.where(known, np.stack([sizes, got]), 0.0)
-        sizes = following
-    raise unsettled([member.leak for member in part.members])
+        units = run.mean_flow() / measured
+        shut = np.flatnonzero((means > 0) & (units <= 0))
+        if shut.size:
+            place = part.members[shut[0]].place
+            raise InputError(f"a leak with a mean flow must be open within the run (run {place})")
+        return units, None
+
+    return settled([member.leak for member in part.members], sizes, measure)[0]

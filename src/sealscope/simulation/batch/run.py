@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import sys
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -33,7 +32,6 @@ from sealscope.simulation.experiment import Experiment, choose_method, exact
 from sealscope.simulation.instruments import FILTER_REACH, anti_alias_taps
 from sealscope.simulation.integrate import (
     VACUUM,
-    NodeSines,
     oversampling_of,
     refuse_long,
     refuse_unresolved,
@@ -102,7 +100,7 @@ def refuse(experiment: Experiment, place: int) -> None:
         raise no(f"a leak that opens abruptly or evenly, got {experiment.leaks[0].opening}")
     if experiment.rig.motor.integrator == "euler":
         raise no("motor.integrator = state, got euler")
-    if any(fault.adjustments() or fault.holds() for fault in experiment.faults):
+    if any(fault.row.of_sensor for fault in experiment.faults):
         raise no(f"no fault of a sensor, got {', '.join(str(fault) for fault in experiment.faults)}")
     if experiment.rig.daq.jitter != 0:
         raise no(f"daq.jitter = 0, got {experiment.rig.daq.jitter}")
@@ -302,36 +300,26 @@ class SetRun:
     """The runs of a set.
 
     `sizes` (runs,) are the leaks' coefficients, `measured` those whose flow is accounted, `bounds` [s] the segments of
-    the statistics, None for none (flows alone are then of interest). `most` samples are run where that is less than
-    all.
+    the statistics, None for none (flows alone are then of interest).
     """
 
     #: Runs of a group.
     width: ClassVar[int] = 8
 
-    def __init__(
-        self,
-        part: LaneSet,
-        step: float,
-        sizes: Array,
-        measured: Array,
-        bounds: Array | None,
-        most: int | None = None,
-    ) -> None:
+    def __init__(self, part: LaneSet, step: float, sizes: Array, measured: Array, bounds: Array | None) -> None:
         from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, nodes_of
         from sealscope.physics.solvers.limits import longest_step
         from sealscope.physics.standstill import initial_state
         from sealscope.physics.vector.runs import ACCOUNTS, CHANNELS, LEAST
 
         members, common = part.members, part.experiment
-        self.asked_step, self.sizes = step, sizes
         self.part, self.runs, self.channels = part, len(members), CHANNELS
         self.method = choose_method(common.rig, common.method)
         self.factor = oversampling_of(common.rate, step)
         rate = common.rate * self.factor
         self.every = steps_per_output(rate, step)
         self.h = 1.0 / (rate * self.every)
-        self.samples = min(round(common.duration * common.rate), most or sys.maxsize)
+        self.samples = round(common.duration * common.rate)
         self.outputs = (self.samples + FILTER_REACH) * self.factor
         self.nodes = nodes_of(IMPLICIT if self.method == "imex" else EXPLICIT, self.h)
         self.cells = cells_of(members, self.outputs, rate)
@@ -360,43 +348,28 @@ class SetRun:
             self._prepare_statistics(bounds)
 
     def _prepare_filters(self, rate: float) -> None:
-        """Lay out the anti-alias filter, for each lane where a channel is late.
-
-        Its first tap is `before` and its last `after` outputs from the sample's.
-        """
-        from sealscope.simulation.batch.signals import TILE
-
-        taps = anti_alias_taps(self.factor)
-        self.before = self.after = taps.size // 2
-        self.taps = np.pad(taps, (TILE - 1) * self.factor)
+        """Lay out the anti-alias filter of each lane: its taps are `before` .. `after` outputs from the sample's."""
         sensors = [member.experiment.rig.sensors for member in self.part.members]
         delays = np.array([[getattr(group, name).delay * rate for name in CHAMBERS] for group in sensors])
-        whole = np.floor(delays).astype(np.int64)
-        if not delays.any():
-            self.own_taps = np.zeros((self.groups, self.channels, 1, self.width))
-            return
-        filters = [[anti_alias_taps(self.factor, delay % 1.0) for delay in run] for run in delays]
-        self.after = max(taps.size // 2 for run in filters for taps in run)
-        self.before = self.after + int(whole.max())
+        known = {delay: anti_alias_taps(self.factor, delay % 1.0) for delay in set(delays.ravel().tolist())}
+        self.after = max(taps.size // 2 for taps in known.values())
+        self.before = self.after + int(delays.max())
         own = np.zeros((self.runs, self.channels, self.before + self.after + 1))
-        for run, channel in np.ndindex(*delays.shape):
-            taps = filters[run][channel]
-            start = self.before - int(whole[run, channel]) - taps.size // 2
-            own[run, channel, start : start + taps.size] = taps
-        self.own_taps = in_lanes(own, self.width)
+        for place, delay in np.ndenumerate(delays):
+            taps = known[float(delay)]
+            start = self.before - int(delay) - taps.size // 2
+            own[place][start : start + taps.size] = taps
+        self.taps = in_lanes(own, self.width)
 
     def _prepare_statistics(self, bounds: Array) -> None:
-        from sealscope.signals.filters import decomposition_filters, reach
+        from sealscope.signals.filters import reach
         from sealscope.simulation.batch.noise import keys
-        from sealscope.simulation.batch.signals import LEVELS, QUANTITIES
+        from sealscope.simulation.batch.signals import QUANTITIES
 
-        rate = self.part.experiment.rate
-        before, after = reach("db8", LEVELS)[-1]
-        at = np.round(bounds * rate).astype(np.int64)
+        before, after = reach()[-1]
+        at = np.round(bounds * self.part.experiment.rate).astype(np.int64)
         self.segments = np.clip(at, before, self.samples - after)
-        self.low, self.high = (tuple(taps.tolist()) for taps in decomposition_filters("db8"))
-        shape = (self.groups, self.channels)
-        self.sums = np.zeros((*shape, self.segments.size - 1, QUANTITIES, self.width))
+        self.sums = np.zeros((self.groups, self.channels, self.segments.size - 1, QUANTITIES, self.width))
         self.keys = in_lanes(keys([m.experiment.seed for m in self.part.members]), self.width)
 
     def all(self, threads: int, progress: Callable[[float], None] | None) -> None:
@@ -438,26 +411,27 @@ class SetRun:
     def _some(self, groups: tuple[int, int], tell: Callable[[float], None]) -> None:
         """Run the groups first <= g < last from standstill to the end."""
         from sealscope.physics.vector.runs import advance_lanes_imex, advance_lanes_rk4
-        from sealscope.simulation.batch.signals import FILTER_ROWS, sense_lanes
+        from sealscope.signals.streams import DetailStream
+        from sealscope.simulation.batch.signals import sense_lanes
 
         advance = advance_lanes_imex if self.method == "imex" else advance_lanes_rk4
         a, b = groups
         own = (0, b - a)
         state, drive, leaks, account = self.state[a:b], self.drive[a:b], self.leaks[a:b], self.account[a:b]
         table, cells = np.empty((0, 0, 0, 0)), (-1, -1)
-        chunks, shapes = self._chunks(), self._shapes()
+        chunks = self._chunks()
         kept = self.before + self.after + self.factor  # outputs that later samples still need
         longest = max(stop - start for _, _, start, stop in chunks)
         pressures = np.zeros((b - a, kept + longest, self.channels, self.width))
         walks = np.zeros((b - a, self.channels, self.width))
-        filters = np.zeros((b - a, self.channels, FILTER_ROWS if self.bounds is not None else 0, self.width))
+        wavelet = DetailStream((self.channels, (b - a) * self.width))
         sampled = 0
         for first, last, start, stop in chunks:
             if cells != (first, last):
                 table, cells = self.cells.table(first, last, self.width)[a:b], (first, last)
             bounds = (np.clip(self.cells.bounds[first : last + 1], start, stop) - start) * self.every  # in steps
             advance(
-                own, state, self.h, start * self.every, self.nodes, shapes(start, stop), drive, leaks, table,
+                own, state, self.h, start * self.every, self.nodes, self._shape(start, stop), drive, leaks, table,
                 bounds, self.numbers, self.every, pressures, kept, account,
             )  # fmt: skip
             self._check(groups, stop)
@@ -466,33 +440,24 @@ class SetRun:
                     pressures[:, :kept] = pressures[:, kept : kept + 1]  # at standstill before the beginning
                 until = self._due(stop)
                 if until > sampled:
-                    sensors = self._sensors(groups, sampled, until)
                     begin = sampled * self.factor - self.before - (start - kept)
                     sense_lanes(
-                        own, pressures, begin, self.factor, self.taps, self.own_taps[a:b], sampled, until, sensors,
-                        self.keys[a:b], walks, filters, self.low, self.high, self.segments, self.sums[a:b],
+                        own, pressures, begin, self.factor, self.taps[a:b], sampled, until,
+                        self._sensors(groups, sampled, until), self.keys[a:b], walks, wavelet.taps, wavelet.buffers,
+                        self.segments, self.sums[a:b],
                     )  # fmt: skip
                     sampled = until
                 pressures[:, :kept] = pressures[:, stop - start : stop - start + kept].copy()
             tell((stop - start) / self.outputs * (b - a) / self.groups)
 
-    def _shapes(self) -> Callable[[int, int], Array]:
-        """Return the command's shape at the nodes of the steps between two outputs, for one thread's use.
-
-        Where there is a load, its forces [N] at the nodes stand behind.
-        """
-        shape, load = self.part.shape, self.part.experiment.load
-        sines = NodeSines(shape.omega, shape.phase) if isinstance(shape, Sine) else None
-
-        def shapes(start: int, stop: int) -> Array:
-            t = np.arange(start * self.every, stop * self.every, dtype=np.float64) * self.h
-            at = t[:, None] + self.nodes
-            volts = shape.volts(at) if sines is None else sines.at(t, self.nodes, 1.0, 0.0)
-            return np.ascontiguousarray(
-                volts if load is None else np.hstack([volts, np.broadcast_to(load.at(at), at.shape)])
-            )
-
-        return shapes
+    def _shape(self, start: int, stop: int) -> Array:
+        """Return the command's shape at the nodes of the steps between two outputs, and a load's forces behind it."""
+        t = np.arange(start * self.every, stop * self.every, dtype=np.float64) * self.h
+        at, load = t[:, None] + self.nodes, self.part.experiment.load
+        volts = self.part.shape.volts(at)
+        return np.ascontiguousarray(
+            volts if load is None else np.hstack([volts, np.broadcast_to(load.at(at), at.shape)])
+        )
 
     def _sensors(self, groups: tuple[int, int], first: int, last: int) -> Array:
         """Return the instruments of the groups for samples first .. last, (groups, 2, INSTRUMENT_ROWS, width)."""
@@ -504,7 +469,7 @@ class SetRun:
     @cached_property
     def _steady(self) -> Array | None:
         """The instruments of all groups, None where some change within a run."""
-        if any(member.experiment.readings().adjustments for member in self.part.members):
+        if any(member.experiment.readings().effects for member in self.part.members):
             return None
         return in_lanes(instrument_rows(self.part.members, 0, self.samples), self.width)
 
@@ -541,7 +506,7 @@ class SetRun:
 
     @property
     def _half(self) -> float:
-        return 0.5 * min(member.numbers.L for member in self.part.members)
+        return 0.5 * float(min(member.numbers.L for member in self.part.members))
 
     def rms(self) -> Array:
         """RMS of d1..d4 and d3 d4 in each segment, (runs, 2, segments, 5)."""

@@ -289,7 +289,7 @@ class Machine(NamedTuple):
     def period(self, stiffness: float) -> float:
         """Return the ring's period [samples] at a stiffness of the oil [Pa]."""
         m = self.numbers
-        return 2.0 * math.pi * self.rate * math.sqrt(m.V * m.M_eq / (2.0 * stiffness)) / m.A_A
+        return float(2.0 * math.pi * self.rate * math.sqrt(m.V * m.M_eq / (2.0 * stiffness)) / m.A_A)
 
     def ringing(self, dp: Array, total: Array, beliefs: Beliefs) -> Array:
         """Return the stiffnesses (2,) [Pa] at which p_A - p_B rings most, beyond noise and hum of p_A + p_B.
