@@ -9,7 +9,8 @@ from scipy.stats import t as student
 import sealscope as ss
 from sealscope.diagnosis.inference.live.balance import LiveBalance, NotJudged, size_error
 from sealscope.errors import InputError
-from sealscope.fmu.sensor import COLUMNS, INPUTS, RESULTS, WALK, WINDOW, SensorChoice, size
+from sealscope.fmu.sensor import COLUMNS, INPUTS, WALK, WINDOW, SensorChoice, size
+from sealscope.fmu.variables import SENSOR_RESULTS as RESULTS
 
 LEAK, ONSET, SECONDS = 0.0042, 80.0, 162.0
 RIG = ss.load_rig("thesis")

@@ -22,7 +22,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
-from operator import attrgetter
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -48,27 +47,12 @@ from sealscope.diagnosis.inference.terms import ATMOSPHERE, HALF_DIFFERENCE, LEA
 from sealscope.diagnosis.inference.weak_form import LARGEST, SPAN, STRIDE, stride_samples, test_function
 from sealscope.errors import InputError
 from sealscope.fmu.machine import unit_code
-from sealscope.fmu.variables import INPUT_BASE, RESULT_BASE, VALUE_BASE, VALUES, Variable
+from sealscope.fmu.variables import SENSOR_RESULTS, VALUES, Variable, inputs, outputs, parameter
 from sealscope.parameters import Rig
-from sealscope.parameters.fields import leaves, unit_of
 from sealscope.recordings.channels import CHANNEL_UNITS, LONG_NAMES
 
 #: Channels that a soft sensor reads, in the order of the samples.
 INPUTS = ("p_A", "p_B", "theta", "x")
-_MEAN, _RISE = "pump and piston together, mean of the last blocks", "rise over the first blocks"
-#: Outputs: unit, words.
-RESULTS = {
-    "q": ("m^3/s", f"leakage of {_MEAN}"),
-    "q_low": ("m^3/s", "leakage, lower end of its 95 % interval"),
-    "q_high": ("m^3/s", "leakage, upper end of its 95 % interval"),
-    "q_rise": ("m^3/s", f"leakage, {_RISE}"),
-    "q_rise_low": ("m^3/s", "leakage, lower end of the rise's 95 % interval"),
-    "q_rise_high": ("m^3/s", "leakage, upper end of the rise's 95 % interval"),
-    "conductance": ("m^3/(s Pa)", f"conductance between the chambers, {_MEAN}"),
-    "misfit": ("1", "variance of the last block's rows over the usual one"),
-    "blocks": ("1", "blocks that were estimated"),
-    "settled": ("1", "1 from the first block after those of the baseline on, else 0"),
-}
 #: What a function of a soft sensor returns where it fails.
 FAILURES = MappingProxyType({1: "pump.q_b must be > 0 m^3/rev"})
 #: The parameter of the rig that the balance reads.
@@ -98,14 +82,9 @@ _SCALARS = (
 
 def variables(rig: Rig) -> Iterator[Variable]:
     """Yield the variables of a soft sensor."""
-    for k, name in enumerate(INPUTS):
-        yield Variable(
-            INPUT_BASE + k, name, "input", "continuous", CHANNEL_UNITS[name], f"reading: {LONG_NAMES[name]}", 0.0
-        )
-    field, value = dict(leaves(Rig))[READ], float(attrgetter(READ)(rig))
-    yield Variable(VALUE_BASE + _SIZE, READ, "parameter", "fixed", unit_of(field), str(field.title or READ), value)
-    for k, (name, (unit, words)) in enumerate(RESULTS.items()):
-        yield Variable(RESULT_BASE + k, name, "output", "continuous", unit, words, None)
+    yield from inputs({name: (CHANNEL_UNITS[name], f"reading: {LONG_NAMES[name]}") for name in INPUTS})
+    yield from filter(None, [parameter(rig, READ, "fixed")])
+    yield from outputs(SENSOR_RESULTS)
 
 
 class SensorChoice(NamedTuple):
@@ -210,7 +189,7 @@ def functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
     sample, length, interval = _sample(choice), size(choice), 1.0 / choice.rate
     last_at = _place_of(choice, "last")
     misfit_at = length - sum(math.prod(shape) for shape in _shapes(choice)[2][3:]) + MISFIT
-    n_inputs, n_results, n_values = len(INPUTS), len(RESULTS), len(VALUES)
+    n_inputs, n_results, n_values = len(INPUTS), len(SENSOR_RESULTS), len(VALUES)
     quantiles, error = _quantiles(), choice.size_error
 
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
@@ -448,7 +427,7 @@ def _variance(last: Any, newest: int, n: int) -> float:
 
 @law
 def _write_results(m: Any, last: Any, misfit: float, error: float, quantiles: Any, out: Any) -> None:
-    """Write the outputs (`RESULTS`).
+    """Write the outputs (`SENSOR_RESULTS`).
 
     `error`: that of the machine's size, relative; `quantiles`: Student's t for 1, 2, ... degrees of freedom.
     """
