@@ -18,7 +18,7 @@ import pytest
 
 from sealscope.errors import MissingExtra
 from sealscope.reporting.thesis.files import figure_rows, publish
-from sealscope.reporting.thesis.page import VERDICTS, cell, render_thesis_page, write_thesis_page
+from sealscope.reporting.thesis.page import VERDICTS, cell, write_thesis_page
 from sealscope.reporting.thesis.plot_style import STYLES, caption, typeset
 from sealscope.reporting.thesis.plots import MOST_SVG_BYTES, UNRESOLVED, draw, grid_of, visible
 from sealscope.thesis.engine.build import ItemStatus
@@ -300,7 +300,8 @@ def test_the_pages_script_is_the_one_its_policy_allows(page: str) -> None:
 
 
 def test_an_empty_folder_gives_a_page_that_says_so(tmp_path: Path) -> None:
-    text = render_thesis_page(tmp_path, [(ItemStatus(Item("fig-1.1", 4, "figure", "F", make), "not made"), ())])
+    page = write_thesis_page(tmp_path, [(ItemStatus(Item("fig-1.1", 4, "figure", "F", make), "not made"), ())])
+    text = page.read_text(encoding="utf-8")
     assert "0 of 1 items" in text
     assert "not made yet, or from other sources (1)" in text
 

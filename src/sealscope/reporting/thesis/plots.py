@@ -52,7 +52,8 @@ def draw(figure: Figure) -> tuple[bytes, bytes]:
 
     with matplotlib.rc_context():
         matplotlib.rcdefaults()  # not the settings in the working folder, which may be hostile and run TeX
-        matplotlib.rcParams.update({**SETTINGS, "svg.hashsalt": figure.id})
+        matplotlib.rcParams.update(matplotlib.rc_params_from_file(SETTINGS, use_default_template=False))
+        matplotlib.rcParams["svg.hashsalt"] = figure.id
         canvas = _canvas(figure)
         long = [line for ax in canvas.axes for line in ax.lines if np.size(line.get_xdata()) > _LONG]
         if sum(np.size(line.get_xdata()) for line in long) * _POINT_BYTES > MOST_SVG_BYTES:

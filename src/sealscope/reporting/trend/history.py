@@ -14,7 +14,7 @@ from sealscope.diagnosis.trend.reading import DAY
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
-from sealscope.reporting import charts, messages, template
+from sealscope.reporting import charts, messages, picture, template
 from sealscope.reporting.trend.chart import SIZES, Scale, day_ticks, with_margin
 from sealscope.reporting.trend.text import stamp
 
@@ -138,7 +138,7 @@ def history_chart(ordered: Sequence[Judged], size: str) -> dict[str, Any] | None
         "absent": [scale.x(day) for day, level in zip(days, levels, strict=True) if level is None],
         "limit": None if limit is None or limit > top else scale.y(limit),
         "x_ticks": [(scale.x(day), stamp(day * DAY, span) if dated else f"{day:g}") for day in ticks],
-        "y_ticks": [(scale.y(level), f"{level:.6g}") for level in charts.ticks(0.0, top, 4)],
+        "y_ticks": [(scale.y(level), f"{level:.6g}") for level in picture.ticks(0.0, top, 4)],
     }
 
 
