@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
     from sealscope.recordings import Recording
     from sealscope.recordings.formats.columns import ChannelMap
-    from sealscope.simulation.simulate import Progress
 
 T = TypeVar("T")
 #: Exit status where a verdict is one of those that `--fail-on` names; verdicts; levels of severity, the worst last.
@@ -333,64 +332,53 @@ def say_jobs(jobs: int | None) -> None:
 
 
 @contextmanager
-def progress() -> Iterator[Progress]:
-    """Return a progress line a task on standard error, gone when done; silent without a terminal."""
-    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+def progress(noun: str = "") -> Iterator[Callable[[str, float], None]]:
+    """Return what shows tasks and their shares on standard error, in lines that are gone when done.
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with _bar(*columns) as bar:
+    Without a terminal nothing is shown; of many things, `noun`, a line a minute for the log.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    if not console.is_terminal:  # a disabled bar may print an empty line
+        yield _each_minute() if noun else lambda *_: None
+        return
+    columns = (BarColumn(), TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=console, transient=True, speed_estimate_period=120) as bar:
         tasks: dict[str, Any] = {}
 
         def update(task: str, share: float) -> None:
-            if bar is None:
-                return
-            if task not in tasks:
-                tasks[task] = bar.add_task(task, total=1.0)
-            bar.update(tasks[task], completed=share)
+            key = noun or task
+            if key not in tasks:
+                tasks[key] = bar.add_task(task, total=1.0)
+            bar.update(tasks[key], completed=share, description=task)
 
         yield update
+
+
+def _each_minute() -> Callable[[str, float], None]:
+    """Return what prints a line a minute: what is done, and the time left."""
+    began = said = time.monotonic()
+    first: float | None = None
+
+    def update(task: str, share: float) -> None:
+        nonlocal said, first
+        now, first = time.monotonic(), share if first is None else first
+        if now - said >= 60.0 and share > first:
+            said = now
+            echo(f"{task}, about {time_text((now - began) / (share - first) * (1.0 - share))} left", err=True)
+
+    return update
 
 
 @contextmanager
 def counted_progress(noun: str) -> Iterator[Callable[[int, int, str], None]]:
-    """Show on standard error how many of `noun` are done, the time left and a note.
-
-    Without a terminal a line a minute, for the log.
-    """
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-    columns = (TextColumn(noun), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"))
-    with _bar(*columns, TimeRemainingColumn(), TextColumn("{task.description}")) as bar:
-        task = None if bar is None else bar.add_task("", total=None)
-        began = said = time.monotonic()
-        first: int | None = None
-
-        def update(done: int, total: int, note: str) -> None:
-            nonlocal said, first
-            if bar is not None:
-                bar.update(task, completed=done, total=total, description=note)
-                return
-            now, first = time.monotonic(), done if first is None else first
-            if now - said >= 60.0 and done > first:
-                said, left = now, (now - began) / (done - first) * (total - done)
-                note = f", {note}" if note else ""
-                echo(f"{done} of {total} {noun}{note}, about {time_text(left)} left", err=True)
-
-        yield update
-
-
-@contextmanager
-def _bar(*columns: Any) -> Iterator[Any]:
-    """Return a bar on standard error, None without a terminal: a disabled bar may print an empty line."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield None
-        return
-    with Progress(*columns, console=console, transient=True, speed_estimate_period=120) as bar:
-        yield bar
+    """Show on standard error how many of `noun` are done, the time left and a note."""
+    with progress(noun) as show:
+        yield lambda done, total, note: show(
+            f"{done} of {total} {noun}{', ' if note else ''}{note}", done / max(total, 1)
+        )
 
 
 def time_text(seconds: float) -> str:
