@@ -327,7 +327,7 @@ def write_sensor_fmu(
         _values(machine),
         len(own.INPUTS),
         len(SENSOR_RESULTS),
-        own.size(choice),
+        own.memory_of(choice).itemsize // 8,
         1.0 / rate,
         own.FAILURES,
     )
