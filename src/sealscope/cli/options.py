@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import logging
 import shutil
 import sys
@@ -9,7 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
+from functools import partial, wraps
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from textwrap import fill
@@ -111,27 +112,28 @@ SheetOption = Annotated[Path | None, Option("--sheet", help=_SHEET)]
 
 @dataclass(frozen=True)
 class StatedMachine:
-    """What a call states of the machine: by its file (`known`), or how to read its files, its rig and repair limit."""
+    """What a call states of the machine: by its file (`known`), or how to read its files, rig, limit and baseline."""
 
     known: CommissionedMachine | None = None
     channel_map: ChannelMap = field(default_factory=dict)
     rate: float | None = None
     rig: Rig | None = None
     limit: str | None = None
+    baseline: tuple[Path, ...] = ()
 
     @classmethod
     def of(
         cls,
-        machine: Path | None,
-        maps: Sequence[str] | None,
-        rate: float | None,
-        rig: str | None = None,
-        area: Sequence[str] | None = None,
-        displacement: str | None = None,
-        limit: str | None = None,
-        baseline: Sequence[Path] | None = None,
+        machine: MachineOption = None,
+        maps: MapOption = None,
+        rate: RateOption = None,
+        rig: AssumeOption = None,
+        area: AreaOption = None,
+        displacement: DisplacementOption = None,
+        limit: LimitOption = None,
+        baseline: BaselineOption = None,
     ) -> StatedMachine:
-        """Return what the options state; InputError where it cannot be, or stands beside `--machine` and differs."""
+        """Return what the options state; InputError where it cannot be, or stands beside `--machine`."""
         from sealscope.diagnosis.verdict.severity import RepairLimit
         from sealscope.recordings.formats.columns import check_call
 
@@ -145,7 +147,8 @@ class StatedMachine:
                     raise InputError(f"{name} must not stand beside --machine, whose file states it")
             known = load_machine(machine)
             return cls(known, rig=known.rig, limit=known.limit)
-        stated = cls(None, channel_map_of(maps), rate, _assumed_rig(rig, area, displacement), limit)
+        own_rig = _assumed_rig(rig, area, displacement)
+        stated = cls(None, channel_map_of(maps), rate, own_rig, limit, tuple(baseline or ()))
         check_call(stated.channel_map, rate)
         check_call(stated._map_of_rig, rate)
         RepairLimit.of(limit)
@@ -216,6 +219,27 @@ class StatedMachine:
             return replace(own, file=str(file))
         stated: dict[str, Any] = {"rig": self.rig, "limit": self.limit, "quick": quick, "file": file}
         return diagnose(recording, baseline, false_alarm_probability=false_alarm, **stated)
+
+
+def stating(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command the options of `StatedMachine.of`, or those of these names, in place of its parameter `stated`."""
+
+    def decorated(command: Callable[..., None]) -> Callable[..., None]:
+        own = inspect.signature(command, eval_str=True)
+        every = inspect.signature(StatedMachine.of, eval_str=True).parameters
+        options = [every[name] for name in names or every]
+
+        @wraps(command)
+        def call(**given: Any) -> None:
+            stated = StatedMachine.of(**{option.name: given.pop(option.name) for option in options})
+            command(stated=stated, **given)
+
+        kept = [parameter for parameter in own.parameters.values() if parameter.name != "stated"]
+        by_name = [parameter.replace(kind=parameter.KEYWORD_ONLY) for parameter in (*kept, *options)]
+        call.__signature__ = own.replace(parameters=by_name)  # type: ignore[attr-defined]
+        return call
+
+    return decorated
 
 
 def _assumed_rig(name: str | None, area: Sequence[str] | None, displacement: str | None) -> Rig | None:
