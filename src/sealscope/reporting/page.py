@@ -169,7 +169,6 @@ def render_page(
         *charts.detail_charts(chambers, pressure_unit),
     ]
     drawn = charts.draw(recording, chambers, shown, diagnosis, all_marks)
-    uplot_js, charts_js = template.packaged("vendor/uPlot.iife.min.js"), template.packaged("templates/charts.js")
     circuit = circuit_of(known_rig, recording)
     facts = f"{len(recording)} samples at {recording.rate:g} Hz, {messages.clock(recording.duration)}"
     return template.render(
@@ -189,12 +188,7 @@ def render_page(
         recording=recording,
         channels=[_summary(recording, name, pressure_unit) for name in recording.channels],
         provenance=list(_flat(recording.provenance)),
-        uplot_license=str(template.packaged("vendor/uPlot.LICENSE")),
-        uplot_css=template.packaged("vendor/uPlot.min.css"),
-        uplot_js=uplot_js,
-        charts_js=charts_js,
-        script_hashes=Markup(" ").join(template.script_hash(code) for code in (uplot_js, charts_js)),
-        chart_data=template.script_json(drawn.data),
+        chart_data=drawn.data if shown else None,
         **_evidence(recording, diagnosis, drawn, shown, all_marks),
         **_changes(recording, diagnosis, chambers, pressure_unit),
     )

@@ -220,7 +220,6 @@ def render_campaign_page(result: CampaignResult, files: Sequence[str] = ()) -> s
         failed=failed,
         failed_count=len(judgement.failed),
         files=files,
-        campaign_css=template.packaged("templates/campaign.css"),
     )
 
 

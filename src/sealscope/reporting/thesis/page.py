@@ -77,9 +77,10 @@ def write_thesis_page(
             why = f"{status.state}: {status.reason}"
             absent["not made yet, or from other sources" if status.state == "not made" else why].append(status)
     claims_files = [name for status in statuses if status.item.id == "claims" for name in status.files]
-    script = template.packaged("templates/thesis.js")
     page = template.render(
         "thesis.html.j2",
+        scripts=["templates/thesis.js"],
+        title="The thesis reproduced",
         thesis=THESIS,
         chapters=[(number, CHAPTERS.get(number, f"Chapter {number}"), of) for number, of in chapters.items()],
         claims=list(claims.values()),
@@ -97,9 +98,6 @@ def write_thesis_page(
         cell=cell,
         is_number=lambda value: isinstance(value, int | float) and not isinstance(value, bool),
         long_table=_LONG_TABLE,
-        thesis_css=template.packaged("templates/thesis.css"),
-        script=script,
-        script_hash=template.script_hash(script),
     )
     return template.write(folder / "index.html", page)
 
