@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from enum import StrEnum
 from functools import partial, wraps
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -28,9 +29,8 @@ if TYPE_CHECKING:
     from sealscope.recordings.formats.columns import ChannelMap
 
 T = TypeVar("T")
-#: Exit status where a verdict is one of those that `--fail-on` names; verdicts; levels of severity, the worst last.
+#: Exit status where a verdict is one of those that `--fail-on` names.
 FAILED_ON = 3
-VERDICTS, LEVELS = ("leak", "no leak", "cannot tell"), ("monitor", "plan", "repair")
 #: Stands for standard input.
 STANDARD_INPUT = Path("-")
 _log = logging.getLogger(__name__)
@@ -102,10 +102,9 @@ FalseAlarmOption = Annotated[float, Option("--false-alarm", help="Probability of
 SeedOption = Annotated[int, Option("--seed", help="Seed of the instruments' noise.")]
 _JOBS = "Processes; by default one a core, two a core at most."
 JobsOption = Annotated[int | None, Option("--jobs", "-j", help=_JOBS)]
-FailOnOption = Annotated[
-    list[str] | None,
-    Option("--fail-on", help="End with status 3 on this verdict; repeat.", autocompletion=completing(lambda: VERDICTS)),
-]
+_FAIL_ON = "End with status 3 on this verdict; repeat."
+Verdict = StrEnum("Verdict", {"leak": "leak", "no_leak": "no leak", "cannot_tell": "cannot tell"})
+FailOnOption = Annotated[list[Verdict] | None, Option("--fail-on", help=_FAIL_ON)]
 _SHEET = "Folder with the thesis's data sheet (appendix_c_pa.csv, appendix_c_pb.csv); else $SEALSCOPE_SHEET or ./data."
 SheetOption = Annotated[Path | None, Option("--sheet", help=_SHEET)]
 
@@ -282,12 +281,6 @@ def channel_map_of(options: Sequence[str] | None) -> ChannelMap:
             raise InputError(f"--map {channel} must be given once, got {columns[channel]} and {column}")
         columns[channel] = column
     return "auto" if set(columns) == {REST} else columns
-
-
-def check_fail_on(words: Sequence[str] | None, known: Sequence[str]) -> None:
-    """Raise InputError where `--fail-on` names no verdict, and no level where there are levels."""
-    if wrong := [word for word in words or () if word not in known]:
-        raise InputError(f"--fail-on must be {', '.join(known[:-1])} or {known[-1]}, got {wrong[0]!r}")
 
 
 def verbose(context: Context) -> bool:

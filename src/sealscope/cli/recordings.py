@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import redirect_stderr
 from dataclasses import replace
+from enum import StrEnum
 from functools import partial
 from io import StringIO
 from itertools import pairwise
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
     Judged = tuple[Recording, Diagnosis]
     Dated = tuple[float | None, Diagnosis]
 
+#: Levels of a leak, the worst last; what `--fail-on` names.
+_LEVELS = ("monitor", "plan", "repair")
+FailOn = StrEnum("FailOn", [(word.replace(" ", "_"), word) for word in (*opt.Verdict, *_LEVELS)])  # type: ignore[misc]
 #: Fewer files are diagnosed one after the other: processes take a second or two to start.
 _FEWEST_SIDE_BY_SIDE = 4
 #: Fewest files, and time between two of them [s], from which on they may be a machine's over time.
@@ -46,23 +50,20 @@ def diagnose(
     false_alarm: opt.FalseAlarmOption = 0.01,
     quick: Annotated[bool, Option("--quick", help="Stop at the first method with a verdict.")] = False,
     quiet: Annotated[bool, Option("--quiet", "-q", help="Print the first line of each verdict only.")] = False,
-    fail_on: Annotated[
-        list[str] | None,
-        Option("--fail-on", help=_FAIL_ON, autocompletion=opt.completing(lambda: (*opt.VERDICTS, *opt.LEVELS))),
-    ] = None,
+    fail_on: Annotated[list[FailOn] | None, Option("--fail-on", help=_FAIL_ON)] = None,
 ) -> None:
     """Say for each file whether oil bypasses the piston; with -v by every method.
 
     With --machine also of folders, a line a recording. Exit status 1 where a file could not be read.
     """
     from sealscope.campaigns.execution.workers import cores, in_order
+    from sealscope.diagnosis.commissioned.machine import recordings_in
     from sealscope.diagnosis.diagnose import check_probability
 
     check_probability(false_alarm)
-    opt.check_fail_on(fail_on, (*opt.VERDICTS, *opt.LEVELS))
     form = "jsonl" if output == "jsonl" else "line" if quiet else "whole" if opt.verbose(context) else "short"
     if stated.known is not None and any(path.is_dir() for path in files):
-        files = _in_folders(files)
+        files = recordings_in(files)
         form = form if form == "jsonl" else "table"
     work = partial(_dated, machine=stated, joined=join, false_alarm=false_alarm, quick=quick)
     jobs = min(cores(), len(files))
@@ -109,7 +110,7 @@ def _text(diagnosis: Diagnosis, form: str, start_s: float | None) -> str:
 def _fails(reason: str, diagnosis: Diagnosis) -> bool:
     """Return whether the verdict is the one of `--fail-on`, or a leak's level that one or worse."""
     level = None if diagnosis.severity is None else diagnosis.severity.level
-    return reason == diagnosis.verdict or (reason in opt.LEVELS and level in opt.LEVELS[opt.LEVELS.index(reason) :])
+    return reason == diagnosis.verdict or (reason in _LEVELS and level in _LEVELS[_LEVELS.index(reason) :])
 
 
 def _in_time(files: Sequence[Path], starts: Sequence[float | None]) -> bool:
@@ -127,12 +128,6 @@ def _check_standard_input(files: Iterable[Path]) -> bool:
     if count > 1:
         raise InputError(f"standard input (-) must be given once, got it {count} times")
     return count == 1
-
-
-def _in_folders(paths: Sequence[Path]) -> list[Path]:
-    from sealscope.diagnosis.commissioned.machine import recordings_in
-
-    return recordings_in(paths)
 
 
 def _diagnoses(
@@ -235,13 +230,14 @@ def report(
 
 def _report_machine(files: Sequence[Path], machine: opt.StatedMachine, output: Path, false_alarm: float) -> None:
     """Write the page of a commissioned machine: the recordings of a folder over time, the newest verdict first."""
+    from sealscope.diagnosis.commissioned.machine import recordings_in
     from sealscope.recordings.formats.columns import counted
     from sealscope.recordings.joining import start_seconds
     from sealscope.reporting.template import check_page
     from sealscope.reporting.trend.history import Judged, write_history_page
 
     opt.check_folder(check_page(output, card=False))
-    paths = _in_folders(files)
+    paths = recordings_in(files)
     if output.resolve() in {path.resolve() for path in paths}:
         raise InputError(f"a page must not replace a recording, got {output}")
     results = list(_diagnoses(paths, machine, False, false_alarm))

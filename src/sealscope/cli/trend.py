@@ -43,7 +43,6 @@ def trend(
     from sealscope.reporting.trend.text import trend_csv, trend_text
     from sealscope.units import parse_quantity
 
-    opt.check_fail_on(fail_on, opt.VERDICTS)
     spacing = None if every is None else parse_quantity(every, "s", name="--every")
     if output is not None:
         _check_output(output, files)
