@@ -19,15 +19,12 @@ from numpy.typing import ArrayLike
 from sealscope.errors import InputError
 from sealscope.signals.filters import (
     Array,
-    check_saved,
     checked_levels,
     decomposition_filters,
     reach,
-    saved_array,
-    saved_count,
-    saved_part,
     whole_number,
 )
+from sealscope.storage.plain_state import count_of, numbers_of, part_of
 
 if TYPE_CHECKING:
     from concurrent.futures import ThreadPoolExecutor
@@ -186,21 +183,23 @@ class DetailStream:
             "history": unpacked(history, self._table[1]),
         }
 
-    def load_state(self, state: dict[str, Any], what: str = "detail stream") -> None:
+    def load_state(self, state: dict[str, Any]) -> None:
         """Continue from what `state_dict` of a stream with the same settings returned, bit for bit.
 
         Raises InputError for a state that is not one of such a stream.
         """
-        for name in _SETTINGS:
-            check_saved(state, name, getattr(self, name), what)
-        history = saved_array(state, "history", (self._table[0], self.levels, self._history, self._table[1]), what)
-        self._fill, self.samples = self._history, saved_count(state, "samples", what)
+        for name, own in ((name, getattr(self, name)) for name in _SETTINGS):
+            value = part_of(state, name, (type(own), list))
+            if own != (tuple(value) if isinstance(value, list) else value):
+                raise InputError(f"saved state's {name} must be {own}, got {value!r}")
+        history = numbers_of(state, "history", (self._table[0], self.levels, self._history, self._table[1]))
+        self._fill, self.samples = self._history, count_of(state, "samples")
         pack(history, self._buffers[:, :, :, : self._history])
 
     @classmethod
     def from_state(cls, state: dict[str, Any], *, threads: int = 1) -> DetailStream:
         """Return the stream that `state_dict` described, bit for bit; raises InputError for a wrong state."""
-        channels, levels, wavelet = (saved_part(state, name, "detail stream") for name in _SETTINGS)
+        channels, levels, wavelet = (part_of(state, name, object) for name in _SETTINGS)
         stream = cls(
             tuple(channels) if isinstance(channels, list) else channels, levels, wavelet=wavelet, threads=threads
         )
