@@ -104,7 +104,7 @@ _JOBS = "Processes; by default one a core, two a core at most."
 JobsOption = Annotated[int | None, Option("--jobs", "-j", help=_JOBS)]
 _FAIL_ON = "End with status 3 on this verdict; repeat."
 Verdict = StrEnum("Verdict", {"leak": "leak", "no_leak": "no leak", "cannot_tell": "cannot tell"})
-FailOnOption = Annotated[list[Verdict] | None, Option("--fail-on", help=_FAIL_ON)]
+FailOnOption = Annotated[list[Verdict] | None, Option("--fail-on", metavar="VERDICT", help=_FAIL_ON)]
 _SHEET = "Folder with the thesis's data sheet (appendix_c_pa.csv, appendix_c_pb.csv); else $SEALSCOPE_SHEET or ./data."
 SheetOption = Annotated[Path | None, Option("--sheet", help=_SHEET)]
 

@@ -33,7 +33,10 @@ FailOn = StrEnum("FailOn", [(word.replace(" ", "_"), word) for word in (*opt.Ver
 _FEWEST_SIDE_BY_SIDE = 4
 #: Fewest files, and time between two of them [s], from which on they may be a machine's over time.
 _FEWEST_IN_TIME, _APART_IN_TIME = 3, 3600.0
-_FAIL_ON = "End with status 3 where a file has this verdict, or a leak of this level against --limit or worse; repeat."
+_FAIL_ON = (
+    "End with status 3 where a file has this verdict, or a leak of this level (monitor, plan, repair) against --limit "
+    "or worse; repeat."
+)
 _EVERY = (
     "Cut a long log into parts of this length (1h): TARGET is a new folder for them, of NetCDF files. A text log of "
     "any size is read in bounded memory; `sealscope trend` takes the parts."
@@ -50,7 +53,7 @@ def diagnose(
     false_alarm: opt.FalseAlarmOption = 0.01,
     quick: Annotated[bool, Option("--quick", help="Stop at the first method with a verdict.")] = False,
     quiet: Annotated[bool, Option("--quiet", "-q", help="Print the first line of each verdict only.")] = False,
-    fail_on: Annotated[list[FailOn] | None, Option("--fail-on", help=_FAIL_ON)] = None,
+    fail_on: Annotated[list[FailOn] | None, Option("--fail-on", metavar="VERDICT|LEVEL", help=_FAIL_ON)] = None,
 ) -> None:
     """Say for each file whether oil bypasses the piston; with -v by every method.
 
