@@ -11,92 +11,63 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sealscope import datasets
+    from sealscope import datasets as datasets
     from sealscope.diagnosis.commissioned.estimator import LeakDetector as LeakDetector
-    from sealscope.diagnosis.commissioned.machine import CommissionedMachine, commission
-    from sealscope.diagnosis.commissioned.machine_file import load_machine, write_machine
-    from sealscope.diagnosis.diagnose import diagnose
-    from sealscope.diagnosis.inference.live.stream import SequentialBalance
-    from sealscope.diagnosis.trend.trend import Trend, trend
-    from sealscope.diagnosis.verdict.diagnosis import Diagnosis
-    from sealscope.fmu.build import write_fmu, write_sensor_fmu
-    from sealscope.fmu.recording import record_fmu
-    from sealscope.monitor.stream.watch import Watch, watch
-    from sealscope.parameters import Rig, load_rig
-    from sealscope.recordings import Recording, inspect, read, read_parts, write
-    from sealscope.reporting import write_page
-    from sealscope.signals.streams import DetailStream
-    from sealscope.signals.windows import RmsStream
-    from sealscope.simulation.batch.batch import simulate_batch
-    from sealscope.simulation.experiment import Experiment
-    from sealscope.simulation.simulate import prove, simulate, simulate_with_truth
+    from sealscope.diagnosis.commissioned.machine import CommissionedMachine as CommissionedMachine
+    from sealscope.diagnosis.commissioned.machine import commission as commission
+    from sealscope.diagnosis.commissioned.machine_file import load_machine as load_machine
+    from sealscope.diagnosis.commissioned.machine_file import write_machine as write_machine
+    from sealscope.diagnosis.diagnose import diagnose as diagnose
+    from sealscope.diagnosis.inference.live.stream import SequentialBalance as SequentialBalance
+    from sealscope.diagnosis.trend.trend import Trend as Trend
+    from sealscope.diagnosis.trend.trend import trend as trend
+    from sealscope.diagnosis.verdict.diagnosis import Diagnosis as Diagnosis
+    from sealscope.fmu.build import write_fmu as write_fmu
+    from sealscope.fmu.build import write_sensor_fmu as write_sensor_fmu
+    from sealscope.fmu.recording import record_fmu as record_fmu
+    from sealscope.monitor.stream.watch import Watch as Watch
+    from sealscope.monitor.stream.watch import watch as watch
+    from sealscope.parameters import Rig as Rig
+    from sealscope.parameters import load_rig as load_rig
+    from sealscope.recordings import Recording as Recording
+    from sealscope.recordings import inspect as inspect
+    from sealscope.recordings import read as read
+    from sealscope.recordings import read_parts as read_parts
+    from sealscope.recordings import write as write
+    from sealscope.reporting import write_page as write_page
+    from sealscope.signals.streams import DetailStream as DetailStream
+    from sealscope.signals.windows import RmsStream as RmsStream
+    from sealscope.simulation.batch.batch import simulate_batch as simulate_batch
+    from sealscope.simulation.experiment import Experiment as Experiment
+    from sealscope.simulation.simulate import prove as prove
+    from sealscope.simulation.simulate import simulate as simulate
+    from sealscope.simulation.simulate import simulate_with_truth as simulate_with_truth
 
-_HOMES = {
-    "DetailStream": "signals.streams",
-    "Diagnosis": "diagnosis.verdict.diagnosis",
-    "Experiment": "simulation.experiment",
-    "Recording": "recordings.recording",
-    "Rig": "parameters",
-    "CommissionedMachine": "diagnosis.commissioned.machine",
-    "LeakDetector": "diagnosis.commissioned.estimator",  # in no `import *`: it needs the extra `learn`
-    "RmsStream": "signals.windows",
-    "SequentialBalance": "diagnosis.inference.live.stream",
-    "Trend": "diagnosis.trend.trend",
-    "Watch": "monitor.stream.watch",
-    "commission": "diagnosis.commissioned.machine",
-    "diagnose": "diagnosis.diagnose",
-    "inspect": "recordings",
-    "load_machine": "diagnosis.commissioned.machine_file",
-    "load_rig": "parameters",
-    "prove": "simulation.simulate",
-    "read": "recordings",
-    "read_parts": "recordings",
-    "record_fmu": "fmu.recording",
-    "simulate": "simulation.simulate",
-    "simulate_batch": "simulation.batch.batch",
-    "simulate_with_truth": "simulation.simulate",
-    "trend": "diagnosis.trend.trend",
-    "watch": "monitor.stream.watch",
-    "write": "recordings",
-    "write_fmu": "fmu.build",
-    "write_sensor_fmu": "fmu.build",
-    "write_machine": "diagnosis.commissioned.machine_file",
-    "write_page": "reporting",
+#: Module -> names that it is the home of.
+_NAMES = {
+    "diagnosis.commissioned.estimator": "LeakDetector",
+    "diagnosis.commissioned.machine": "CommissionedMachine commission",
+    "diagnosis.commissioned.machine_file": "load_machine write_machine",
+    "diagnosis.diagnose": "diagnose",
+    "diagnosis.inference.live.stream": "SequentialBalance",
+    "diagnosis.trend.trend": "Trend trend",
+    "diagnosis.verdict.diagnosis": "Diagnosis",
+    "fmu.build": "write_fmu write_sensor_fmu",
+    "fmu.recording": "record_fmu",
+    "monitor.stream.watch": "Watch watch",
+    "parameters": "Rig load_rig",
+    "recordings": "inspect read read_parts write",
+    "recordings.recording": "Recording",
+    "reporting": "write_page",
+    "signals.streams": "DetailStream",
+    "signals.windows": "RmsStream",
+    "simulation.batch.batch": "simulate_batch",
+    "simulation.experiment": "Experiment",
+    "simulation.simulate": "prove simulate simulate_with_truth",
 }
-
-__all__ = [
-    "CommissionedMachine",
-    "DetailStream",
-    "Diagnosis",
-    "Experiment",
-    "Recording",
-    "Rig",
-    "RmsStream",
-    "SequentialBalance",
-    "Trend",
-    "Watch",
-    "__version__",
-    "commission",
-    "datasets",
-    "diagnose",
-    "inspect",
-    "load_machine",
-    "load_rig",
-    "prove",
-    "read",
-    "read_parts",
-    "record_fmu",
-    "simulate",
-    "simulate_batch",
-    "simulate_with_truth",
-    "trend",
-    "watch",
-    "write",
-    "write_fmu",
-    "write_machine",
-    "write_page",
-    "write_sensor_fmu",
-]
+_HOMES = {name: home for home, names in _NAMES.items() for name in names.split()}
+# LeakDetector needs the extra `learn`, so it is in no `import *`
+__all__ = list(sorted({*_HOMES, "__version__", "datasets"} - {"LeakDetector"}))
 
 
 def _load(name: str) -> Any:
@@ -118,4 +89,4 @@ else:
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return __all__

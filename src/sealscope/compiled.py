@@ -354,6 +354,27 @@ def pointer_at(context: Any, pointer: Any, offset: Any) -> Any:
     return pointer(pointer, numba.int64), generate
 
 
+def record_at(layout: Any) -> Callable[[Any], Any]:
+    """Return the law that reads a block of numbers, at the pointer to its first, as a record, in code for `plain_code`.
+
+    `layout`: NumPy's type of a record of doubles and arrays of them; what is assigned to its parts is in the block.
+    """
+    kind = numba.types.CPointer(numba.from_dtype(layout))
+
+    @intrinsic  # type: ignore[misc]
+    def cast(context: Any, pointer: Any) -> Any:
+        def generate(target: Any, builder: Any, signature: Any, values: Any) -> Any:
+            return builder.bitcast(values[0], target.get_value_type(kind))
+
+        return kind(pointer), generate
+
+    @law
+    def record(pointer: Any) -> Any:
+        return numba.carray(cast(pointer), 1)[0]
+
+    return record  # type: ignore[no-any-return]
+
+
 def plain_code(function: Callable[..., Any], *arguments: str) -> tuple[str, str]:
     """Return a function's LLVM code, free of Python, and its symbol there.
 

@@ -307,8 +307,8 @@ def _nothing(dataset: Dataset, folder: Path, *names: str) -> InputError:
     )
 
 
-def _from(dataset: Dataset, provenance: Mapping[str, Any]) -> dict[str, Any]:
-    return {**provenance, "dataset": dataset.name, "licence": dataset.licence}
+def _origin(dataset: Dataset) -> dict[str, str]:
+    return {"dataset": dataset.name, "licence": dataset.licence}
 
 
 def _strokes(
@@ -324,7 +324,7 @@ def _strokes(
     def strokes() -> Iterator[LabelledRecording]:
         for name in names:
             recording = read_file(files[name], map=channels, rate=dataset.rate)
-            recording = replace(recording, provenance=_from(dataset, recording.provenance))
+            recording = replace(recording, provenance={**recording.provenance, **_origin(dataset)})
             yield LabelledRecording(recording, MappingProxyType(dict(dataset.labels.get(name, {}))))
 
     return strokes()
@@ -371,7 +371,7 @@ def _cycles(
                 {channel: values[row] for channel, values in pascals.items()},
                 dict.fromkeys(pascals, "Pa"),
                 rate,
-                provenance=_from(dataset, {"file": f"{dataset.name} cycle {row + 1}"}),
+                provenance={"file": f"{dataset.name} cycle {row + 1}", **_origin(dataset)},
                 history=(f"channels {', '.join(f'{channel} = {sensor}' for channel, sensor in channels.items())}",),
             )
             yield LabelledRecording(recording, MappingProxyType(dict(zip(_GRADES, map(float, marks), strict=True))))

@@ -10,9 +10,12 @@ from __future__ import annotations
 
 import math
 import re
+import tomllib
+from collections.abc import Mapping
 from fractions import Fraction
 from functools import cache, lru_cache
 from numbers import Real
+from pathlib import Path
 from typing import Any, NamedTuple, overload
 
 import numpy as np
@@ -31,122 +34,46 @@ _Conversion = tuple[Fraction, float, Fraction, Fraction]
 class Unit(NamedTuple):
     """SI value = (value + offset) * factor * pi**pi_power, in the product of `powers` of base units."""
 
-    factor: Fraction
-    pi_power: Fraction
-    powers: _Powers
+    factor: Fraction = Fraction(1)
+    pi_power: Fraction = Fraction(0)
+    powers: _Powers = ()
     offset: Fraction = Fraction(0)
 
+    def times(self, other: Unit, power: Fraction) -> Unit:
+        """Return the product with a power of another unit, without an offset; ValueError beyond a double's range."""
+        bits = max(other.factor.numerator, other.factor.denominator).bit_length()
+        if abs(power) * bits > _MOST_BITS:
+            raise ValueError
+        factor, pi_power = self.factor * Fraction(other.factor**power), self.pi_power + other.pi_power * power
+        if max(factor.numerator, factor.denominator).bit_length() > _MOST_BITS or abs(pi_power) > _MOST_PI:
+            raise ValueError
+        powers = dict(self.powers)
+        for base, exponent in other.powers:
+            powers[base] = powers.get(base, Fraction(0)) + exponent * power
+        return Unit(factor, pi_power, tuple(sorted((base, own) for base, own in powers.items() if own)))
 
-def _unit(factor: Fraction | str | int, *, pi: int = 0, offset: Fraction | str | int = 0, **powers: int) -> Unit:
-    ordered = tuple(sorted((base, Fraction(power)) for base, power in powers.items()))
-    return Unit(Fraction(factor), Fraction(pi), ordered, Fraction(offset))
+
+def _unit(row: Mapping[str, Any]) -> Unit:
+    powers = {base: Fraction(power) for base, power in row.items() if base not in ("factor", "pi", "offset")}
+    factor, pi_power, offset = (Fraction(row.get(name, usual)) for name, usual in _USUAL.items())
+    return Unit(factor, pi_power, tuple(sorted(powers.items())), offset)
 
 
-_PREFIXES = {"n": -9, "u": -6, "m": -3, "c": -2, "": 0, "k": 3, "M": 6, "G": 9}
-_PREFIXED = {
-    "Pa": _unit(1, kg=1, m=-1, s=-2),
-    "m": _unit(1, m=1),
-    "s": _unit(1, s=1),
-    "V": _unit(1, kg=1, m=2, s=-3, A=-1),
-    "A": _unit(1, A=1),
-    "N": _unit(1, kg=1, m=1, s=-2),
-    "g": _unit("1/1000", kg=1),
-    "L": _unit("1/1000", m=3),
-    "l": _unit("1/1000", m=3),
-    "W": _unit(1, kg=1, m=2, s=-3),
-    "J": _unit(1, kg=1, m=2, s=-2),
-    "H": _unit(1, kg=1, m=2, s=-2, A=-2),
-    "ohm": _unit(1, kg=1, m=2, s=-3, A=-2),
-    "Hz": _unit(1, s=-1),
-    "rad": _unit(1, rad=1),
-    "bar": _unit(10**5, kg=1, m=-1, s=-2),
-}
-_PSI = Fraction("0.45359237") * Fraction("9.80665") / Fraction("0.0254") ** 2
-_ATOMS: dict[str, Unit] = {
-    prefix + name: unit._replace(factor=unit.factor * Fraction(10) ** power)
-    for name, unit in _PREFIXED.items()
-    for prefix, power in _PREFIXES.items()
-} | {
-    "1": _unit(1),
-    "%": _unit("1/100"),
-    "psi": _unit(_PSI, kg=1, m=-1, s=-2),
-    "psia": _unit(_PSI, offset=-101325 / _PSI, kg=1, m=-1, s=-2),
-    "bara": _unit(10**5, offset="-1.01325", kg=1, m=-1, s=-2),
-    "kgf": _unit("9.80665", kg=1, m=1, s=-2),
-    "in": _unit("0.0254", m=1),
-    "mil": _unit("0.0000254", m=1),
-    "lpm": _unit("1/60000", m=3, s=-1),
-    "min": _unit(60, s=1),
-    "h": _unit(3600, s=1),
-    "rev": _unit(2, pi=1, rad=1),
-    "rpm": _unit("1/30", pi=1, rad=1, s=-1),
-    "deg": _unit("1/180", pi=1, rad=1),
-    "count": _unit(1, count=1),
-    "K": _unit(1, K=1),
-    "degC": _unit(1, K=1, offset="273.15"),
-    "degF": _unit("5/9", K=1, offset="459.67"),
-}
-# pressures inside are gauge pressures; absolute ones lose one standard atmosphere
-_SPELLINGS = {
-    spelling: name
-    for name, spellings in {
-        "psi": "PSI Psi",
-        "bar": "BAR Bar бар",
-        "Pa": "pa PA",
-        "kPa": "kpa Kpa KPA KPa кПа",
-        "MPa": "mpa Mpa MPA МПа",
-        "mbar": "MBAR Mbar",
-        "kgf": "kp",
-        "kgf/cm^2": "kg/cm2 kg/cm^2 kg/cm\u00b2",
-        "lbf/in^2": "lb/in2 lb/in^2 lb/in\u00b2 lbs/in2",
-        "rpm": "RPM Rpm U/min r/min Upm UPM upm tr/min giri/min r.p.m.",
-        "lpm": "LPM",
-        "V": "Volt volt Volts volts",
-        "s": "sec Sec second seconds Seconds sek Sek Sekunden secondes secondi segundos с сек",
-        "ms": "msec Millisekunden",
-        "mm": "MM мм millimetre millimeter Millimeter millimeters",
-        "cm": "CM Zentimeter",
-        "in": 'inch inches Inch Inches IN Zoll in. " \u2033',
-        "mil": "mils thou",
-        "min": "minute minutes",
-        "h": "hr hour hours",
-        "count": "counts Count Counts cts",
-        "ohm": "Ohm",
-        "rev": "revolution revs revolutions turn turns Umdr Umdr. Umdrehungen tr tours giri",
-        "rad": "radian radians",
-        "deg": "degree degrees Degree Degrees DEG Deg deg. Grad \u00b0",
-        "degC": "°C C",
-        "degF": "°F",
-        "m": "metre meter",
-        "g": "gram",
-        "kg": "kilogram",
-        "K": "kelvin",
-        "A": "ampere",
-        "1": "-",
-        "%": "percent",
-    }.items()
-    for spelling in spellings.split()
-} | {"": "1"}
-_SIGNS = str.maketrans(
-    dict.fromkeys("\u00b7\u22c5\u00d7*", " ")
-    | {
-        "\u00b2": "^2",
-        "\u00b3": "^3",
-        "\u207b": "^-",
-        "\u00b9": "1",
-        "\u00b5": "u",
-        "\u03bc": "u",
-        "\u03a9": "ohm",
-        "\u2126": "ohm",
-        "\u2212": "-",
-    }
-)
-_KINDS = {
-    "Pa": "pressure", "m": "length", "m^2": "area", "m^3": "volume", "m^3/s": "volume flow", "rad/s": "angular speed",
-    "rad": "angle", "s": "time", "V": "voltage", "A": "current", "N": "force", "kg": "mass", "Hz": "frequency",
-    "ohm": "resistance", "H": "inductance", "kg m^2": "inertia", "kg/m^3": "density", "K": "temperature",
-    "m/s": "speed", "m^3/rev": "volume per turn",
-}  # fmt: skip
+def _absolute(unit: Unit) -> Unit:
+    """Return the unit of an absolute pressure: inside are gauge pressures, a standard atmosphere less."""
+    return unit._replace(offset=-_TABLES["absolute"]["atmosphere"] / unit.factor)
+
+
+_USUAL = {"factor": 1, "pi": 0, "offset": 0}
+_TABLES: dict[str, Any] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+_ATOMS = {
+    prefix + name: _unit({**row, "factor": Fraction(row.get("factor", 1)) * Fraction(10) ** power})
+    for name, row in _TABLES["prefixed"].items()
+    for prefix, power in _TABLES["prefixes"].items()
+} | {name: _unit(row) for name, row in _TABLES["plain"].items()}
+_ATOMS |= {name: _absolute(_ATOMS[of]) for name, of in _TABLES["absolute"].items() if name != "atmosphere"}
+_SPELLINGS = {own: name for name, spellings in _TABLES["spellings"].items() for own in spellings.split()} | {"": "1"}
+_SIGNS, _KINDS = str.maketrans(_TABLES["signs"]), _TABLES["kinds"]
 _TOKEN = re.compile(
     r"\s*(?:(?P<op>[/()])|\^(?P<power>[+-]?\d(?:\.5)?)(?![\d.])|(?P<name>[^\W\d]\w*?|%|°[CF]?|1)(?P<digit>[23]?)(?=$|[\s/()^]))"
 )
@@ -158,7 +85,6 @@ _NUMBER = re.compile(
 _MARKED = re.compile(
     r"(?P<unit>.{1,40}?)[\s_]*\(?(?:(?P<absolute>a|A|abs\.?|absolute?)|g|G|gauge|gage|rel\.?|relative?|\u00fc|\u00dc)\)?"
 )
-_STANDARD_ATMOSPHERE = 101325
 _LONGEST_TEXT = 200
 #: A unit's factor is a double: its fraction has at most so many bits, and pi at most this power.
 _MOST_BITS, _MOST_PI = 900, 100
@@ -183,78 +109,57 @@ def _atom(name: str) -> Unit:
         raise InputError(f"got {name}, which is no known unit") from error
     if not offset_free:
         raise InputError(f"got {name}, which is not proportional to an SI unit")
-    powers: dict[str, Fraction] = {}
-    result = Fraction(repr(float(factor)))
-    for long_name, power in base._units.items():
-        unit = _ATOMS.get(_SPELLINGS.get(long_name, long_name))
-        exact = Fraction(power).limit_denominator(12)
-        if unit is None:
-            powers[long_name] = powers.get(long_name, Fraction(0)) + exact
-            continue
-        result *= unit.factor ** int(exact) if exact.denominator == 1 else Fraction(float(unit.factor) ** float(exact))
-        for symbol, exponent in unit.powers:
-            powers[symbol] = powers.get(symbol, Fraction(0)) + exponent * exact
-    return Unit(result, Fraction(0), tuple(sorted(powers.items())))
+    result = Unit(Fraction(repr(float(factor))))
+    for base_name, power in base._units.items():
+        unit = _ATOMS.get(_SPELLINGS.get(base_name, base_name), Unit(powers=((base_name, Fraction(1)),)))
+        result = result.times(unit, Fraction(power).limit_denominator(12))
+    return result
 
 
-class _Parser:
-    """Product of powers with `/`, blanks and brackets: ``m^3/(s Pa)``, ``N m/A``, ``cm3/rev``, ``rad/s/V``."""
-
-    def __init__(self, text: str) -> None:
-        self.tokens: list[tuple[str, str]] = []
-        at = 0
-        self.text = text = text.strip()
-        while at < len(text):
-            match = _TOKEN.match(text, at)
-            if match is None:
-                raise InputError(f"got {self.text[:60]}, which is no product of units")
-            at = match.end()
-            if match["op"]:
-                self.tokens.append((match["op"], ""))
-            elif match["power"]:
-                self.tokens.append(("^", match["power"]))
-            elif match["name"] + match["digit"] in _SPELLINGS or not match["digit"]:
-                self.tokens.append(("name", match["name"] + match["digit"]))
-            else:
-                self.tokens += [("name", match["name"]), ("^", match["digit"])]
-
-    def product(self, depth: int = 0) -> Unit:
-        factor, pi_power, powers = Fraction(1), Fraction(0), dict[str, Fraction]()
-        sign, count = 1, 0
-        alone: Unit | None = None
-        while self.tokens and self.tokens[0][0] != ")":
-            kind, value = self.tokens.pop(0)
-            if kind == "/":
-                if sign < 0 or not count:
-                    break
-                sign = -1
-                continue
-            if kind == "(":
-                unit = self.product(depth + 1)
-                if not self.tokens or self.tokens.pop(0)[0] != ")":
-                    break
-            elif kind == "name":
-                unit = _atom(value)
-            else:
-                break
-            power = Fraction(sign)
-            if self.tokens and self.tokens[0][0] == "^":
-                power = sign * Fraction(self.tokens.pop(0)[1])
-            if abs(power) * max(unit.factor.numerator, unit.factor.denominator).bit_length() > _MOST_BITS:
-                break
-            factor *= Fraction(unit.factor**power)
-            pi_power += unit.pi_power * power
-            if max(factor.numerator, factor.denominator).bit_length() > _MOST_BITS or abs(pi_power) > _MOST_PI:
-                break
-            for base, exponent in unit.powers:
-                powers[base] = powers.get(base, Fraction(0)) + exponent * power
-            alone = unit if count == 0 and power == 1 else None
-            sign, count = 1, count + 1
+def _tokens(text: str) -> list[str]:
+    """Return names, powers (^2), brackets and strokes of a product of units; ValueError for anything else."""
+    tokens, at = [], 0
+    while at < len(text):
+        match = _TOKEN.match(text, at)
+        if match is None:
+            raise ValueError
+        at = match.end()
+        name, digit = match["name"] or "", match["digit"] or ""
+        if not digit or name + digit in _SPELLINGS:
+            tokens.append(match["op"] or (f"^{match['power']}" if match["power"] else name + digit))
         else:
-            if count and sign > 0 and (not self.tokens or depth):
-                offset = alone.offset if alone is not None else Fraction(0)
-                return Unit(factor, pi_power, tuple(sorted((b, p) for b, p in powers.items() if p)), offset)
-        raise InputError(f"got {self.text[:60]}, which is no product of units")
+            tokens += [name, f"^{digit}"]
+    return tokens
+
+
+def _product(tokens: list[str]) -> Unit:
+    """Take a product with `/`, blanks and brackets, as ``m^3/(s Pa)`` or ``rad/s/V``, off the tokens' beginning.
+
+    It ends before a closing bracket. ValueError where there is none.
+    """
+    result: Unit | None = None
+    divides = False
+    while tokens and tokens[0] != ")":
+        token = tokens.pop(0)
+        if token == "/" and result is not None and not divides:
+            divides = True
+            continue
+        if token == "(":
+            unit = _product(tokens)
+            if not tokens or tokens.pop(0) != ")":
+                raise ValueError
+        elif token[0] in "/^":
+            raise ValueError
+        else:
+            unit = _atom(token)
+        power = Fraction(tokens.pop(0)[1:]) if tokens and tokens[0][0] == "^" else Fraction(1)
+        # a unit alone keeps its offset, a product has none
+        alone = result is None and power == 1
+        result = unit if alone else (result or Unit()).times(unit, -power if divides else power)
+        divides = False
+    if result is None or divides:
+        raise ValueError
+    return result
 
 
 def _marked_pressure(text: str) -> Unit | None:
@@ -268,7 +173,7 @@ def _marked_pressure(text: str) -> Unit | None:
         return None
     if unit.powers != _ATOMS["Pa"].powers or unit.offset:
         return None
-    return unit._replace(offset=-_STANDARD_ATMOSPHERE / unit.factor) if marked["absolute"] else unit
+    return _absolute(unit) if marked["absolute"] else unit
 
 
 @lru_cache(maxsize=1024)
@@ -284,7 +189,16 @@ def parse_unit(text: str) -> Unit:
     if pressure is not None:
         return pressure
     plain = re.sub(r"(?<=[A-Za-z])-(?=[A-Za-z])", " ", text.replace("**", "^").translate(_SIGNS))
-    return _Parser(plain).product()
+    try:
+        tokens = _tokens(plain.strip())
+        unit = _product(tokens)
+        if not tokens:
+            return unit
+    except InputError:
+        raise
+    except ValueError:
+        pass
+    raise InputError(f"got {plain.strip()[:60]}, which is no product of units")
 
 
 def _expected(si_unit: str) -> str:

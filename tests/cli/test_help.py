@@ -30,11 +30,12 @@ def plain(text: str) -> str:
 
 
 @pytest.mark.parametrize(("path", "command"), COMMANDS, ids=[" ".join(path) for path, _ in COMMANDS])
-def test_every_option_s_text_is_shown_whole(path, command, call, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "200")
-    monkeypatch.setenv("TERMINAL_WIDTH", "200")
+def test_every_option_s_text_is_shown_whole_in_80_columns(path, command, call, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("TERMINAL_WIDTH", "80")
     done = call(*path, "--help")
     assert done.status == 0
+    assert max(map(len, done.out.splitlines())) <= 80
     shown = plain(done.out)
     for parameter in command.params:
         if text := getattr(parameter, "help", None):

@@ -77,4 +77,5 @@ def test_margins_of_a_loop_are_printed(call):
     rows = [line.split() for line in done.out.splitlines()[2:] if "damped" not in line]
     assert [float(row[0]) for row in rows] == [0.0, 0.01, 0.02, 0.05]
     assert all(float(row[1]) > 6.0 and float(row[2]) > 45.0 for row in rows)
+    assert max(map(len, done.out.splitlines())) <= 80
     assert "controller must be one of pi" in call("rigs", "margins", "--controller", "pid").refused()

@@ -70,7 +70,7 @@ def test_an_interrupt_within_a_finalizer_is_not_lost(untouched, surroundings):
         "class Finalized:\n"
         "    def __del__(self):\n"
         "        print('finalizing', flush=True)\n"
-        "        time.sleep(2)\n"
+        "        time.sleep(1)\n"
         "def integrate(*arguments, **options):\n"
         "    Finalized()\n"
         "    time.sleep(50)\n"
@@ -94,8 +94,11 @@ def test_an_interrupt_within_a_finalizer_is_not_lost(untouched, surroundings):
 SEALSCOPE = '"$PYTHON" -m sealscope'
 
 
-@pytest.mark.parametrize("words", ["parameters", "parameters --format csv", "parameters --format json", "--version"])
-@pytest.mark.parametrize("reader", ["head -1", "true"])
+@pytest.mark.parametrize(
+    ("words", "reader"),
+    [("parameters", "true"), ("parameters --format csv", "head -1"), ("parameters --format json", "true"),
+     ("--version", "true")],
+)  # fmt: skip
 def test_a_reader_that_goes_away_is_no_error(shell, words, reader):
     done = shell("bash", "-c", f"{SEALSCOPE} {words} | {reader}")
     assert (done.status, done.err) == (0, "")
@@ -103,7 +106,7 @@ def test_a_reader_that_goes_away_is_no_error(shell, words, reader):
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="this system has no /dev/full")  # noqa: PTH110
-@pytest.mark.parametrize("words", ["parameters", "parameters --format csv", "parameters --format json", "--version"])
+@pytest.mark.parametrize("words", ["parameters --format csv", "--version"])
 def test_a_full_disk_behind_the_output_is_one_line(shell, words):
     done = shell("bash", "-c", f"{SEALSCOPE} {words} > /dev/full")
     assert "No space left on device" in done.refused(1)

@@ -8,14 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from .test_help import COMMANDS
-
 #: Calls in a folder with leak.nc, healthy_1.nc to healthy_3.nc and those as days/press_2024-05-0N.nc.
 CALLS = [
-    "rigs", "rigs margins", "datasets", "parameters", "reproduce --list",
-    "diagnose leak.nc healthy_1.nc", "-v diagnose leak.nc healthy_1.nc", "diagnose leak.nc -v --rig thesis",
+    "rigs", "datasets", "parameters", "reproduce --list",
+    "diagnose healthy_1.nc --rig thesis", "-v diagnose leak.nc healthy_1.nc",
     "inspect leak.nc", "trend days", "-v trend days --rig thesis", "convert leak.nc leak.csv",
-    "commission days -o press.toml --rig thesis", "report leak.nc healthy_1.nc -o pages",
+    "commission days -o press.toml --rig thesis", "report healthy_1.nc healthy_2.nc -o pages",
     "rigs new press --area-A 500 --area-B 400 --stroke 300 --displacement 6", "plugin new stroke",
     "simulate -o run.nc --duration 20 --leak 0.01[L/min] --fault", "campaign status bench-thesis",
 ]  # fmt: skip
@@ -57,10 +55,3 @@ def test_a_folder_beside_its_machine_fits_a_terminal(folder: Path, call) -> None
     done = call("diagnose", "days", "--machine", "m.toml")
     assert done.status == 0 and "leak " in done.out
     assert len(widest(done.out)) <= 80, widest(done.out)
-
-
-@pytest.mark.parametrize("path", [path for path, _ in COMMANDS], ids=" ".join)
-def test_help_fits_a_terminal(path: tuple[str, ...], call, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("COLUMNS", "TERMINAL_WIDTH"):
-        monkeypatch.setenv(name, "80")
-    assert len(widest(call(*path, "--help").out)) <= 80

@@ -9,8 +9,8 @@ import pytest
 
 from sealscope.errors import InputError
 from sealscope.fmu import build
-from sealscope.fmu.description import base_units, description_2, description_3
-from sealscope.fmu.variables import VALUE_BASE, VALUES, variables
+from sealscope.fmu.description import base_units, description
+from sealscope.fmu.variables import REFERENCES, VALUES, variables
 from sealscope.parameters import load_rig
 
 
@@ -34,18 +34,17 @@ def test_every_parameter_that_a_law_takes_is_tunable_unless_it_is_absent(name):
     listed = {v.name: v for v in variables(rig, 1e-3)}
     for symbol, value in zip(VALUES, range(len(VALUES)), strict=True):
         if symbol in listed:
-            assert listed[symbol].reference == VALUE_BASE + value
+            assert listed[symbol].reference == REFERENCES["value"] + value
             assert listed[symbol].start == rig[symbol]
             assert listed[symbol].unit
     assert {"pump.q_b", "cylinder.A_A", "friction.F_v", "line.C_d", "fluid.rho"} <= set(listed)
     assert ("makeup.G_relief" in listed) == (rig["makeup.G_relief"] > 0)  # a law that the rig does without
 
 
-@pytest.mark.parametrize("describe", [description_2, description_3])
-def test_references_and_names_are_unique_and_outputs_are_listed(describe):
+@pytest.mark.parametrize(("version", "tag"), [(2, "ScalarVariable"), (3, "Float64")])
+def test_references_and_names_are_unique_and_outputs_are_listed(version, tag):
     listed = tuple(variables(load_rig("thesis"), 1e-3))
-    root = ElementTree.fromstring(describe("eha", "token", "words", listed))
-    tag = {description_2: "ScalarVariable", description_3: "Float64"}[describe]
+    root = ElementTree.fromstring(description(version, "eha", "token", "words", listed))
     held = list(root.iter(tag))
     assert len({v.get("name") for v in held}) == len(held)
     assert len({v.get("valueReference") for v in held}) == len(held)

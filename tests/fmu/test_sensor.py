@@ -9,7 +9,8 @@ from scipy.stats import t as student
 import sealscope as ss
 from sealscope.diagnosis.inference.live.balance import LiveBalance, NotJudged, size_error
 from sealscope.errors import InputError
-from sealscope.fmu.sensor import COLUMNS, INPUTS, RESULTS, WALK, WINDOW, SensorChoice, size
+from sealscope.fmu.sensor import COLUMNS, INPUTS, WALK, WINDOW, SensorChoice, memory_of
+from sealscope.fmu.variables import SENSOR_RESULTS as RESULTS
 
 LEAK, ONSET, SECONDS = 0.0042, 80.0, 162.0
 RIG = ss.load_rig("thesis")
@@ -106,7 +107,7 @@ def test_the_code_has_the_terms_of_the_balance_and_a_bounded_memory(rig, rate):
     """Memory grows with the samples of 50 ms around the present one, and not with those of a block."""
     choice = SensorChoice.of(ss.load_rig(rig), rate)
     assert sorted((*choice.fast, *choice.own)) == list(range(len(COLUMNS)))
-    assert size(choice) < 12000 + 4 * 0.06 * rate
+    assert memory_of(choice).itemsize // 8 < 12000 + 4 * 0.06 * rate
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from sealscope.reporting import Mark, render_page, write_index
 from sealscope.reporting.campaign.page import render_campaign_page
 from sealscope.reporting.printing import BROWSERS
 from sealscope.reporting.thesis.files import publish
-from sealscope.reporting.thesis.page import VERDICTS, render_thesis_page
+from sealscope.reporting.thesis.page import VERDICTS, write_thesis_page
 from sealscope.reporting.trend.page import render_trend_page
 from sealscope.thesis.engine.build import ItemStatus
 from sealscope.thesis.engine.items import Item
@@ -44,7 +44,7 @@ def pages(tmp_path_factory, recording, make_diagnosis, no_verdict, campaign_resu
         "cannot tell": render_page(recording.only(["p_A", "x"]), no_verdict),
         "trend": render_trend_page(trend),
         "campaign": render_campaign_page(campaign_result, ["table.csv", "rows.csv"]),
-        "thesis": render_thesis_page(folder, _thesis(folder)),
+        "thesis": write_thesis_page(folder, _thesis(folder)).read_text(encoding="utf-8"),
     }
     files = {name: folder / f"{name}.html" for name in (*texts, "index")}
     for name, text in texts.items():

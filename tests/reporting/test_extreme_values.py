@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 import sealscope as ss
-from sealscope.reporting.charts import Chart, ChartLine, still_chart, ticks
+from sealscope.reporting.charts import Chart, ChartLine, still_chart
 from sealscope.reporting.page import render_page
+from sealscope.reporting.picture import ticks
 
 T = np.arange(4500) / 500
 S = np.sin(4 * T)

@@ -16,7 +16,7 @@ import pytest
 from sealscope.diagnosis.verdict.evidence import LeakCourse
 from sealscope.errors import InputError, MissingExtra
 from sealscope.reporting import printing, render_page, write_page
-from sealscope.reporting.card import render_card
+from sealscope.reporting.page import render_card
 
 PAGE = "<!DOCTYPE html><title>t</title><h1>Leak</h1>"
 BROWSER = next(filter(None, map(shutil.which, printing.BROWSERS)), None)

@@ -164,15 +164,13 @@ def test_bad_calls_are_one_clear_line():
     with pytest.raises(InputError, match="out must be"):
         DetailStream().update(np.zeros(5), out=np.empty((5, 4)).T)
     state = DetailStream().state_dict()
-    with pytest.raises(
-        InputError, match="saved detail stream must have 'history', got channels, levels, wavelet, samples"
-    ):
+    with pytest.raises(InputError, match="saved state must have 'history'"):
         DetailStream.from_state({key: value for key, value in state.items() if key != "history"})
     with pytest.raises(InputError, match=r"history must have shape \(1, 4, 127, 1\), got \(1, 4, 126, 1\)"):
         DetailStream.from_state({**state, "history": state["history"][:, :, 1:]})
     with pytest.raises(InputError, match="samples must be a whole number >= 0, got 'many'"):
         DetailStream.from_state({**state, "samples": "many"})
-    with pytest.raises(InputError, match="must be a mapping, as state_dict returns it, got list"):
+    with pytest.raises(InputError, match=r"saved state must have .*, got list"):
         DetailStream.from_state([1, 2])
     with pytest.raises(InputError, match="rows and columns of a table"):
         DetailStream((2, 3, 4))

@@ -159,7 +159,7 @@ def test_bad_input_is_one_clear_line():
         stream.update(np.ones(3))
     with pytest.raises(InputError, match="single number"):
         stream.update(1.0)
-    with pytest.raises(InputError, match="saved RMS stream must have 'size'"):
+    with pytest.raises(InputError, match="saved state must have 'size'"):
         RmsStream.from_state({})
     with pytest.raises(InputError, match="same leading axes"):
         RmsStream.from_state({**stream.state_dict(), "sums": None})

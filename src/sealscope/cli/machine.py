@@ -9,31 +9,17 @@ from typing import Annotated
 
 import typer
 
-from sealscope.cli.options import (
-    AreaOption,
-    AssumeOption,
-    DisplacementOption,
-    LimitOption,
-    MapOption,
-    RateOption,
-    StatedMachine,
-    check_folder,
-    say,
-)
+from sealscope.cli.options import StatedMachine, check_folder, say, stating
 from sealscope.errors import InputError
 
 
+@stating("rig", "area", "displacement", "maps", "rate", "limit")
 def commission(
     files: Annotated[
         list[Path], typer.Argument(metavar="FILE...", help="Healthy recordings of the machine, or a folder of them.")
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="The machine's file to write (.toml).")],
-    rig: AssumeOption = None,
-    area: AreaOption = None,
-    displacement: DisplacementOption = None,
-    maps: MapOption = None,
-    rate: RateOption = None,
-    limit: LimitOption = None,
+    stated: StatedMachine,
     add: Annotated[
         bool,
         typer.Option(
@@ -59,10 +45,8 @@ def commission(
         raise InputError("--since must stand with --add, for a machine that is known")
     check_folder(output)
     if add:
-        stated = {"--rig": rig, "--area": area, "--displacement": displacement, "--map": maps, "--rate": rate}
-        for name, value in {**stated, "--limit": limit}.items():
-            if value:
-                raise InputError(f"{name} must not stand beside --add: the machine's file states it")
+        if stated != StatedMachine():
+            raise InputError("what states the machine must not stand beside --add: the machine's file states it")
         machine = load_machine(output)
         if since is not None:
             repair = JudgedAlarm("", "repaired", _date(since), _date(since))
@@ -74,9 +58,10 @@ def commission(
     else:
         if output.exists():
             raise InputError(f"a machine's file must be new, got {output}, which exists; --add adds recordings to it")
-        own = StatedMachine.of(None, maps, rate, rig, area, displacement, limit)
-        columns = own.channel_map or None
-        machine = commissioned(files, rig=own.rig, map=columns, rate=rate, limit=limit, name=output.stem)
+        machine = commissioned(
+            files, rig=stated.rig, map=stated.channel_map or None, rate=stated.rate, limit=stated.limit,
+            name=output.stem,
+        )  # fmt: skip
     write_machine(machine, output)
     say(f"{output}:\n{machine}")
 

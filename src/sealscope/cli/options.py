@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import logging
 import shutil
 import sys
@@ -9,7 +10,8 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
+from enum import StrEnum
+from functools import partial, wraps
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from textwrap import fill
@@ -25,12 +27,10 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
     from sealscope.recordings import Recording
     from sealscope.recordings.formats.columns import ChannelMap
-    from sealscope.simulation.simulate import Progress
 
 T = TypeVar("T")
-#: Exit status where a verdict is one of those that `--fail-on` names; verdicts; levels of severity, the worst last.
+#: Exit status where a verdict is one of those that `--fail-on` names.
 FAILED_ON = 3
-VERDICTS, LEVELS = ("leak", "no leak", "cannot tell"), ("monitor", "plan", "repair")
 #: Stands for standard input.
 STANDARD_INPUT = Path("-")
 _log = logging.getLogger(__name__)
@@ -102,37 +102,37 @@ FalseAlarmOption = Annotated[float, Option("--false-alarm", help="Probability of
 SeedOption = Annotated[int, Option("--seed", help="Seed of the instruments' noise.")]
 _JOBS = "Processes; by default one a core, two a core at most."
 JobsOption = Annotated[int | None, Option("--jobs", "-j", help=_JOBS)]
-FailOnOption = Annotated[
-    list[str] | None,
-    Option("--fail-on", help="End with status 3 on this verdict; repeat.", autocompletion=completing(lambda: VERDICTS)),
-]
+_FAIL_ON = "End with status 3 on this verdict; repeat."
+Verdict = StrEnum("Verdict", {"leak": "leak", "no_leak": "no leak", "cannot_tell": "cannot tell"})
+FailOnOption = Annotated[list[Verdict] | None, Option("--fail-on", metavar="VERDICT", help=_FAIL_ON)]
 _SHEET = "Folder with the thesis's data sheet (appendix_c_pa.csv, appendix_c_pb.csv); else $SEALSCOPE_SHEET or ./data."
 SheetOption = Annotated[Path | None, Option("--sheet", help=_SHEET)]
 
 
 @dataclass(frozen=True)
 class StatedMachine:
-    """What a call states of the machine: by its file (`known`), or how to read its files, its rig and repair limit."""
+    """What a call states of the machine: by its file (`known`), or how to read its files, rig, limit and baseline."""
 
     known: CommissionedMachine | None = None
     channel_map: ChannelMap = field(default_factory=dict)
     rate: float | None = None
     rig: Rig | None = None
     limit: str | None = None
+    baseline: tuple[Path, ...] = ()
 
     @classmethod
     def of(
         cls,
-        machine: Path | None,
-        maps: Sequence[str] | None,
-        rate: float | None,
-        rig: str | None = None,
-        area: Sequence[str] | None = None,
-        displacement: str | None = None,
-        limit: str | None = None,
-        baseline: Sequence[Path] | None = None,
+        machine: MachineOption = None,
+        maps: MapOption = None,
+        rate: RateOption = None,
+        rig: AssumeOption = None,
+        area: AreaOption = None,
+        displacement: DisplacementOption = None,
+        limit: LimitOption = None,
+        baseline: BaselineOption = None,
     ) -> StatedMachine:
-        """Return what the options state; InputError where it cannot be, or stands beside `--machine` and differs."""
+        """Return what the options state; InputError where it cannot be, or stands beside `--machine`."""
         from sealscope.diagnosis.verdict.severity import RepairLimit
         from sealscope.recordings.formats.columns import check_call
 
@@ -146,7 +146,8 @@ class StatedMachine:
                     raise InputError(f"{name} must not stand beside --machine, whose file states it")
             known = load_machine(machine)
             return cls(known, rig=known.rig, limit=known.limit)
-        stated = cls(None, channel_map_of(maps), rate, _assumed_rig(rig, area, displacement), limit)
+        own_rig = _assumed_rig(rig, area, displacement)
+        stated = cls(None, channel_map_of(maps), rate, own_rig, limit, tuple(baseline or ()))
         check_call(stated.channel_map, rate)
         check_call(stated._map_of_rig, rate)
         RepairLimit.of(limit)
@@ -219,6 +220,27 @@ class StatedMachine:
         return diagnose(recording, baseline, false_alarm_probability=false_alarm, **stated)
 
 
+def stating(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command the options of `StatedMachine.of`, or those of these names, in place of its parameter `stated`."""
+
+    def decorated(command: Callable[..., None]) -> Callable[..., None]:
+        own = inspect.signature(command, eval_str=True)
+        every = inspect.signature(StatedMachine.of, eval_str=True).parameters
+        options = [every[name] for name in names or every]
+
+        @wraps(command)
+        def call(**given: Any) -> None:
+            stated = StatedMachine.of(**{option.name: given.pop(option.name) for option in options})
+            command(stated=stated, **given)
+
+        kept = [parameter for parameter in own.parameters.values() if parameter.name != "stated"]
+        by_name = [parameter.replace(kind=parameter.KEYWORD_ONLY) for parameter in (*kept, *options)]
+        call.__signature__ = own.replace(parameters=by_name)  # type: ignore[attr-defined]
+        return call
+
+    return decorated
+
+
 def _assumed_rig(name: str | None, area: Sequence[str] | None, displacement: str | None) -> Rig | None:
     """Return the rig of `--rig` with what `--area` and `--displacement` state; None where none of them is given."""
     from sealscope.diagnosis.verdict.machine import unstated
@@ -259,12 +281,6 @@ def channel_map_of(options: Sequence[str] | None) -> ChannelMap:
             raise InputError(f"--map {channel} must be given once, got {columns[channel]} and {column}")
         columns[channel] = column
     return "auto" if set(columns) == {REST} else columns
-
-
-def check_fail_on(words: Sequence[str] | None, known: Sequence[str]) -> None:
-    """Raise InputError where `--fail-on` names no verdict, and no level where there are levels."""
-    if wrong := [word for word in words or () if word not in known]:
-        raise InputError(f"--fail-on must be {', '.join(known[:-1])} or {known[-1]}, got {wrong[0]!r}")
 
 
 def verbose(context: Context) -> bool:
@@ -333,64 +349,53 @@ def say_jobs(jobs: int | None) -> None:
 
 
 @contextmanager
-def progress() -> Iterator[Progress]:
-    """Return a progress line a task on standard error, gone when done; silent without a terminal."""
-    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+def progress(noun: str = "") -> Iterator[Callable[[str, float], None]]:
+    """Return what shows tasks and their shares on standard error, in lines that are gone when done.
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with _bar(*columns) as bar:
+    Without a terminal nothing is shown; of many things, `noun`, a line a minute for the log.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    if not console.is_terminal:  # a disabled bar may print an empty line
+        yield _each_minute() if noun else lambda *_: None
+        return
+    columns = (BarColumn(), TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=console, transient=True, speed_estimate_period=120) as bar:
         tasks: dict[str, Any] = {}
 
         def update(task: str, share: float) -> None:
-            if bar is None:
-                return
-            if task not in tasks:
-                tasks[task] = bar.add_task(task, total=1.0)
-            bar.update(tasks[task], completed=share)
+            key = noun or task
+            if key not in tasks:
+                tasks[key] = bar.add_task(task, total=1.0)
+            bar.update(tasks[key], completed=share, description=task)
 
         yield update
+
+
+def _each_minute() -> Callable[[str, float], None]:
+    """Return what prints a line a minute: what is done, and the time left."""
+    began = said = time.monotonic()
+    first: float | None = None
+
+    def update(task: str, share: float) -> None:
+        nonlocal said, first
+        now, first = time.monotonic(), share if first is None else first
+        if now - said >= 60.0 and share > first:
+            said = now
+            echo(f"{task}, about {time_text((now - began) / (share - first) * (1.0 - share))} left", err=True)
+
+    return update
 
 
 @contextmanager
 def counted_progress(noun: str) -> Iterator[Callable[[int, int, str], None]]:
-    """Show on standard error how many of `noun` are done, the time left and a note.
-
-    Without a terminal a line a minute, for the log.
-    """
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-    columns = (TextColumn(noun), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"))
-    with _bar(*columns, TimeRemainingColumn(), TextColumn("{task.description}")) as bar:
-        task = None if bar is None else bar.add_task("", total=None)
-        began = said = time.monotonic()
-        first: int | None = None
-
-        def update(done: int, total: int, note: str) -> None:
-            nonlocal said, first
-            if bar is not None:
-                bar.update(task, completed=done, total=total, description=note)
-                return
-            now, first = time.monotonic(), done if first is None else first
-            if now - said >= 60.0 and done > first:
-                said, left = now, (now - began) / (done - first) * (total - done)
-                note = f", {note}" if note else ""
-                echo(f"{done} of {total} {noun}{note}, about {time_text(left)} left", err=True)
-
-        yield update
-
-
-@contextmanager
-def _bar(*columns: Any) -> Iterator[Any]:
-    """Return a bar on standard error, None without a terminal: a disabled bar may print an empty line."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield None
-        return
-    with Progress(*columns, console=console, transient=True, speed_estimate_period=120) as bar:
-        yield bar
+    """Show on standard error how many of `noun` are done, the time left and a note."""
+    with progress(noun) as show:
+        yield lambda done, total, note: show(
+            f"{done} of {total} {noun}{', ' if note else ''}{note}", done / max(total, 1)
+        )
 
 
 def time_text(seconds: float) -> str:

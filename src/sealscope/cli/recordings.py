@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import redirect_stderr
 from dataclasses import replace
+from enum import StrEnum
 from functools import partial
 from io import StringIO
 from itertools import pairwise
@@ -25,57 +26,53 @@ if TYPE_CHECKING:
     Judged = tuple[Recording, Diagnosis]
     Dated = tuple[float | None, Diagnosis]
 
+#: Levels of a leak, the worst last; what `--fail-on` names.
+_LEVELS = ("monitor", "plan", "repair")
+FailOn = StrEnum("FailOn", [(word.replace(" ", "_"), word) for word in (*opt.Verdict, *_LEVELS)])  # type: ignore[misc]
 #: Fewer files are diagnosed one after the other: processes take a second or two to start.
 _FEWEST_SIDE_BY_SIDE = 4
 #: Fewest files, and time between two of them [s], from which on they may be a machine's over time.
 _FEWEST_IN_TIME, _APART_IN_TIME = 3, 3600.0
-_FAIL_ON = "End with status 3 where a file has this verdict, or a leak of this level against --limit or worse; repeat."
+_FAIL_ON = (
+    "End with status 3 where a file has this verdict, or a leak of this level (monitor, plan, repair) against --limit "
+    "or worse; repeat."
+)
 _EVERY = (
     "Cut a long log into parts of this length (1h): TARGET is a new folder for them, of NetCDF files. A text log of "
     "any size is read in bounded memory; `sealscope trend` takes the parts."
 )
 
 
+@opt.stating()
 def diagnose(
     context: Context,
     files: Annotated[list[Path], Argument(metavar="FILE...", help="Recordings of any format; `-`: standard input.")],
-    baseline: opt.BaselineOption = None,
+    stated: opt.StatedMachine,
     output: Annotated[Literal["text", "jsonl"], Option("--format", help="Text, or one JSON object a line.")] = "text",
-    maps: opt.MapOption = None,
-    rate: opt.RateOption = None,
     join: opt.JoinOption = False,
     false_alarm: opt.FalseAlarmOption = 0.01,
-    rig: opt.AssumeOption = None,
-    area: opt.AreaOption = None,
-    displacement: opt.DisplacementOption = None,
-    limit: opt.LimitOption = None,
-    machine: opt.MachineOption = None,
     quick: Annotated[bool, Option("--quick", help="Stop at the first method with a verdict.")] = False,
     quiet: Annotated[bool, Option("--quiet", "-q", help="Print the first line of each verdict only.")] = False,
-    fail_on: Annotated[
-        list[str] | None,
-        Option("--fail-on", help=_FAIL_ON, autocompletion=opt.completing(lambda: (*opt.VERDICTS, *opt.LEVELS))),
-    ] = None,
+    fail_on: Annotated[list[FailOn] | None, Option("--fail-on", metavar="VERDICT|LEVEL", help=_FAIL_ON)] = None,
 ) -> None:
     """Say for each file whether oil bypasses the piston; with -v by every method.
 
     With --machine also of folders, a line a recording. Exit status 1 where a file could not be read.
     """
     from sealscope.campaigns.execution.workers import cores, in_order
+    from sealscope.diagnosis.commissioned.machine import recordings_in
     from sealscope.diagnosis.diagnose import check_probability
 
     check_probability(false_alarm)
-    opt.check_fail_on(fail_on, (*opt.VERDICTS, *opt.LEVELS))
-    stated = opt.StatedMachine.of(machine, maps, rate, rig, area, displacement, limit, baseline)
     form = "jsonl" if output == "jsonl" else "line" if quiet else "whole" if opt.verbose(context) else "short"
-    if machine is not None and any(path.is_dir() for path in files):
-        files = _in_folders(files)
+    if stated.known is not None and any(path.is_dir() for path in files):
+        files = recordings_in(files)
         form = form if form == "jsonl" else "table"
-    work = partial(_dated, machine=stated, baseline=baseline or (), joined=join, false_alarm=false_alarm, quick=quick)
+    work = partial(_dated, machine=stated, joined=join, false_alarm=false_alarm, quick=quick)
     jobs = min(cores(), len(files))
-    piped = _check_standard_input([*files, *(baseline or ())])
+    piped = _check_standard_input([*files, *stated.baseline])
     # what a baseline costs is spent once, and standard input is this process's
-    if join or piped or baseline or machine or jobs == 1 or len(files) < _FEWEST_SIDE_BY_SIDE:
+    if join or piped or stated.baseline or stated.known or jobs == 1 or len(files) < _FEWEST_SIDE_BY_SIDE:
         results: Iterable[tuple[str, Iterable[Dated | None]]] = [("", work(files))]
     else:
         results = (
@@ -116,7 +113,7 @@ def _text(diagnosis: Diagnosis, form: str, start_s: float | None) -> str:
 def _fails(reason: str, diagnosis: Diagnosis) -> bool:
     """Return whether the verdict is the one of `--fail-on`, or a leak's level that one or worse."""
     level = None if diagnosis.severity is None else diagnosis.severity.level
-    return reason == diagnosis.verdict or (reason in opt.LEVELS and level in opt.LEVELS[opt.LEVELS.index(reason) :])
+    return reason == diagnosis.verdict or (reason in _LEVELS and level in _LEVELS[_LEVELS.index(reason) :])
 
 
 def _in_time(files: Sequence[Path], starts: Sequence[float | None]) -> bool:
@@ -136,21 +133,11 @@ def _check_standard_input(files: Iterable[Path]) -> bool:
     return count == 1
 
 
-def _in_folders(paths: Sequence[Path]) -> list[Path]:
-    from sealscope.diagnosis.commissioned.machine import recordings_in
-
-    return recordings_in(paths)
-
-
 def _diagnoses(
-    files: Sequence[Path],
-    machine: opt.StatedMachine,
-    baseline: Sequence[Path] = (),
-    joined: bool = False,
-    false_alarm: float = 0.01,
-    quick: bool = False,
+    files: Sequence[Path], machine: opt.StatedMachine, joined: bool, false_alarm: float, quick: bool = False
 ) -> Iterator[Judged | None]:
     """Yield recording and diagnosis of each file, None for one that cannot be read; no file is its own baseline."""
+    baseline = machine.baseline
     for file in files if baseline else ():
         if all(path.resolve() == file.resolve() for path in baseline):
             raise InputError(f"a baseline must be another recording than the file itself, got {file}")
@@ -188,22 +175,16 @@ def _aside(
     return complaints.getvalue(), dated
 
 
+@opt.stating()
 def report(
     files: Annotated[list[Path], Argument(metavar="FILE...", help="Recordings to report on.")],
     output: Annotated[
         Path,
         Option("--output", "-o", help="The page (.html, .pdf) or its card (.png), or a folder for several files."),
     ],
-    baseline: opt.BaselineOption = None,
-    maps: opt.MapOption = None,
-    rate: opt.RateOption = None,
+    stated: opt.StatedMachine,
     join: opt.JoinOption = False,
     false_alarm: opt.FalseAlarmOption = 0.01,
-    rig: opt.AssumeOption = None,
-    area: opt.AreaOption = None,
-    displacement: opt.DisplacementOption = None,
-    limit: opt.LimitOption = None,
-    machine: opt.MachineOption = None,
 ) -> None:
     """Diagnose each file and write a self-contained page of it; a folder gets an index, the most severe first.
 
@@ -215,14 +196,13 @@ def report(
     from sealscope.storage.folders import make_folder
 
     check_probability(false_alarm)
-    stated = opt.StatedMachine.of(machine, maps, rate, rig, area, displacement, limit, baseline)
-    if machine is not None and any(path.is_dir() for path in files):
+    if stated.known is not None and any(path.is_dir() for path in files):
         if join:
             raise InputError("--join must not stand beside a folder, whose recordings are judged each for itself")
         _report_machine(files, stated, output, false_alarm)
         return
     several = (len(files) > 1 and not join) or output.is_dir()
-    read_too = {path.resolve() for path in (*files, *(baseline or ()))}
+    read_too = {path.resolve() for path in (*files, *stated.baseline)}
     pages: dict[Path, Path] = {}
     for file in files[:1] if join else files:
         page = output / f"{file.stem}.html" if several else output
@@ -237,33 +217,33 @@ def report(
         make_folder(output)
     else:
         opt.check_folder(check_page(output))
-    complete = True
+    results = 0
     written: list[tuple[Path, Diagnosis]] = []
-    for own in _diagnoses(files, stated, baseline or (), join, false_alarm):
+    for own in _diagnoses(files, stated, join, false_alarm):
+        results += 1
         page = output if own is None or not several else output / f"{Path(own[1].file).stem}.html"
-        if own is None or opt.attempt(page, partial(write_page, page, *own, rig=stated.rig)) is None:
-            complete = False
-            continue
-        written.append((page, own[1]))
-        opt.say(f"{own[1].file}: {own[1].verdict} -> {page}")
+        if own is not None and opt.attempt(page, partial(write_page, page, *own, rig=stated.rig)) is not None:
+            written.append((page, own[1]))
+            opt.say(f"{own[1].file}: {own[1].verdict} -> {page}")
     if several and written:
         write_index(output / "index.html", written)
-    if not complete:
+    if len(written) < results:
         raise Exit(1)
 
 
 def _report_machine(files: Sequence[Path], machine: opt.StatedMachine, output: Path, false_alarm: float) -> None:
     """Write the page of a commissioned machine: the recordings of a folder over time, the newest verdict first."""
+    from sealscope.diagnosis.commissioned.machine import recordings_in
     from sealscope.recordings.formats.columns import counted
     from sealscope.recordings.joining import start_seconds
     from sealscope.reporting.template import check_page
     from sealscope.reporting.trend.history import Judged, write_history_page
 
     opt.check_folder(check_page(output, card=False))
-    paths = _in_folders(files)
+    paths = recordings_in(files)
     if output.resolve() in {path.resolve() for path in paths}:
         raise InputError(f"a page must not replace a recording, got {output}")
-    results = list(_diagnoses(paths, machine, false_alarm=false_alarm))
+    results = list(_diagnoses(paths, machine, False, false_alarm))
     judged = [
         Judged(own[1], start_seconds(own[0], own[1].file), partial(machine.read, Path(own[1].file)))
         for own in results
@@ -318,18 +298,17 @@ def inspect(
         opt.say(f"map saved in {rig}: later calls with --rig {rig} use it")
 
 
+@opt.stating("maps", "rate")
 def convert(
     source: Annotated[Path, Argument(help="Recording to read.")],
     target: Annotated[Path, Argument(help="Recording to write; its suffix tells the format.")],
-    maps: opt.MapOption = None,
-    rate: opt.RateOption = None,
+    stated: opt.StatedMachine,
     every: Annotated[str | None, Option("--every", metavar="TIME", help=_EVERY)] = None,
 ) -> None:
     """Rewrite a recording in another format, with Sealscope's channel names and units."""
     from sealscope.recordings import inspect, write
     from sealscope.recordings.files import check_target
 
-    stated = opt.StatedMachine.of(None, maps, rate)
     if every is not None:
         _convert_parts(source, target, stated, every)
         return

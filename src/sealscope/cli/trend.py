@@ -20,21 +20,16 @@ _YEARS = "Machine-years in which a healthy machine has one false alarm."
 _EVERY = "Time from one recording to the next (1d, 12h), of files that state none."
 
 
+@opt.stating("machine", "maps", "rate", "rig", "area", "displacement", "limit")
 def trend(
     context: Context,
     files: Annotated[list[Path], Argument(metavar="FILE...", help=_FILES)],
+    stated: opt.StatedMachine,
     form: Annotated[Literal["text", "json", "csv"], Option("--format", help="Text, a JSON object, a table.")] = "text",
     output: Annotated[Path | None, Option("--output", "-o", help=_OUTPUT)] = None,
     healthy: Annotated[int, Option(help=_HEALTHY)] = 1,
-    limit: opt.LimitOption = None,
     years: Annotated[float, Option(help=_YEARS)] = 10.0,
     every: Annotated[str | None, Option(metavar="TIME", help=_EVERY)] = None,
-    maps: opt.MapOption = None,
-    rate: opt.RateOption = None,
-    machine: opt.MachineOption = None,
-    rig: opt.AssumeOption = None,
-    area: opt.AreaOption = None,
-    displacement: opt.DisplacementOption = None,
     fail_on: opt.FailOnOption = None,
 ) -> None:
     """Show a machine over its recordings: L/min, change, growth, and when it reaches the limit.
@@ -48,8 +43,6 @@ def trend(
     from sealscope.reporting.trend.text import trend_csv, trend_text
     from sealscope.units import parse_quantity
 
-    opt.check_fail_on(fail_on, opt.VERDICTS)
-    stated = opt.StatedMachine.of(machine, maps, rate, rig, area, displacement, limit)
     spacing = None if every is None else parse_quantity(every, "s", name="--every")
     if output is not None:
         _check_output(output, files)

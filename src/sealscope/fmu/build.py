@@ -9,33 +9,22 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import tomllib
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from importlib.resources import files
 from operator import attrgetter
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from sealscope.calls import checked_call
 from sealscope.diagnosis.inference.detector import RESOLVED
 from sealscope.diagnosis.inference.weak_form import STRIDE
 from sealscope.errors import InputError
-from sealscope.fmu.description import description_2, description_3
+from sealscope.fmu.description import description, templates
 from sealscope.fmu.machine import FAILURES, Choice, code, object_code
-from sealscope.fmu.variables import (
-    INPUT_BASE,
-    INPUTS,
-    RESULT_BASE,
-    RESULTS,
-    START_POSITION,
-    STEP,
-    VALUE_BASE,
-    VALUES,
-    Variable,
-    variables,
-)
+from sealscope.fmu.variables import INPUTS, REFERENCES, RESULTS, SENSOR_RESULTS, VALUES, Variable, variables
 from sealscope.parameters import Rig, load_rig
 from sealscope.physics.state import STATES
 from sealscope.storage.atomic import atomic_write
@@ -46,12 +35,14 @@ Sensor = Literal["volume"]
 #: rms error [Pa] of a pressure by which a unit's step is chosen, and the commands under which.
 ERROR = 1.0
 COMMANDS = ("3 sin(4t)", "5 sin(2t)")
-_SOURCES = ("unit.c", "unit.h")
 _COMPILE_TIMEOUT = 300.0
+_README = """\
+The machine's laws are LLVM code (.ll), the interface around them is C11. To build the library for another
+system, with clang or `zig cc`: clang -O2 -fPIC -shared -I. -Iheaders -o NAME.so *.c *.ll -lm
+"""
 
 
-@dataclass(frozen=True)
-class Platform:
+class Platform(NamedTuple):
     """A system that a unit runs on: LLVM's and the compiler's names of it, its folders in the archive, its suffix."""
 
     triple: str
@@ -60,19 +51,17 @@ class Platform:
     suffix: str
 
 
-PLATFORMS: Mapping[str, Platform] = MappingProxyType(
-    {
-        "linux": Platform(
-            "x86_64-unknown-linux-gnu", "x86_64-linux-gnu.2.17", {2: "linux64", 3: "x86_64-linux"}, ".so"
-        ),
-        "windows": Platform("x86_64-pc-windows-gnu", "x86_64-windows-gnu", {2: "win64", 3: "x86_64-windows"}, ".dll"),
-        "macos": Platform(
-            "x86_64-apple-macosx11.0", "x86_64-macos.11.0", {2: "darwin64", 3: "x86_64-darwin"}, ".dylib"
-        ),
-        "macos-arm": Platform("arm64-apple-macosx11.0", "aarch64-macos.11.0", {3: "aarch64-darwin"}, ".dylib"),
-        "linux-arm": Platform("aarch64-unknown-linux-gnu", "aarch64-linux-gnu.2.17", {3: "aarch64-linux"}, ".so"),
-    }
-)
+def _platforms() -> Mapping[str, Platform]:
+    tables = tomllib.loads((files("sealscope.fmu") / "platforms.toml").read_text("utf-8"))
+    return MappingProxyType(
+        {
+            name: Platform(own["triple"], own["target"], {int(k): v for k, v in own["folders"].items()}, own["suffix"])
+            for name, own in tables.items()
+        }
+    )
+
+
+PLATFORMS = _platforms()
 
 
 def this_platform() -> str:
@@ -115,12 +104,6 @@ def fmi_headers() -> Path:
     return Path(package.origin).parent / "c-code"
 
 
-def identifier_of(path: Path) -> str:
-    """Return the file's name as an identifier of C."""
-    name = re.sub(r"\W", "_", path.stem, flags=re.ASCII)
-    return name if re.match(r"[A-Za-z_]", name) else f"_{name}"
-
-
 def chosen_step(rig: Rig, error: float) -> tuple[float, float]:
     """Return a step [s] of the solver by which pressures are off by `error` [Pa rms] at most, and the error it has.
 
@@ -133,8 +116,7 @@ def chosen_step(rig: Rig, error: float) -> tuple[float, float]:
     return min(run.step for run in runs), max(run.error for run in runs)
 
 
-@dataclass(frozen=True)
-class MockUp:
+class MockUp(NamedTuple):
     """A unit before it is built: its code, what it lists, and the sizes and starts that its layer in C needs.
 
     `modules`: LLVM code of its functions; `values`: parameters at the start, in the order of the code; `inputs`,
@@ -157,57 +139,56 @@ class MockUp:
         """The unit's identity, as the description and the library hold it."""
         return hashlib.sha256("".join([self.words, str(self.listed), *self.modules.values()]).encode()).hexdigest()[:32]
 
-    def configuration(self) -> str:
-        """Return the header of the unit: its sizes, its token and the values it starts with."""
-        references = {variable.reference for variable in self.listed}
-        present = ["1" if VALUE_BASE + k in references else "0" for k in range(len(self.values))]
-        sizes = {"STATES": self.states, "VALUES": len(self.values), "INPUTS": self.inputs, "RESULTS": self.results}
-        bases = {"INPUT_BASE": INPUT_BASE, "VALUE_BASE": VALUE_BASE, "RESULT_BASE": RESULT_BASE}
-        lines = [f"#define N_{name} {size}" for name, size in sizes.items()]
-        lines += [f"#define {name} {base}" for name, base in bases.items()]
-        lines += [f"#define START_POSITION {START_POSITION}", f"#define STEP {STEP}"]
-        lines += [f'#define TOKEN "{self.token}"', f"#define START_STEP {self.step!r}"]
-        lines += ["#define VALUES_AT_START {" + ", ".join(map(repr, self.values)) + "}"]
-        lines += ["#define VALUES_PRESENT {" + ", ".join(present) + "}"]
-        lines += ["#define FAILURES {" + ", ".join(f'"{words}"' for words in self.failures.values()) + "}"]
-        return "\n".join(lines) + "\n"
-
     def write(self, path: Path, version: Version, platforms: Sequence[str]) -> None:
         """Write the unit's archive; raise InputError where the compiler refuses."""
-        identifier = identifier_of(path)
-        describe = description_2 if version == 2 else description_3
+        name = re.sub(r"\W", "_", path.stem, flags=re.ASCII)
+        identifier = name if re.match(r"[A-Za-z_]", name) else f"_{name}"  # of C
         with tempfile.TemporaryDirectory(prefix="sealscope-fmu-") as folder, atomic_write(path) as temporary:
             place = Path(folder)
-            sources = _sources(place, self.modules, self.configuration(), version)
+            sources = self._sources(place, version)
             with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-                archive.writestr("modelDescription.xml", describe(identifier, self.token, self.words, self.listed))
-                for name in platforms:
-                    target = f"binaries/{PLATFORMS[name].folders[version]}/{identifier}{PLATFORMS[name].suffix}"
-                    archive.writestr(target, library(place, self.modules, name, version, identifier))
+                xml = description(version, identifier, self.token, self.words, self.listed)
+                archive.writestr("modelDescription.xml", xml)
+                for system in platforms:
+                    target = f"binaries/{PLATFORMS[system].folders[version]}/{identifier}{PLATFORMS[system].suffix}"
+                    archive.writestr(target, self._library(place, system, version))
                 for source in sources:
                     archive.write(source, f"sources/{source.relative_to(place).as_posix()}")
 
+    def _sources(self, place: Path, version: Version) -> list[Path]:
+        """Write the sources of the unit below `place`, and return their paths."""
+        layer = files("sealscope.fmu") / "c"
+        present = {variable.reference - REFERENCES["value"] for variable in self.listed}
+        config = (
+            templates()
+            .get_template("config.h.j2")
+            .render(unit=self, references=REFERENCES, present=[int(k in present) for k in range(len(self.values))])
+        )
+        texts = {name: (layer / name).read_text("utf-8") for name in ("unit.c", "unit.h", f"fmi{version}.c")}
+        texts |= {f"headers/{path.name}": path.read_text("utf-8") for path in fmi_headers().glob(f"fmi{version}*.h")}
+        texts |= {"config.h": config} | {f"{function}.ll": module for function, module in self.modules.items()}
+        texts["README.txt"] = _README
+        (place / "headers").mkdir()
+        for name, text in texts.items():
+            (place / name).write_text(text, encoding="utf-8")
+        return [place / name for name in texts]
 
-def library(folder: Path, modules: Mapping[str, str], name: str, version: Version, identifier: str) -> bytes:
-    """Return the shared library of a unit for the platform `name`, from the sources in `folder`.
-
-    Raises InputError where the compiler refuses.
-    """
-    platform, (call, crosses) = PLATFORMS[name], compiler()
-    objects = []
-    for function, module in modules.items():
-        path = folder / f"{function}-{name}.o"
-        path.write_bytes(object_code(module, platform.triple))
-        objects.append(str(path))
-    output = folder / f"{identifier}-{name}{platform.suffix}"
-    target = ["-target", platform.target] if crosses else []
-    sources = [str(folder / "unit.c"), str(folder / f"fmi{version}.c")]
-    flags = ["-std=c11", "-O2", "-fPIC", "-shared", f"-I{folder}", f"-I{folder / 'headers'}"]
-    command = [*call, *target, *flags, "-o", str(output), *sources, *objects, "-lm"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=_COMPILE_TIMEOUT, check=False)
-    if done.returncode:
-        raise InputError(f"the C compiler ({' '.join(call)}) could not build the unit for {name}: {done.stderr[-500:]}")
-    return output.read_bytes()
+    def _library(self, folder: Path, system: str, version: Version) -> bytes:
+        """Return the shared library of the unit for a platform, from the sources in `folder`."""
+        platform, (call, crosses) = PLATFORMS[system], compiler()
+        inputs = [folder / "unit.c", folder / f"fmi{version}.c"]
+        for function, module in self.modules.items():
+            inputs.append(folder / f"{function}-{system}.o")
+            inputs[-1].write_bytes(object_code(module, platform.triple))
+        output = folder / f"{system}{platform.suffix}"
+        target = ["-target", platform.target] if crosses else []
+        flags = ["-std=c11", "-O2", "-fPIC", "-shared", f"-I{folder}", f"-I{folder / 'headers'}", "-o", str(output)]
+        command = [*call, *target, *flags, *map(str, inputs), "-lm"]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_COMPILE_TIMEOUT, check=False)
+        if done.returncode:
+            caller, said = " ".join(call), done.stderr[-500:]
+            raise InputError(f"the C compiler ({caller}) could not build the unit for {system}: {said}")
+        return output.read_bytes()
 
 
 @checked_call
@@ -345,8 +326,8 @@ def write_sensor_fmu(
         tuple(own.variables(machine)),
         _values(machine),
         len(own.INPUTS),
-        len(own.RESULTS),
-        own.size(choice),
+        len(SENSOR_RESULTS),
+        own.memory_of(choice).itemsize // 8,
         1.0 / rate,
         own.FAILURES,
     )
@@ -381,20 +362,3 @@ def _checked(path: str | os.PathLike[str], fmi: int, platforms: Sequence[str] | 
         if name != this_platform() and not compiler()[1]:
             raise InputError(f"a unit for {name} needs a compiler for it: pip install 'sealscope[fmu]'")
     return wanted
-
-
-def _sources(place: Path, modules: Mapping[str, str], header: str, version: Version) -> list[Path]:
-    """Write the sources of a unit below `place`, and return their paths."""
-    layer = files("sealscope.fmu") / "c"
-    written = {name: (layer / name).read_text("utf-8") for name in (*_SOURCES, f"fmi{version}.c")}
-    written |= {f"headers/{path.name}": path.read_text("utf-8") for path in fmi_headers().glob(f"fmi{version}*.h")}
-    written["config.h"] = header
-    written |= {f"{function}.ll": module for function, module in modules.items()}
-    written["README.txt"] = (
-        "The machine's laws are LLVM code (.ll), the interface around them is C11. To build the library for another\n"
-        "system, with clang or `zig cc`: clang -O2 -fPIC -shared -I. -Iheaders -o NAME.so *.c *.ll -lm\n"
-    )
-    (place / "headers").mkdir()
-    for name, text in written.items():
-        (place / name).write_text(text, encoding="utf-8")
-    return [place / name for name in written]

@@ -95,13 +95,16 @@ def record_fmu(
     t = np.arange((n + FILTER_REACH) * factor + 1) / (rate * factor)
     driven = _driven(path, experiment, names, variables, t)
     rows = _run(path, t, driven, list(measured.values()), experiment.duration, progress)
-    outputs = {name: _si(path, rows[own], variables[own], CHANNEL_UNITS[name]) for name, own in measured.items()}
+    outputs = {}
+    for name, own in measured.items():
+        unit = variables[own].unit or CHANNEL_UNITS[name]  # what has no unit is taken to be in SI units
+        outputs[name] = to_si(rows[own], unit, CHANNEL_UNITS[name], name=f"{own} of {path.name}")
     volts = experiment.commanded.volts(t[: n * factor : factor])
     everything = {name: outputs.get(name, np.zeros(t.size)) for name in _MEASURED}
     recorded = record(experiment.rig, everything, volts, factor, experiment.seed, experiment.readings())
     kept = {"u", *measured} | ({"omega"} if "theta" in measured else set())
-    unit = {"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "name": description.modelName}
-    provenance: dict[str, Any] = {"origin": "fmu", "unit": unit, "experiment": experiment.describe()}
+    source = {"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "name": description.modelName}
+    provenance: dict[str, Any] = {"origin": "fmu", "unit": source, "experiment": experiment.describe()}
     return replace(
         recorded,
         channels={name: values for name, values in recorded.channels.items() if name in kept},
@@ -149,12 +152,6 @@ def _names(path: Path, variables: Mapping[str, Any], given: Mapping[str, str]) -
     return {name: given.get(name, name) for name in known if given.get(name, name) in variables}
 
 
-def _si(path: Path, values: Array, variable: Any, unit: str) -> Array:
-    """Return a variable of the unit in SI units; what has no unit is taken to be in them."""
-    own = getattr(variable, "unit", None)
-    return values if not own else to_si(values, own, unit, name=f"{variable.name} of {path.name}")
-
-
 def _driven(
     path: Path, experiment: Experiment, names: Mapping[str, str], variables: Mapping[str, Any], t: Array
 ) -> Array:
@@ -176,9 +173,8 @@ def _driven(
             columns[names[name]] = from_si(values, variable.unit, unit, name=name) if variable.unit else values
         elif name == "u" or np.any(values):
             raise InputError(f"the experiment needs the input {name} ({INPUTS[name][1]}), which {path} does not have")
-    rows = np.empty(t.size, dtype=[("time", float), *((name, float) for name in columns)])
-    rows["time"] = t
-    for name, values in columns.items():
+    rows = np.empty(t.size, dtype=[(name, float) for name in ("time", *columns)])
+    for name, values in {"time": t, **columns}.items():
         rows[name] = values
     return rows
 

@@ -20,15 +20,15 @@ uncertain by theirs and by the walk of a healthy machine, w times a block's nois
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import lru_cache
-from operator import attrgetter
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+import numpy as np
 from numba import carray
 
-from sealscope.compiled import large_law, law, pointer_at
+from sealscope.compiled import large_law, law, record_at
 from sealscope.diagnosis.inference.blocks import Columns
 from sealscope.diagnosis.inference.live.balance import BLOCK_SECONDS, LEARNED, TELLS, WAKES, live_equations, size_error
 from sealscope.diagnosis.inference.live.known import (
@@ -48,27 +48,12 @@ from sealscope.diagnosis.inference.terms import ATMOSPHERE, HALF_DIFFERENCE, LEA
 from sealscope.diagnosis.inference.weak_form import LARGEST, SPAN, STRIDE, stride_samples, test_function
 from sealscope.errors import InputError
 from sealscope.fmu.machine import unit_code
-from sealscope.fmu.variables import INPUT_BASE, RESULT_BASE, VALUE_BASE, VALUES, Variable
+from sealscope.fmu.variables import SENSOR_RESULTS, VALUES, Variable, inputs, outputs, parameter
 from sealscope.parameters import Rig
-from sealscope.parameters.fields import leaves, unit_of
 from sealscope.recordings.channels import CHANNEL_UNITS, LONG_NAMES
 
 #: Channels that a soft sensor reads, in the order of the samples.
 INPUTS = ("p_A", "p_B", "theta", "x")
-_MEAN, _RISE = "pump and piston together, mean of the last blocks", "rise over the first blocks"
-#: Outputs: unit, words.
-RESULTS = {
-    "q": ("m^3/s", f"leakage of {_MEAN}"),
-    "q_low": ("m^3/s", "leakage, lower end of its 95 % interval"),
-    "q_high": ("m^3/s", "leakage, upper end of its 95 % interval"),
-    "q_rise": ("m^3/s", f"leakage, {_RISE}"),
-    "q_rise_low": ("m^3/s", "leakage, lower end of the rise's 95 % interval"),
-    "q_rise_high": ("m^3/s", "leakage, upper end of the rise's 95 % interval"),
-    "conductance": ("m^3/(s Pa)", f"conductance between the chambers, {_MEAN}"),
-    "misfit": ("1", "variance of the last block's rows over the usual one"),
-    "blocks": ("1", "blocks that were estimated"),
-    "settled": ("1", "1 from the first block after those of the baseline on, else 0"),
-}
 #: What a function of a soft sensor returns where it fails.
 FAILURES = MappingProxyType({1: "pump.q_b must be > 0 m^3/rev"})
 #: The parameter of the rig that the balance reads.
@@ -88,24 +73,18 @@ COLUMNS = (
 )  # fmt: skip
 _WIDTH, _LEAK, _LEFT = len(COLUMNS), len(COLUMNS) - 2, len(COLUMNS) - 1
 _PLACE = tuple(range(_WIDTH))
-_SCALARS = (
-    "clock", "count", "sign", "closed", "pending", "rows", "waiting", "precision", "woken", "blocks", "base",
-    "base_square", "base_variance",
+#: Numbers of a soft sensor's memory.
+_COUNTERS = (
+    "clock", "sample_count", "sign", "closed", "pending", "row_count", "wait_count", "precision", "woken", "blocks",
+    "base", "base_square", "base_variance",
 )  # fmt: skip
-(_CLOCK, _COUNT, _SIGN, _CLOSED, _PENDING, _ROWS, _WAITING, _PRECISION, _WOKEN, _BLOCKS, _BASE, _BASE_SQUARE,
- _BASE_VARIANCE) = range(len(_SCALARS))  # fmt: skip
 
 
 def variables(rig: Rig) -> Iterator[Variable]:
     """Yield the variables of a soft sensor."""
-    for k, name in enumerate(INPUTS):
-        yield Variable(
-            INPUT_BASE + k, name, "input", "continuous", CHANNEL_UNITS[name], f"reading: {LONG_NAMES[name]}", 0.0
-        )
-    field, value = dict(leaves(Rig))[READ], float(attrgetter(READ)(rig))
-    yield Variable(VALUE_BASE + _SIZE, READ, "parameter", "fixed", unit_of(field), str(field.title or READ), value)
-    for k, (name, (unit, words)) in enumerate(RESULTS.items()):
-        yield Variable(RESULT_BASE + k, name, "output", "continuous", unit, words, None)
+    yield from inputs({name: (CHANNEL_UNITS[name], f"reading: {LONG_NAMES[name]}") for name in INPUTS})
+    yield from filter(None, [parameter(rig, READ, "fixed")])
+    yield from outputs(SENSOR_RESULTS)
 
 
 class SensorChoice(NamedTuple):
@@ -141,97 +120,68 @@ class _Numbers(NamedTuple):
         return cls(stride_samples(rate), round(BLOCK_SECONDS / STRIDE), max(1, round(HALF_DIFFERENCE * rate)))
 
 
-class _Memory(NamedTuple):
-    """A soft sensor's memory.
+def memory_of(choice: SensorChoice) -> np.dtype[Any]:
+    """Return the layout of a soft sensor's memory.
 
     `ring`: the last samples; `increments`, `opened`: of an interval, and the rows that it is part of; `rows`, `ends`,
     `gram`: of the blocks that are weighted together; `sizes`: sum and number of abs(p_A - p_B) in the last blocks;
     `support`: what supports the weights; `waits`, `waiting`, `ordered`: sums, rows and size, and precisions of the
     blocks that are learned from; `last`: of each of the last blocks total, conductance, its variance, that of the
-    level, and abs(p_A - p_B).
+    level, and abs(p_A - p_B); `workspace`, `known`: a `Workspace` and a `Known`.
     """
-
-    scalars: Any
-    ring: Any
-    increments: Any
-    opened: Any
-    rows: Any
-    ends: Any
-    gram: Any
-    sizes: Any
-    support: Any
-    waits: Any
-    waiting: Any
-    ordered: Any
-    last: Any
-
-
-def _shapes(choice: SensorChoice) -> tuple[tuple[tuple[int, ...], ...], ...]:
-    """Return the shapes of a memory's parts: those of `_Memory`, of a `Workspace` and of a `Known`."""
     n, slow = _Numbers.of(choice.rate), len(choice.own) - 1
     rows = SUPPORT * n.strides
-    own = _Memory(
-        (len(_SCALARS),), (len(INPUTS), 2 * n.half + 3), (_WIDTH,), (SPAN, _WIDTH), (rows, _WIDTH), (SUPPORT,),
-        (SUPPORT, _WIDTH, _WIDTH), (SUPPORT + 1, 2), (slow + 1, slow + 1), (LEARNED, _WIDTH, _WIDTH), (LEARNED, 3),
-        (LEARNED,), (WINDOW, 5),
-    )  # fmt: skip
-    return tuple(own), workspace_shapes(rows, SUPPORT, len(choice.fast), slow), known_shapes(_LEAK)
+    shapes: dict[str, tuple[int, ...]] = {
+        **dict.fromkeys(_COUNTERS, ()),
+        "ring": (len(INPUTS), 2 * n.half + 3),
+        "increments": (_WIDTH,),
+        "opened": (SPAN, _WIDTH),
+        "rows": (rows, _WIDTH),
+        "ends": (SUPPORT,),
+        "gram": (SUPPORT, _WIDTH, _WIDTH),
+        "sizes": (SUPPORT + 1, 2),
+        "support": (slow + 1, slow + 1),
+        "waits": (LEARNED, _WIDTH, _WIDTH),
+        "waiting": (LEARNED, 3),
+        "ordered": (LEARNED,),
+        "last": (WINDOW, 5),
+    }
+    workspace = zip(Workspace._fields, workspace_shapes(rows, SUPPORT, len(choice.fast), slow), strict=True)
+    known = zip(Known._fields, known_shapes(_LEAK), strict=True)
+    records = [("workspace", _doubles(workspace)), ("known", _doubles(known))]
+    return np.dtype([*_doubles(shapes.items()).descr, *records])
 
 
-def size(choice: SensorChoice) -> int:
-    """Return the length of a soft sensor's memory."""
-    return sum(math.prod(shape) for part in _shapes(choice) for shape in part)
-
-
-def _place_of(choice: SensorChoice, name: str) -> int:
-    """Return where a part of `_Memory` begins."""
-    return sum(math.prod(shape) for shape in _shapes(choice)[0][: _Memory._fields.index(name)])
-
-
-def _arrays(shapes: tuple[tuple[int, ...], ...], at: int) -> Callable[..., Any]:
-    """Return the law that makes a tuple of arrays of these shapes, one behind the other, from the place `at` on."""
-    if not shapes:
-        return law(_nothing)
-    shape, others = shapes[0], _arrays(shapes[1:], at + math.prod(shapes[0]))
-
-    @law
-    def arrays(memory: Any) -> Any:
-        return (carray(pointer_at(memory, at), shape), *others(memory))
-
-    return arrays  # type: ignore[no-any-return]
-
-
-def _nothing(memory: Any) -> Any:
-    return ()
+def _doubles(shapes: Iterable[tuple[str, tuple[int, ...]]]) -> np.dtype[Any]:
+    return np.dtype([(name, "f8", shape) for name, shape in shapes])
 
 
 def functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
     """Return the functions of a soft sensor, to be compiled: ``start``, ``advance`` and ``report`` as of a machine."""
-    sample, length, interval = _sample(choice), size(choice), 1.0 / choice.rate
-    last_at = _place_of(choice, "last")
-    misfit_at = length - sum(math.prod(shape) for shape in _shapes(choice)[2][3:]) + MISFIT
-    n_inputs, n_results, n_values = len(INPUTS), len(RESULTS), len(VALUES)
-    quantiles, error = _quantiles(), choice.size_error
+    from scipy.special import stdtrit
+
+    layout = memory_of(choice)
+    sample, memory, length, interval = _sample(choice), record_at(layout), layout.itemsize // 8, 1.0 / choice.rate
+    n_inputs, n_results, n_values = len(INPUTS), len(SENSOR_RESULTS), len(VALUES)
+    error = choice.size_error
+    quantiles = tuple(float(stdtrit(freedom, 0.975)) for freedom in range(1, WINDOW))  # Student's t
 
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
-        m = carray(y, length)
-        for k in range(length):
-            m[k] = 0.0
+        carray(y, length)[:] = 0.0
         return 0 if carray(values, n_values)[_SIZE] > 0.0 else 1
 
     def advance(values: Any, inputs: Any, slopes: Any, y: Any, span: float, steps: int) -> int:
-        m, displacement = carray(y, length), carray(values, n_values)[_SIZE] / (2.0 * math.pi)
+        m, displacement = memory(y), carray(values, n_values)[_SIZE] / (2.0 * math.pi)
         a, b = carray(inputs, n_inputs), carray(slopes, n_inputs)
-        t = m[_CLOCK]
+        t = m.clock
         while t < span - 1e-6 * interval:  # a sample at the end is the next step's first
-            sample(y, displacement, a[0] + b[0] * t, a[1] + b[1] * t, a[2] + b[2] * t, a[3] + b[3] * t)
+            sample(m, displacement, a[0] + b[0] * t, a[1] + b[1] * t, a[2] + b[2] * t, a[3] + b[3] * t)
             t += interval
-        m[_CLOCK] = t - span
+        m.clock = t - span
         return 0
 
     def report(values: Any, inputs: Any, y: Any, results: Any) -> int:
-        m, last = carray(y, length), carray(pointer_at(y, last_at), (WINDOW, 5))
-        _write_results(m, last, m[misfit_at], error, quantiles, carray(results, n_results))
+        _write_results(memory(y), error, quantiles, carray(results, n_results))
         return 0
 
     return {"start": start, "advance": advance, "report": report}
@@ -239,25 +189,16 @@ def functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
 
 def _sample(choice: SensorChoice) -> Callable[..., Any]:
     """Return the law that takes a sample of the channels `INPUTS`."""
-    parts, workspace, known = _shapes(choice)
-    workspace_at = sum(math.prod(shape) for shape in parts)
-    of_memory = _arrays(parts, 0)
-    of_workspace, of_known = (
-        _arrays(workspace, workspace_at),
-        _arrays(known, workspace_at + sum(math.prod(shape) for shape in workspace)),
-    )
     (stride, strides, half), rate = _Numbers.of(choice.rate), choice.rate
     support, weight = SPAN * stride, float(test_function(rate)[0, 0]) / (1.0 - (1.0 / (SPAN * stride) - 1.0) ** 2) ** 4
     close, length = _close(choice), stride * strides
-    rows_at, ends_at = (_place_of(choice, name) for name in ("rows", "ends"))
 
     @law
-    def sample(memory: Any, displacement: float, p_A: float, p_B: float, theta: float, x: float) -> None:
-        m = _Memory(*of_memory(memory))
-        count, width = int(m.scalars[_COUNT]), m.ring.shape[1]
+    def sample(m: Any, displacement: float, p_A: float, p_B: float, theta: float, x: float) -> None:
+        count, width = int(m.sample_count), m.ring.shape[1]
         at = count % width
         m.ring[0, at], m.ring[1, at], m.ring[2, at], m.ring[3, at] = p_A, p_B, theta, x
-        m.scalars[_COUNT] += 1.0
+        m.sample_count += 1.0
         k = count - half - 1  # the interval from sample k on, which half a difference is known after
         if k < 0:
             return
@@ -278,15 +219,13 @@ def _sample(choice: SensorChoice) -> Callable[..., Any]:
         row = piece - SPAN + 1
         if inside < stride - 1 or row < 0:
             return
-        whole, place = True, int(m.scalars[_ROWS])
+        whole, place = True, int(m.row_count)
         for j in range(_WIDTH):
             m.rows[place, j] = m.opened[row % SPAN, j]
             whole = whole and abs(m.rows[place, j]) < LARGEST
-        m.scalars[_ROWS] += whole
+        m.row_count += whole
         if row % strides == strides - 1:
-            taken = carray(pointer_at(memory, rows_at), (int(m.scalars[_ROWS]), _WIDTH))
-            ends = carray(pointer_at(memory, ends_at), (int(m.scalars[_PENDING]) + 1,))
-            close(m, taken, ends, Workspace(*of_workspace(memory)), Known(*of_known(memory)), row // strides)
+            close(m, m.rows[: int(m.row_count)], m.ends[: int(m.pending) + 1], row // strides)
 
     return sample  # type: ignore[no-any-return]
 
@@ -327,30 +266,32 @@ def _orient(m: Any, count: int) -> None:
         mean += m.rows[r, _LEAK] / count
     for r in range(count):
         work += (m.rows[r, _LEAK] - mean) * m.rows[r, _LEFT]
-    m.scalars[_SIGN] = -1.0 if work < 0.0 else 1.0
+    m.sign = -1.0 if work < 0.0 else 1.0
 
 
 @large_law
-def _show(m: Any, known: Any, error: float, rows: float, size: float, adds: bool) -> None:
+def _show(m: Any, error: float, rows: float, size: float, adds: bool) -> None:
     """Put what the block `known.own` shows among the last ones."""
-    scalars, moved = m.scalars, motion(known.own[-1, -1], rows, known.numbers)
+    known = m.known
+    moved = motion(known.own[-1, -1], rows, known.numbers)
     precision, lead, shift, leaning = says(known, rows, adds)
-    if not precision > (TELLS * scalars[_PRECISION] if moved < STANDSTILL else 0.0):
+    if not precision > (TELLS * m.precision if moved < STANDSTILL else 0.0):
         return
-    total, last, k = lead / precision, m.last, int(scalars[_BLOCKS]) % WINDOW
+    total, last, k = lead / precision, m.last, int(m.blocks) % WINDOW
     g = total - shift / precision
     last[k, 0], last[k, 1], last[k, 2], last[k, 4] = total, g, 1.0 / precision, size
     last[k, 3] = leaning / precision**2 + (error * total) ** 2
-    scalars[_BLOCKS] += 1.0
-    if scalars[_BLOCKS] <= WINDOW:
-        scalars[_BASE] += g
-        scalars[_BASE_SQUARE] += g * g
-        scalars[_BASE_VARIANCE] += 1.0 / precision
+    m.blocks += 1.0
+    if m.blocks <= WINDOW:
+        m.base += g
+        m.base_square += g * g
+        m.base_variance += 1.0 / precision
 
 
 @large_law
-def _learn(m: Any, known: Any, error: float) -> None:
+def _learn(m: Any, error: float) -> None:
     """Learn from the blocks that wait, and show them."""
+    known = m.known
     for again in range(3):
         for k in range(LEARNED):
             rows, size = m.waiting[k, 0], m.waiting[k, 1]
@@ -360,45 +301,40 @@ def _learn(m: Any, known: Any, error: float) -> None:
             elif again == 1:
                 m.ordered[k] = says(known, rows, False)[0]
             else:
-                _show(m, known, error, rows, size, False)
+                _show(m, error, rows, size, False)
         if again == 0:
             begin(known)
         elif again == 1:
-            m.scalars[_PRECISION] = median(m.ordered, LEARNED)
-    m.scalars[_WAITING] = 0.0
+            m.precision = median(m.ordered, LEARNED)
+    m.wait_count = 0.0
 
 
 @large_law
-def _take(m: Any, known: Any, error: float, b: int, rows: float, size: float) -> None:
+def _take(m: Any, error: float, b: int, rows: float, size: float) -> None:
     """Take the sums of a block: `LEARNED` blocks are learned from together, the others one by one."""
-    scalars = m.scalars
-    if scalars[_PRECISION] > 0.0:
+    known = m.known
+    if m.precision > 0.0:
         moved = motion(m.gram[b, _LEFT, _LEFT], rows, known.numbers)
-        scalars[_WOKEN] = scalars[_WOKEN] + 1.0 if moved > 1.0 / STANDSTILL else 0.0
-        if scalars[_WOKEN] >= WAKES:  # all before were of a machine at standstill: nothing is compared with them
-            for i in range(len(known.own)):
-                for j in range(len(known.own)):
-                    known.sums[i, j] = 0.0
-            for i in range(len(known.along)):
-                known.along[i] = 0.0
-            for i in range(len(known.numbers)):
-                known.numbers[i] = 0.0
-            for i in range(_PRECISION, len(_SCALARS)):
-                scalars[i] = 0.0
+        m.woken = m.woken + 1.0 if moved > 1.0 / STANDSTILL else 0.0
+        if m.woken >= WAKES:  # all before were of a machine at standstill: nothing is compared with them
+            known.sums[:, :] = 0.0
+            known.along[:] = 0.0
+            known.numbers[:] = 0.0
+            m.precision = m.woken = m.blocks = m.base = m.base_square = m.base_variance = 0.0
             return
         take(known, m.gram[b], _PLACE)
-        _show(m, known, error, rows, size, True)
+        _show(m, error, rows, size, True)
         return
-    waiting = int(scalars[_WAITING])
+    waiting = int(m.wait_count)
     if waiting == 0 and not m.gram[b, _LEFT, _LEFT] > 0.0:
         return
     m.waiting[waiting, 0], m.waiting[waiting, 1] = rows, size
     for i in range(_WIDTH):
         for j in range(_WIDTH):
             m.waits[waiting, i, j] = m.gram[b, i, j]
-    scalars[_WAITING] += 1.0
+    m.wait_count += 1.0
     if waiting + 1 == LEARNED:
-        _learn(m, known, error)
+        _learn(m, error)
 
 
 def _close(choice: SensorChoice) -> Callable[..., Any]:
@@ -406,24 +342,24 @@ def _close(choice: SensorChoice) -> Callable[..., Any]:
     fast, own, error = choice.fast, choice.own, choice.size_error
 
     @large_law
-    def close(m: Any, rows: Any, ends: Any, workspace: Any, known: Any, block: int) -> None:
-        scalars, count, pending, first = m.scalars, len(rows), len(ends), m.scalars[_CLOSED] == 0.0
+    def close(m: Any, rows: Any, ends: Any, block: int) -> None:
+        count, pending, first = len(rows), len(ends), m.closed == 0.0
         ends[pending - 1] = count
-        scalars[_PENDING] = pending
+        m.pending = pending
         if first and pending < SUPPORT:
             return
         if first:
             _orient(m, count)
         for r in range(count):
-            rows[r, _LEFT] *= scalars[_SIGN]
-        scalars[_CLOSED] += pending
-        weigh(rows, ends, fast, own, m.support, min(1.0, SUPPORT / scalars[_CLOSED]), workspace, m.gram)
-        scalars[_PENDING] = scalars[_ROWS] = 0.0
+            rows[r, _LEFT] *= m.sign
+        m.closed += pending
+        weigh(rows, ends, fast, own, m.support, min(1.0, SUPPORT / m.closed), m.workspace, m.gram)
+        m.pending = m.row_count = 0.0
         for b in range(pending):
             of_block = ends[b] - (ends[b - 1] if b else 0.0)
             slot = (block - pending + 1 + b) % (SUPPORT + 1)
             if of_block > 0.0:
-                _take(m, known, error, b, of_block, max(m.sizes[slot, 0] / max(m.sizes[slot, 1], 1.0), TINY))
+                _take(m, error, b, of_block, max(m.sizes[slot, 0] / max(m.sizes[slot, 1], 1.0), TINY))
 
     return close  # type: ignore[no-any-return]
 
@@ -447,15 +383,14 @@ def _variance(last: Any, newest: int, n: int) -> float:
 
 
 @law
-def _write_results(m: Any, last: Any, misfit: float, error: float, quantiles: Any, out: Any) -> None:
-    """Write the outputs (`RESULTS`).
+def _write_results(m: Any, error: float, quantiles: Any, out: Any) -> None:
+    """Write the outputs (`SENSOR_RESULTS`).
 
     `error`: that of the machine's size, relative; `quantiles`: Student's t for 1, 2, ... degrees of freedom.
     """
-    for k in range(len(out)):
-        out[k] = 0.0
-    count, newest = int(m[_BLOCKS]), int(m[_BLOCKS]) - 1
-    out[7], out[8], n = misfit, m[_BLOCKS], min(count, WINDOW)
+    out[:] = 0.0
+    last, count, newest = m.last, int(m.blocks), int(m.blocks) - 1
+    out[7], out[8], n = m.known.numbers[MISFIT], m.blocks, min(count, WINDOW)
     if n < 2:
         return
     G, flow = _mean(last, newest, n, 0), _mean(last, newest, n, 4)
@@ -466,20 +401,13 @@ def _write_results(m: Any, last: Any, misfit: float, error: float, quantiles: An
     n = min(count - WINDOW, WINDOW)
     if n < 2:
         return
-    base, flow = m[_BASE] / WINDOW, _mean(last, newest, n, 4)
+    base, flow = m.base / WINDOW, _mean(last, newest, n, 4)
     rise = _mean(last, newest, n, 1) - base
-    before = max((m[_BASE_SQUARE] - WINDOW * base**2) / (WINDOW - 1.0), m[_BASE_VARIANCE] / WINDOW)
+    before = max((m.base_square - WINDOW * base**2) / (WINDOW - 1.0), m.base_variance / WINDOW)
     walked = WALK * (count - 0.5 * (n + WINDOW)) / (1.0 + WALK * (WINDOW + 1.0) / 6.0)
     variance = _variance(last, newest, n) + before * (1.0 / WINDOW + walked)
     half = math.hypot(quantiles[n - 2] * math.sqrt(variance), _95 * error * rise)
     out[3], out[4], out[5], out[9] = flow * rise, flow * (rise - half), flow * (rise + half), 1.0
-
-
-def _quantiles() -> tuple[float, ...]:
-    """Return Student's t of 95 % intervals for 1, 2, ... degrees of freedom."""
-    from scipy.special import stdtrit
-
-    return tuple(float(stdtrit(freedom, 0.975)) for freedom in range(1, WINDOW))
 
 
 @lru_cache(maxsize=8)

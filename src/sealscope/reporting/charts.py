@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isfinite
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.errors import InputError
 from sealscope.recordings.recording import COUNTS, Array, Recording
 from sealscope.reporting.features import NAMES, PRODUCT, ChamberDetails
+from sealscope.reporting.picture import Scale
 from sealscope.reporting.series import DrawnTimes, coded, coded_times, time_base
 from sealscope.units import LITRE_PER_MINUTE, PSI
 
@@ -56,26 +57,15 @@ class Mark:
             raise InputError(f"time of the mark {self.label!r} must be finite, got {self.t}")
 
 
-@dataclass(frozen=True)
-class ChartLine:
-    """One line of a chart: its label, the style's name in the style sheet, and its values in the chart's unit.
-
-    Values beyond +-1e100 are drawn there, so that no scale overflows.
-    """
+class ChartLine(NamedTuple):
+    """One line of a chart: its label, the style's name in the style sheet, and its values in the chart's unit."""
 
     label: str
     style: str
     values: Array
 
-    def __post_init__(self) -> None:
-        beyond = np.isfinite(self.values) & (np.abs(self.values) > _LARGEST)
-        if beyond.any():
-            drawn = np.where(beyond, np.copysign(_LARGEST, self.values), self.values)
-            object.__setattr__(self, "values", drawn)
 
-
-@dataclass(frozen=True)
-class Chart:
+class Chart(NamedTuple):
     """One chart.
 
     `base`: the time axis of its lines (all samples, the centres of the RMS windows, or the instants of the leak's
@@ -103,9 +93,7 @@ class Chart:
     @property
     def cut(self) -> bool:
         """Whether values lie beyond the limits."""
-        if self.limits is None:
-            return False
-        low, high = self.limits
+        low, high = self.limits or (-np.inf, np.inf)
         return any(bool(np.any((line.values < low) | (line.values > high))) for line in self.lines)
 
 
@@ -137,46 +125,41 @@ def label_of(name: str) -> str:
 
 def channel_charts(recording: Recording, pressure_unit: str) -> list[Chart]:
     """Return the charts of the channels that have samples, those of one kind and unit together."""
-    kinds = [
-        ("u", "Command", (("u", "a"),)),
-        ("x", "Piston position", (("x", "a"),)),
-        ("omega", "Motor speed", (("omega", "a"),)),
-        ("p_AB", "Chamber pressures", (("p_A", "a"), ("p_B", "b"))),
-        ("p_12", "Pump port pressures", (("p_1", "a"), ("p_2", "b"))),
-        ("q_leak", "Flow meter in the bypass", (("q_leak", "a"),)),
-        ("q_comp", "Leakage that the controller makes good", (("q_comp", "a"),)),
-    ]
     charts = []
-    for key, title, members in kinds:
+    for key, title, height, members in _CHANNELS:
         units: dict[str, list[ChartLine]] = {}
-        for name, style in members:
+        for name, style in zip(members, "ab", strict=False):
             if name in recording and np.isfinite(recording[name]).any():
                 unit, size = shown_unit(recording.units[name], pressure_unit)
                 units.setdefault(unit, []).append(ChartLine(name, style, recording[name] / size))
         for i, (unit, lines) in enumerate(units.items()):
-            height = 210 if key == "p_AB" else 140
             charts.append(Chart(f"{key}-{i}", "channels", title, unit, tuple(lines), height=height))
     return charts
 
 
-def _axis(channel: str) -> str:
-    return f"windows-{channel}"
+_CHANNELS = (
+    ("u", "Command", 140, ("u",)),
+    ("x", "Piston position", 140, ("x",)),
+    ("omega", "Motor speed", 140, ("omega",)),
+    ("p_AB", "Chamber pressures", 210, ("p_A", "p_B")),
+    ("p_12", "Pump port pressures", 140, ("p_1", "p_2")),
+    ("q_leak", "Flow meter in the bypass", 140, ("q_leak",)),
+    ("q_comp", "Leakage that the controller makes good", 140, ("q_comp",)),
+)
 
 
 def rms_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
     """Return the charts of the windowed RMS: d1..d4 of each chamber, then d3d4 of each."""
     charts = []
-    windowed = [chamber for chamber in chambers if chamber.window_t.size]
-    for chamber in windowed:
-        name = chamber.channel
-        unit, size = detail_unit(chamber.unit, "d1", pressure_unit)
-        lines = tuple(ChartLine(d, d, chamber.window_rms[d] / size) for d in NAMES if d != PRODUCT)
-        charts.append(Chart(f"rms-{name}", "rms", f"RMS of the details of {name}", unit, lines, _axis(name), 230))
-    for chamber in windowed:
-        name, label = chamber.channel, label_of(PRODUCT)
-        unit, size = detail_unit(chamber.unit, PRODUCT, pressure_unit)
-        line = ChartLine(label, PRODUCT, chamber.window_rms[PRODUCT] / size)
-        charts.append(Chart(f"rms-{name}-d3d4", "rms", f"RMS of {label} of {name}", unit, (line,), _axis(name), 150))
+    for names, of, key, height in ((NAMES[:-1], "the details", "", 230), ((PRODUCT,), label_of(PRODUCT), "-d3d4", 150)):
+        for chamber in chambers:
+            if not chamber.window_t.size:
+                continue
+            own = chamber.channel
+            unit, size = detail_unit(chamber.unit, names[0], pressure_unit)
+            lines = tuple(ChartLine(label_of(name), name, chamber.window_rms[name] / size) for name in names)
+            title = f"RMS of {of} of {own}"
+            charts.append(Chart(f"rms-{own}{key}", "rms", title, unit, lines, f"windows-{own}", height))
     return charts
 
 
@@ -230,8 +213,7 @@ def detail_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Ch
     return charts
 
 
-@dataclass(frozen=True)
-class DrawnCharts:
+class DrawnCharts(NamedTuple):
     """All charts: `data` for the script (plain JSON values), `still` by chart key for the template, and their base."""
 
     data: dict[str, Any]
@@ -255,41 +237,35 @@ def draw(
     base = time_base(recording.t, recording.rate, POINTS, near=near, near_samples=NEAR_SAMPLES)
     few = time_base(recording.t, recording.rate, STILL_POINTS)
     span = (float(base.t[0]), float(base.t[-1]))
-    axes: dict[str, Array] = {SAMPLES: base.t} | {_axis(c.channel): c.window_t for c in chambers}
+    axes: dict[str, Array] = {SAMPLES: base.t} | {f"windows-{c.channel}": c.window_t for c in chambers}
     if diagnosis.course is not None:
         axes[COURSE] = diagnosis.course.t
     onset, interval = onset_within(diagnosis, span)
     low, high = interval or (None, None)
-    data: dict[str, Any] = {
+    coded_charts, still = [], {}
+    for chart in charts:
+        lines = [_drawable(line.values) for line in chart.lines]
+        t, points = axes[chart.base], lines
+        if chart.base == SAMPLES:
+            t, points, lines = few.t, [few.reduce(line) for line in lines], [base.reduce(line) for line in lines]
+        named = zip(chart.lines, lines, strict=True)
+        series = [{"label": line.label, "style": line.style, **coded(values)} for line, values in named]
+        shown = {name: getattr(chart, name) for name in ("key", "title", "unit", "height", "band", "limits", "level")}
+        coded_charts.append({**shown, "axis": chart.base, "series": series})
+        still[chart.key] = still_chart(chart, t, points, span)
+    data = {
         "span": span,
-        "axes": {name: coded_times(t) for name, t in axes.items() if any(c.base == name for c in charts)},
+        "axes": {name: coded_times(t) for name, t in axes.items() if any(chart.base == name for chart in charts)},
         "onset": {"t": onset, "low": low, "high": high},
         "marks": [{"t": mark.t, "label": mark.label, "known": mark.known} for mark in marks],
-        "charts": [],
+        "charts": coded_charts,
     }
-    still = {}
-    for chart in charts:
-        sampled = chart.base == SAMPLES
-        data["charts"].append(
-            {
-                "key": chart.key,
-                "axis": chart.base,
-                "title": chart.title,
-                "unit": chart.unit,
-                "height": chart.height,
-                "band": chart.band,
-                "limits": chart.limits,
-                "level": chart.level,
-                "series": [
-                    {"label": line.label, "style": line.style}
-                    | coded(base.reduce(line.values) if sampled else line.values)
-                    for line in chart.lines
-                ],
-            }
-        )
-        points = [few.reduce(line.values) if sampled else line.values for line in chart.lines]
-        still[chart.key] = still_chart(chart, few.t if sampled else axes[chart.base], points, span)
     return DrawnCharts(data, still, base)
+
+
+def _drawable(values: Array) -> Array:
+    """Return values with those beyond +-1e100 there, so that no scale overflows."""
+    return np.where(np.isfinite(values), np.clip(values, -_LARGEST, _LARGEST), values)
 
 
 def onset_within(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[float | None, tuple[float, float] | None]:
@@ -315,8 +291,8 @@ def events(diagnosis: Diagnosis, span: tuple[float, float], marks: Sequence[Mark
 
 
 def still_chart(chart: Chart, t: Array, lines: list[Array], span: tuple[float, float]) -> dict[str, Any]:
-    """Return paths, ticks and scales of the still picture, in a box 860 wide and `chart.height` high."""
-    width, height = 860.0, float(chart.height)
+    """Return scale, paths and ticks of the still picture, in a box 860 wide and `chart.height` high."""
+    lines = [_drawable(line) for line in lines]
     stacked = np.concatenate(lines)
     finite = stacked[np.isfinite(stacked)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
@@ -327,41 +303,12 @@ def still_chart(chart: Chart, t: Array, lines: list[Array], span: tuple[float, f
     margin = 0.04 * (high - low)
     low, high = chart.limits or (low - margin, high + margin)
     lines = [np.clip(line, low, high) for line in lines]
-    start, stop = span if span[1] > span[0] else (span[0], span[0] + 1)
-
-    def across(seconds: Array) -> Array:
-        return (seconds - start) / (stop - start) * width
-
-    paths = []
-    for drawn_line, line in zip(chart.lines[: 1 if chart.band else None], lines, strict=False):
-        drawn = np.isfinite(line)
-        pen = drawn & ~np.append(False, drawn[:-1])
-        points = zip(pen[drawn], across(t)[drawn], height * (high - line[drawn]) / (high - low), strict=True)
-        steps = [f"{'M' if begins else 'L'}{x:.0f} {y:.0f}" for begins, x, y in points]
-        paths.append({"label": drawn_line.label, "style": drawn_line.style, "d": "".join(steps)})
-    band = ""
-    if chart.band:
-        there = np.isfinite(lines[1]) & np.isfinite(lines[2])
-        x = across(t)[there]
-        ends = [height * (high - line[there]) / (high - low) for line in lines[1:3]]
-        corners = [*zip(x, ends[1], strict=True), *zip(x[::-1], ends[0][::-1], strict=True)]
-        band = "".join(f"{'L' if k else 'M'}{a:.1f} {b:.1f}" for k, (a, b) in enumerate(corners)) + "Z" * bool(corners)
+    scale = Scale(860.0, float(chart.height), (span[0], span[1] if span[1] > span[0] else span[0] + 1), (low, high))
+    drawn = zip(chart.lines[: 1 if chart.band else None], lines, strict=False)
     return {
-        "paths": paths,
-        "band": band,
-        "level": None if chart.level is None or chart.level > high else height * (high - chart.level) / (high - low),
-        "width": width,
-        "height": height,
-        "x_ticks": [(float(across(np.asarray(v))), f"{v:g}") for v in ticks(start, stop, 8)],
-        "y_ticks": [(height - (v - low) / (high - low) * height, f"{v:g}") for v in ticks(low, high, 4)],
-        "scale": (start, width / (stop - start)),
+        "scale": scale,
+        "paths": [{"label": own.label, "style": own.style, "d": scale.path(t, line, 0)} for own, line in drawn],
+        "band": scale.band(t, *lines[1:3]) if chart.band else "",
+        "level": None if chart.level is None or chart.level > high else float(scale.y(chart.level)),
+        **scale.ticks(8, 4),
     }
-
-
-def ticks(low: float, high: float, about: int) -> list[float]:
-    """Return round values (1, 2 or 5 times a power of ten apart) between low and high, `about` so many."""
-    raw = (high - low) / about
-    power = 10.0 ** np.floor(np.log10(raw))
-    step = float(next(m for m in (1, 2, 5, 10) if m * power >= raw * 0.999) * power)
-    first = int(np.ceil(low / step - 1e-9))
-    return [float(f"{i * step:.12g}") for i in range(first, int(np.floor(high / step + 1e-9)) + 1)]

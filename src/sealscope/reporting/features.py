@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,8 +21,7 @@ WINDOW, STEP = 1000, 500
 HALF_WINDOWS = 10
 
 
-@dataclass(frozen=True)
-class ChamberDetails:
+class ChamberDetails(NamedTuple):
     """d1..d4 and d3d4 of one chamber's pressure.
 
     `values`: name -> (n,) over the whole recording, NaN where the transform would touch an end or a fault of the data;
@@ -37,8 +36,7 @@ class ChamberDetails:
     window_rms: dict[str, Array]
 
 
-@dataclass(frozen=True)
-class DetailChange:
+class DetailChange(NamedTuple):
     """RMS of one detail before and after, in the channel's unit (d3d4: its square); `percent` as in the thesis."""
 
     channel: str
@@ -73,8 +71,7 @@ def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails 
             f"No details of {channel}: they need {needed} samples without a fault, the most there are is {longest}.",
         )
     values = {name: np.full(n, np.nan) for name in NAMES}
-    window_t: list[Array] = []
-    window_rms: dict[str, list[Array]] = {name: [] for name in NAMES}
+    windows: list[tuple[Array, Array]] = []  # centres (w,), RMS (details, w) of each stretch
     for part in usable:
         try:
             transformed = details(series[part], levels=LEVELS)
@@ -83,38 +80,28 @@ def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails 
             products = windowed_rms(product[inside], WINDOW, STEP).rms
         except InputError as error:  # such as pressures of 1e300, whose squares overflow
             return None, f"No details of {channel}: {error}."
-        for level, name in enumerate(NAMES[:LEVELS], start=1):
-            _place(values[name], transformed[level], transformed.inside(level), part)
-        _place(values[PRODUCT], product, transformed.inside(3, 4), part)
-        if not ends.size:
-            continue
-        lines = [*levels, products]
-        centres = t[part.start] + (ends - WINDOW / 2) / recording.rate
-        if window_t:  # a point without a value parts two stretches
-            window_t.append(centres[:1])
-            for name in NAMES:
-                window_rms[name].append(np.array([np.nan]))
-        window_t.append(centres)
-        for name, line in zip(NAMES, lines, strict=True):
-            window_rms[name].append(line)
+        placed = [(name, transformed[level], transformed.inside(level)) for level, name in enumerate(NAMES[:LEVELS], 1)]
+        for name, own, where in (*placed, (PRODUCT, product, transformed.inside(3, 4))):
+            values[name][part.start + where.start : part.start + where.stop] = own[where]
+        if ends.size:
+            centres = t[part.start] + (ends - WINDOW / 2) / recording.rate
+            if windows:  # a point without a value parts two stretches
+                windows.append((centres[:1], np.full((len(NAMES), 1), np.nan)))
+            windows.append((centres, np.vstack([*levels, products])))
     notes = []
     left_out = n - sum(part.stop - part.start for part in usable)
     if left_out:
         pieces = f"{len(usable)} stretch{'es' if len(usable) > 1 else ''}"
         notes.append(f"{channel}: the details are of {pieces} without a fault; {left_out} of {n} samples are left out.")
-    if not window_t:
+    if not windows:
         notes.append(f"{channel} has no stretch long enough for an RMS window of {WINDOW} samples.")
-    joined = {name: np.concatenate(lines) if lines else np.empty(0) for name, lines in window_rms.items()}
-    centres = np.concatenate(window_t) if window_t else np.empty(0)
-    return ChamberDetails(channel, recording.units[channel], values, centres, joined), " ".join(notes)
+        windows.append((np.empty(0), np.empty((len(NAMES), 0))))
+    window_t, rows = (np.concatenate(parts, axis=-1) for parts in zip(*windows, strict=True))
+    window_rms = dict(zip(NAMES, rows, strict=True))
+    return ChamberDetails(channel, recording.units[channel], values, window_t, window_rms), " ".join(notes)
 
 
-def _place(whole: Array, series: Array, inside: slice, part: slice) -> None:
-    whole[part.start + inside.start : part.start + inside.stop] = series[inside]
-
-
-@dataclass(frozen=True)
-class Parts:
+class Parts(NamedTuple):
     """The two parts of a recording whose RMS are compared, t < `end` and t >= `start` [s]; their names; why these."""
 
     end: float

@@ -38,12 +38,11 @@ def number(value: float | None, digits: int = 3) -> str:
         return ABSENT
     if not isfinite(value):
         return "∞" if value > 0 else "−∞"
-    if value == 0 or 1e-6 <= abs(value) < 1e9:
-        places = max(0, digits - 1 - floor(log10(abs(value)))) if value else 0
+    text = f"{value:.{digits}g}"
+    if 1e-6 <= abs(value) < 1e9:
+        places = max(0, digits - 1 - floor(log10(abs(value))))
         text = f"{value:.{places}f}"
         text = text.rstrip("0").rstrip(".") if "." in text else text
-    else:
-        text = f"{value:.{digits}g}"
     return text.replace("-", "−")
 
 
@@ -51,12 +50,11 @@ def clock(seconds: float | None) -> str:
     """Return a time in seconds (one decimal, more below 10 s), from an hour on as h:mm:ss as well."""
     if seconds is None or not isfinite(seconds):
         return ABSENT
-    text = (f"{seconds:.1f} s" if abs(seconds) >= 10 else f"{seconds:.3g} s").replace("-", "−")
-    if abs(seconds) < 3600:
-        return text
-    whole = int(abs(seconds))
-    sign = "−" if seconds < 0 else ""
-    return f"{text} ({sign}{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d})"
+    text = f"{seconds:.1f} s" if abs(seconds) >= 10 else f"{seconds:.3g} s"
+    if abs(seconds) >= 3600:
+        whole = int(abs(seconds))
+        text += f" ({'-' * (seconds < 0)}{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d})"
+    return text.replace("-", "−")
 
 
 def headline(diagnosis: Diagnosis) -> str:
@@ -104,16 +102,17 @@ def how_much(diagnosis: Diagnosis) -> str | None:
             return _say("how_much.at_most", high=number(interval[1], 2))
         return None
     if leak is None:
-        own = diagnosis.severity
-        share = "" if own is None or own.pump_share is None else f"{_of_the_pump(own.pump_share[0])}; "
-        return share + _why_no_flow(diagnosis)
+        share = _pump_share(diagnosis)
+        return _why_no_flow(diagnosis) if share is None else f"{share}; {_why_no_flow(diagnosis)}"
     if interval is None:
         return f"{number(leak)} L/min"
     return _say("how_much.interval", leak=number(leak), low=number(interval[0]), high=number(interval[1]))
 
 
-def _of_the_pump(share: float) -> str:
-    return f"{_percent(share)} of the pump's flow in this duty"
+def _pump_share(diagnosis: Diagnosis) -> str | None:
+    own = diagnosis.severity
+    known = own is not None and own.pump_share is not None
+    return f"{_percent(own.pump_share[0])} of the pump's flow in this duty" if known else None  # type: ignore[union-attr, index]
 
 
 def _why_no_flow(diagnosis: Diagnosis) -> str:
@@ -155,7 +154,9 @@ def how_bad(diagnosis: Diagnosis) -> str | None:
         low, high = own.of_limit[1:]
         share = f"{_span(low, high)} times" if high >= 10.0 else f"{_span(100.0 * low, 100.0 * high)} % of"
         return _say(f"how_bad.{own.level}", share=share, limit=f"{limit}{'' if limit.stated else ', the default'}")
-    return _say("how_bad.no_area", limit=limit) if limit.stated else _pump_share(diagnosis)
+    if limit.stated:
+        return _say("how_bad.no_area", limit=limit)
+    return None if diagnosis.leak_lpm is None else _pump_share(diagnosis)
 
 
 def _span(low: float, high: float) -> str:
@@ -172,16 +173,10 @@ def other_sizes(diagnosis: Diagnosis) -> str | None:
     creep = own.creep_mm_per_min
     parts = [
         None if own.mL_per_min is None else f"{number(own.mL_per_min[0], 2)} mL/min",
-        _pump_share(diagnosis),
+        None if diagnosis.leak_lpm is None else _pump_share(diagnosis),
         None if creep is None else f"as much as a piston that creeps by {number(creep[0], 2)} mm/min",
     ]
     return "; ".join(part for part in parts if part) or None
-
-
-def _pump_share(diagnosis: Diagnosis) -> str | None:
-    own = diagnosis.severity
-    known = own is not None and own.pump_share is not None and diagnosis.leak_lpm is not None
-    return _of_the_pump(own.pump_share[0]) if known else None  # type: ignore[union-attr, index]
 
 
 def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:

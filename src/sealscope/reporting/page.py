@@ -16,13 +16,16 @@ from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.errors import InputError
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Recording
-from sealscope.reporting import card, charts, features, messages, printing, template
+from sealscope.reporting import charts, features, messages, printing, template
 from sealscope.reporting.charts import Mark
 from sealscope.reporting.particulars import particulars_of
 from sealscope.reporting.schematic import Circuit, circuit_of, columns_of, schematic
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
+
+#: Size of a card, and height of the curve on it, in pixels.
+WIDTH, HEIGHT, _CURVE_HEIGHT = 1200, 630, 190
 
 
 @checked_call
@@ -81,46 +84,64 @@ def write_page(
     >>> page.read_text(encoding="utf-8")[:15]
     '<!DOCTYPE html>'
     """
-    from sealscope.parameters import load_rig
-
     target = template.check_page(path)
-    known_rig = _rig_of(diagnosis) if rig is None else load_rig(rig)
+    options: dict[str, Any] = {"rig": rig, "marks": marks, "truth_onset_s": truth_onset_s, "title": title}
     if target.suffix.lower() == ".png":
-        _check_samples(recording)
-        all_marks = _all_marks(marks, truth_onset_s)
-        picture = card.render_card(recording, diagnosis, rig=known_rig, marks=all_marks, title=title)
-        printing.draw_page(picture, target, card.WIDTH, card.HEIGHT)
+        printing.draw_page(render_card(recording, diagnosis, **options), target, WIDTH, HEIGHT)
         return target
-    page = render_page(
-        recording,
-        diagnosis,
-        rig=known_rig,
-        marks=marks,
-        truth_onset_s=truth_onset_s,
-        truth_leak_lpm=truth_leak_lpm,
-        title=title,
-        pressure_unit=pressure_unit,
-    )
+    page = render_page(recording, diagnosis, truth_leak_lpm=truth_leak_lpm, pressure_unit=pressure_unit, **options)
     return template.write(target, page)
 
 
-def _rig_of(diagnosis: Diagnosis) -> Rig | None:
-    """Return the rig that the diagnosis states, by the call or by the recording; None where nobody stated one."""
+def _rig_of(diagnosis: Diagnosis, rig: Rig | str | os.PathLike[str] | None) -> Rig | None:
+    """Return the rig of the call, else the one that the diagnosis states; None where nobody stated one."""
     from sealscope.parameters import load_rig, rig_names
 
+    if rig is not None:
+        return load_rig(rig)
     machine = diagnosis.machine
     known = machine is not None and machine.stated_by != "nobody" and machine.rig in rig_names()
     return load_rig(machine.rig) if known and machine is not None else None
 
 
-def _check_samples(recording: Recording) -> None:
+def _all_marks(recording: Recording, marks: Sequence[Mark], truth_onset_s: float | None) -> list[Mark]:
+    """Return the marks of a page; raise InputError where there is nothing to report."""
     if len(recording) == 0:
         raise InputError("recording must have at least 1 sample to be reported, got 0")
+    return [*marks, *([] if truth_onset_s is None else [Mark(float(truth_onset_s), "true onset", known=True)])]
 
 
-def _all_marks(marks: Sequence[Mark], truth_onset_s: float | None) -> tuple[Mark, ...]:
-    known = () if truth_onset_s is None else (Mark(float(truth_onset_s), "true onset", known=True),)
-    return (*marks, *known)
+def render_card(
+    recording: Recording,
+    diagnosis: Diagnosis,
+    *,
+    rig: Rig | str | os.PathLike[str] | None = None,
+    marks: Sequence[Mark] = (),
+    truth_onset_s: float | None = None,
+    title: str | None = None,
+) -> str:
+    """Return the card as HTML of `WIDTH` x `HEIGHT` pixels; arguments as for `write_page`."""
+    all_marks = _all_marks(recording, marks, truth_onset_s)
+    particulars = particulars_of(recording, _rig_of(diagnosis, rig))
+    name = Path(diagnosis.file).name
+    chart = next(iter(charts.course_charts(diagnosis, height=_CURVE_HEIGHT)), None)
+    still, span = None, (float(recording.t[0]), float(recording.t[-1]))
+    if chart is not None and diagnosis.course is not None:
+        still = charts.still_chart(chart, diagnosis.course.t, [line.values for line in chart.lines], span)
+    subtitle = (name, particulars.get("Operator"), particulars.get("Oil temperature"))
+    return template.render(
+        "card.html.j2",
+        d=diagnosis,
+        messages=messages,
+        title=title or particulars.get("Machine", name),
+        date=particulars.get("Date", ""),
+        subtitle=" · ".join(text for text in subtitle if text),
+        chart=chart,
+        still=still,
+        events=charts.events(diagnosis, span, all_marks),
+        width=WIDTH,
+        height=HEIGHT,
+    )
 
 
 @np.errstate(all="ignore")  # what overflows is not drawn
@@ -138,11 +159,7 @@ def render_page(
     """Return the page as a string of HTML; arguments and errors as for `write_page`."""
     from markupsafe import Markup
 
-    from sealscope.parameters import load_rig
-
-    _check_samples(recording)
-    known_rig = _rig_of(diagnosis) if rig is None else load_rig(rig)
-    all_marks = list(_all_marks(marks, truth_onset_s))
+    known_rig, all_marks = _rig_of(diagnosis, rig), _all_marks(recording, marks, truth_onset_s)
     details = [features.chamber_details(recording, name) for name in CHAMBERS]
     chambers = [chamber for chamber, _ in details if chamber is not None]
     shown = [
@@ -152,9 +169,7 @@ def render_page(
         *charts.detail_charts(chambers, pressure_unit),
     ]
     drawn = charts.draw(recording, chambers, shown, diagnosis, all_marks)
-    uplot_js, charts_js = template.packaged("vendor/uPlot.iife.min.js"), template.packaged("templates/charts.js")
     circuit = circuit_of(known_rig, recording)
-    particulars = particulars_of(recording, known_rig)
     facts = f"{len(recording)} samples at {recording.rate:g} Hz, {messages.clock(recording.duration)}"
     return template.render(
         "page.html.j2",
@@ -162,7 +177,7 @@ def render_page(
         messages=messages,
         title=title or Path(diagnosis.file).name,
         subtitle=f"{diagnosis.file} · {facts}",
-        particulars=particulars,
+        particulars=particulars_of(recording, known_rig),
         known=_known(diagnosis, truth_onset_s, truth_leak_lpm),
         marks=all_marks,
         charts=shown,
@@ -173,12 +188,7 @@ def render_page(
         recording=recording,
         channels=[_summary(recording, name, pressure_unit) for name in recording.channels],
         provenance=list(_flat(recording.provenance)),
-        uplot_license=str(template.packaged("vendor/uPlot.LICENSE")),
-        uplot_css=template.packaged("vendor/uPlot.min.css"),
-        uplot_js=uplot_js,
-        charts_js=charts_js,
-        script_hashes=Markup(" ").join(template.script_hash(code) for code in (uplot_js, charts_js)),
-        chart_data=template.script_json(drawn.data),
+        chart_data=drawn.data if shown else None,
         **_evidence(recording, diagnosis, drawn, shown, all_marks),
         **_changes(recording, diagnosis, chambers, pressure_unit),
     )
@@ -203,9 +213,9 @@ def _known(diagnosis: Diagnosis, truth_onset_s: float | None, truth_leak_lpm: fl
     known = []
     if truth_onset_s is not None:
         known.append(f"the leak begins at {messages.clock(truth_onset_s)}")
-        if diagnosis.onset_s is not None:
-            late = diagnosis.onset_s - truth_onset_s
-            known.append(f"the onset found is {abs(late):.1f} s {'late' if late >= 0 else 'early'}")
+    if truth_onset_s is not None and diagnosis.onset_s is not None:
+        late = diagnosis.onset_s - truth_onset_s
+        known.append(f"the onset found is {abs(late):.1f} s {'late' if late >= 0 else 'early'}")
     if truth_leak_lpm is not None:
         known.append(f"the leak is {messages.number(truth_leak_lpm)} L/min on average")
     return "; ".join(known)

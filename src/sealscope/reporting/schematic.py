@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Container
-from dataclasses import dataclass
 from math import sqrt
-from typing import Any
+from typing import Any, NamedTuple
 
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.parameters import Rig
 from sealscope.recordings.recording import CHANNEL_UNITS, Recording
 from sealscope.reporting import messages, template
 
-#: Parameters of the rig that the page names: symbol, unit shown, SI per unit.
+#: Values of the rig that the page names: parameter, unit shown, SI per unit.
 _VALUES = {
-    "cylinder.A_A": ("A_A", "mm²", 1e-6),
-    "cylinder.A_B": ("A_B", "mm²", 1e-6),
-    "cylinder.L": ("L", "mm", 1e-3),
-    "pump.q_b": ("q_b", "cm³/rev", 1e-6),
-    "line.closed_A": ("closed_A", "%", 1e-2),
-    "line.closed_B": ("closed_B", "%", 1e-2),
+    "A_A": ("cylinder.A_A", "mm²", 1e-6),
+    "A_B": ("cylinder.A_B", "mm²", 1e-6),
+    "L": ("cylinder.L", "mm", 1e-3),
+    "q_b": ("pump.q_b", "cm³/rev", 1e-6),
+    "closed_A": ("line.closed_A", "%", 1e-2),
+    "closed_B": ("line.closed_B", "%", 1e-2),
 }
 #: Two areas that differ by more have the rod on one side only; by less, two rods that are not quite alike.
 _ALIKE = 0.95
@@ -27,47 +26,23 @@ _ALIKE = 0.95
 _BORE, _ROD = 78.0, 18.0
 
 
-@dataclass(frozen=True)
-class Circuit:
+class Circuit(NamedTuple):
     """What is drawn of a machine.
 
-    `rods`: the sides that the rod leaves, "A", "B" or "AB"; `rod`: its height in the drawing, of a single rod in
-    proportion to the bore: sqrt(1 - A_small / A_large); `throttles`, `make_up`, `bypass`: whether the lines have them;
-    `known`: whether a rig says so; `values`: symbol -> value with its unit, "" where it is not known; `valve`: whether
-    a servo valve drives it.
+    `cylinder`: its kind in words; `rods`: the sides that the rod leaves, "A", "B" or "AB"; `rod`: its height in the
+    drawing, of a single rod in proportion to the bore: sqrt(1 - A_small / A_large); `throttles`, `make_up`, `bypass`:
+    whether the lines have them; `valve`: whether a servo valve drives it; `values`: symbol -> value with its unit, ""
+    where it is not known.
     """
 
+    cylinder: str
     rods: str
     rod: float
     throttles: bool
     make_up: bool
     bypass: bool
-    known: bool
+    valve: bool
     values: dict[str, str]
-    valve: bool = False
-
-    @property
-    def cylinder(self) -> str:
-        """The cylinder in words."""
-        return "cylinder" if not self.known else "double-rod cylinder" if self.rods == "AB" else "single-rod cylinder"
-
-    @property
-    def text(self) -> str:
-        """The circuit in sentences, for who does not see the drawing."""
-        if self.valve:
-            drive = f"A servo valve joins the chambers A and B of a {self.cylinder} to a supply and a return."
-            rod = "" if self.rods == "AB" else f" The rod leaves chamber {self.rods}."
-            return f"{drive}{rod} A motor turns the supply's pump at a constant speed."
-        parts = ["A servo motor turns a bidirectional pump of fixed displacement."]
-        ends = f"Its ports 1 and 2 feed the chambers A and B of a {self.cylinder} through a line each"
-        parts.append(f"{ends}, with a one-way throttle in each line." if self.throttles else f"{ends}.")
-        if self.rods != "AB":
-            parts.append(f"The rod leaves chamber {self.rods}.")
-        if self.make_up:
-            parts.append("An accumulator feeds each line through a check valve.")
-        if self.bypass:
-            parts.append("A bypass with needle valve and flow meter joins the two lines.")
-        return " ".join(parts)
 
 
 def circuit_of(rig: Rig | None, recorded: Container[str]) -> Circuit:
@@ -77,20 +52,21 @@ def circuit_of(rig: Rig | None, recorded: Container[str]) -> Circuit:
     """
     bypass = "q_leak" in recorded
     if rig is None:
-        return Circuit("AB", _ROD, False, False, bypass, False, dict.fromkeys((v[0] for v in _VALUES.values()), ""))
-    values = {
-        label: f"{messages.number(float(rig[name]) / size)} {unit}" for name, (label, unit, size) in _VALUES.items()
-    }
-    areas = {"A": rig.cylinder.A_A, "B": rig.cylinder.A_B}
-    side = min(areas, key=lambda name: areas[name])
-    ratio = areas[side] / max(areas.values())
-    throttles = rig.line.orifices == "present" or max(rig.line.closed_A, rig.line.closed_B) > 0
-    make_up = rig.makeup.check_valves == "present"
-    valve = rig.valve.spool == "present"
-    if ratio > _ALIKE:
-        return Circuit("AB", _ROD, throttles, make_up, bypass, True, values, valve)
+        return Circuit("cylinder", "AB", _ROD, False, False, bypass, False, dict.fromkeys(_VALUES, ""))
+    areas = rig.cylinder.A_A, rig.cylinder.A_B
+    ratio = min(areas) / max(areas)
     rod = round(min(0.8, sqrt(1.0 - ratio)) * _BORE, 1)
-    return Circuit(side, rod, throttles, make_up, bypass, True, values, valve)
+    single = ("single-rod cylinder", "A" if areas[0] <= areas[1] else "B", rod)
+    return Circuit(
+        *(("double-rod cylinder", "AB", _ROD) if ratio > _ALIKE else single),
+        throttles=rig.line.orifices == "present" or max(rig.line.closed_A, rig.line.closed_B) > 0,
+        make_up=rig.makeup.check_valves == "present",
+        bypass=bypass,
+        valve=rig.valve.spool == "present",
+        values={
+            label: f"{messages.number(float(rig[name]) / size)} {unit}" for label, (name, unit, size) in _VALUES.items()
+        },
+    )
 
 
 def schematic(recording: Recording, diagnosis: Diagnosis, circuit: Circuit) -> str:

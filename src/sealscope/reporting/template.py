@@ -6,6 +6,7 @@ import json
 import os
 import re
 from base64 import b64encode
+from collections.abc import Sequence
 from functools import cache
 from hashlib import sha256
 from importlib import metadata, resources
@@ -29,22 +30,27 @@ _SUFFIXES = (".html", ".htm", ".pdf", ".png")
 def _environment() -> jinja2.Environment:
     import jinja2
 
-    return jinja2.Environment(
+    environment = jinja2.Environment(
         loader=jinja2.PackageLoader("sealscope.reporting"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
     )
+    environment.globals |= {"packaged": packaged, "version": _version()}
+    environment.filters |= {"script_hash": _script_hash, "script_json": _script_json}
+    return environment
 
 
-def render(template: str, **context: Any) -> str:
-    """Return a template of this package filled in; beside `context` it sees `version` and `page_css`.
+def render(template: str, *, chart_data: Any = None, scripts: Sequence[str] = (), **context: Any) -> str:
+    """Return a template of this package filled in.
 
+    `scripts`: files of this package that the page runs; with `chart_data`, plain JSON values, those of the charts.
     Control characters that a file's name or description brought are replaced.
     """
-    page_css = packaged("templates/page.css")
-    page = _environment().get_template(template).render(context, version=_version(), page_css=page_css)
-    return _CONTROLS.sub("\N{REPLACEMENT CHARACTER}", page)
+    names = scripts if chart_data is None else ("vendor/uPlot.iife.min.js", "templates/charts.js", *scripts)
+    page = _environment().get_template(template)
+    text = page.render(context, chart_data=chart_data, scripts=[packaged(name) for name in names])
+    return _CONTROLS.sub("\N{REPLACEMENT CHARACTER}", text)
 
 
 def packaged(name: str) -> Markup:
@@ -54,14 +60,14 @@ def packaged(name: str) -> Markup:
     return Markup((resources.files("sealscope.reporting") / name).read_text(encoding="utf-8"))
 
 
-def script_hash(code: str) -> Markup:
+def _script_hash(code: str) -> Markup:
     """Return the source of a script as a content security policy names it."""
     from markupsafe import Markup
 
     return Markup(f"'sha256-{b64encode(sha256(code.encode()).digest()).decode()}'")
 
 
-def script_json(value: Any) -> Markup:
+def _script_json(value: Any) -> Markup:
     """Return plain JSON values as they stand inside an element `script`: no sign of them ends it."""
     from markupsafe import Markup
 

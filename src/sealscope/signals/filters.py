@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
@@ -88,35 +87,3 @@ def whole_number(value: object, name: str, unit: str = "") -> int:
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
         raise InputError(f"{name} must be a whole number >= 1{unit}, got {value!r}")
     return int(value)
-
-
-def saved_part(state: Any, name: str, what: str) -> Any:
-    """Return a part of the saved state of `what`; raises InputError where it is missing."""
-    if not isinstance(state, Mapping):
-        raise InputError(f"saved {what} must be a mapping, as state_dict returns it, got {type(state).__name__}")
-    if name not in state:
-        raise InputError(f"saved {what} must have {name!r}, got {', '.join(map(str, state)) or 'nothing'}")
-    return state[name]
-
-
-def saved_count(state: Any, name: str, what: str) -> int:
-    """Return a whole number >= 0 of the saved state of `what`; raises InputError for anything else."""
-    value = saved_part(state, name, what)
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
-        raise InputError(f"saved {what}'s {name} must be a whole number >= 0, got {value!r}")
-    return int(value)
-
-
-def saved_array(state: Any, name: str, shape: tuple[int, ...], what: str, kind: Any = np.float64) -> Any:
-    """Return a part of the saved state of `what` as an array of that shape and kind; raises InputError."""
-    value = saved_part(state, name, what)
-    try:
-        array = np.asarray(value)
-        if array.size and array.dtype.kind not in {"f": "fi", "i": "i", "b": "b"}[np.dtype(kind).kind]:
-            raise TypeError(f"got {array.dtype}")
-        array = array.astype(kind)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"saved {what}'s {name} must hold numbers of type {np.dtype(kind)}: {error}") from None
-    if array.shape != shape:
-        raise InputError(f"saved {what}'s {name} must have shape {shape}, got {array.shape}")
-    return array

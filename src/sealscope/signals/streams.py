@@ -21,11 +21,9 @@ from sealscope.signals.filters import (
     checked_levels,
     decomposition_filters,
     reach,
-    saved_array,
-    saved_count,
-    saved_part,
     whole_number,
 )
+from sealscope.storage.plain_state import count_of, numbers_of, part_of
 
 if TYPE_CHECKING:
     from concurrent.futures import ThreadPoolExecutor
@@ -176,13 +174,12 @@ class DetailStream:
     @classmethod
     def from_state(cls, state: dict[str, Any], *, threads: int = 1) -> DetailStream:
         """Return the stream that `state_dict` described, bit for bit; raises InputError for a wrong state."""
-        what = "detail stream"
-        channels, levels, wavelet = (saved_part(state, name, what) for name in ("channels", "levels", "wavelet"))
+        channels, levels, wavelet = (part_of(state, name, object) for name in ("channels", "levels", "wavelet"))
         table = tuple(channels) if isinstance(channels, list) else channels
         stream = cls(table, levels, wavelet=wavelet, threads=threads)
         shape = (stream._table[0], stream.levels, stream._history, stream._table[1])
-        history = saved_array(state, "history", shape, what)
-        stream.samples = saved_count(state, "samples", what)
+        history = numbers_of(state, "history", shape)
+        stream.samples = count_of(state, "samples")
         groups, width = stream.buffers.shape[0], stream.buffers.shape[-1]
         lanes = np.pad(history, [(0, 0)] * 3 + [(0, groups * width - shape[-1])]).reshape(*shape[:3], groups, width)
         stream.buffers[:, :, :, : stream._history] = np.moveaxis(lanes, -2, 0)

@@ -20,11 +20,9 @@ from sealscope.signals.filters import (
     Array,
     IntArray,
     finite_array,
-    saved_array,
-    saved_count,
-    saved_part,
     whole_number,
 )
+from sealscope.storage.plain_state import count_of, numbers_of, part_of
 
 WINDOW_SIZE = 1000
 WINDOW_STEP = 500
@@ -169,19 +167,16 @@ class RmsStream:
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> RmsStream:
         """Return the stream that `state_dict` described; raises InputError for a wrong state."""
-        what = "RMS stream"
-        size, step = (saved_part(state, name, what) for name in ("size", "step"))
-        stream = cls(size, step, skip=saved_count(state, "skip", what))
-        stream._next_end = saved_count(state, "next_end", what)
-        stream._ahead = saved_count(state, "ahead", what)
-        rest, sums = saved_part(state, "rest", what), saved_part(state, "sums", what)
+        size, step, rest, sums = (part_of(state, name, object) for name in ("size", "step", "rest", "sums"))
+        stream = cls(size, step, skip=count_of(state, "skip"))
+        stream._next_end, stream._ahead = count_of(state, "next_end"), count_of(state, "ahead")
         if rest is None and sums is None:
             return stream
         lead = np.shape(rest)[:-1]
         if rest is None or sums is None or lead != np.shape(sums)[:-1]:
-            raise InputError("saved RMS stream must have rest and sums of the same leading axes, got others")
-        stream._rest = saved_array(state, "rest", np.shape(rest), what)
-        stream._sums = saved_array(state, "sums", np.shape(sums), what)
+            raise InputError("saved state must have rest and sums of the same leading axes, got others")
+        stream._rest = numbers_of(state, "rest", np.shape(rest))
+        stream._sums = numbers_of(state, "sums", np.shape(sums))
         return stream
 
 

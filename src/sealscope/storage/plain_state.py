@@ -61,6 +61,27 @@ def part_of(state: Any, name: str, kind: type | tuple[type, ...]) -> Any:
     return value
 
 
+def count_of(state: Any, name: str) -> int:
+    """Return a whole number >= 0 of a saved state; raises InputError for anything else."""
+    value = part_of(state, name, object)
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
+        raise InputError(f"saved state's {name} must be a whole number >= 0, got {value!r}")
+    return int(value)
+
+
+def numbers_of(state: Any, name: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return numbers of this shape that a saved state holds as they are; raises InputError for anything else."""
+    try:
+        values = np.asarray(part_of(state, name, object))
+        if values.size and values.dtype.kind not in "fi":
+            raise TypeError(f"got {values.dtype}")
+    except (TypeError, ValueError) as error:
+        raise InputError(f"saved state's {name} must hold numbers: {error}") from None
+    if values.shape != shape:
+        raise InputError(f"saved state's {name} must have shape {shape}, got {values.shape}")
+    return values.astype(np.float64)
+
+
 def saved(owner: Any, names: Iterable[str]) -> dict[str, Any]:
     """Return attributes as plain values, for `recall`: arrays, numbers, texts, tuples; null for what is not finite."""
     state = {}

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import numpy as np
 
@@ -19,49 +19,19 @@ from sealscope.campaigns.results import CampaignResult
 from sealscope.diagnosis.registry import detectors
 from sealscope.evaluation.roc import Area
 from sealscope.evaluation.table import SummaryRow
+from sealscope.recordings.channels import Array
 from sealscope.reporting import template
-from sealscope.reporting.campaign.curves import CurvePlot, PlotCurve, draw
 from sealscope.reporting.campaign.tables import cause_tables, page_tables, percent
+from sealscope.reporting.picture import Scale
 
 PAGE = "report.html"
 #: More sizes than this are shown together: a column for each could not be read.
 _MOST_SIZES = 8
-_CURVE_POINTS = 120
+#: Size of a picture; points of a fitted curve, of any curve at most, and of fractions at most.
+WIDTH, HEIGHT = 460.0, 300.0
+_CURVE_POINTS, _MOST_DRAWN, _MOST_POINTS = 120, 400, 60
 #: Detectors that the result names in words, the best of them.
 _MOST_SAID = 3
-
-
-@dataclass(frozen=True)
-class DetectorLine:
-    """One detector's line of the main table, as text; `given`: what it knew beside the record."""
-
-    detector: str
-    given: str
-    false_alarm: str
-    cells: tuple[str, ...]
-    area: str
-    a90: str
-    a90_95: str
-    reference: bool
-
-
-@dataclass(frozen=True)
-class DetectorSection:
-    """One detector's curves and cells."""
-
-    name: str
-    about: str
-    plots: tuple[CurvePlot, ...]
-    areas: tuple[tuple[str, str], ...]
-    cells: tuple[tuple[str, ...], ...]
-    cell_columns: tuple[str, ...]
-
-
-def _within(size: float, largest: float) -> str:
-    """Return a size from a curve as text; beyond the sizes that were tested only that it lies there."""
-    if math.isnan(size):
-        return "–"
-    return f"{size:.3g}" if size <= largest else f"> {largest:.3g}"
 
 
 def _area(area: Area) -> str:
@@ -74,33 +44,25 @@ def sizes_of(judgement: Judgement) -> list[float]:
     return sizes if 0 < len(sizes) <= _MOST_SIZES else [math.nan]
 
 
-def lines_of(result: CampaignResult) -> list[DetectorLine]:
-    """Return the main table: detectors in the plan's order, then the one that always and the one that never fires."""
+def main_table(result: CampaignResult) -> tuple[list[str], list[list[str]]]:
+    """Return heads and rows: detectors in the plan's order, then the one that always and the one that never fires."""
     judgement = result.judgement
     sizes = sizes_of(judgement)
     rows = judgement.overall if math.isnan(sizes[0]) else judgement.table
-    by_detector: dict[str, list[SummaryRow]] = {}
+    by_detector: dict[str, dict[str, SummaryRow]] = defaultdict(dict)
     for row in rows:
-        by_detector.setdefault(row.detector, []).append(row)
+        by_detector[row.detector][f"{row.leak_lpm}"] = row
     pods = {pod.detector: pod for pod in judgement.pods}
-    areas = {roc.detector: roc.area for roc in judgement.rocs if math.isnan(roc.leak_lpm)}
-    lines = []
+    areas = {roc.detector: _area(roc.area) for roc in judgement.rocs if math.isnan(roc.leak_lpm)}
+    table = []
     for name, own in by_detector.items():
-        by_size = {_key(row.leak_lpm): row for row in own}
-        pod = pods.get(name)
-        lines.append(
-            DetectorLine(
-                name,
-                _given(result.known.get(name)),
-                percent(own[0].false_alarm),
-                tuple(percent(by_size[_key(size)].detection) if _key(size) in by_size else "–" for size in sizes),
-                _area(areas[name]) if name in areas else "–",
-                _of_curve(pod, "a90"),
-                _of_curve(pod, "a90_95"),
-                pod is None,
-            )
-        )
-    return lines
+        cells = [percent(own[f"{size}"].detection) if f"{size}" in own else "–" for size in sizes]
+        given = [_given(result.known.get(name))] if result.known else []
+        alarms = percent(next(iter(own.values())).false_alarm)
+        table.append([name, *given, alarms, *cells, areas.get(name, "–"), *_smallest(pods.get(name))])
+    of_sizes = ["any leak" if math.isnan(size) else f"{size:g} {result.plan.unit}" for size in sizes]
+    given = ["given"] if result.known else []
+    return ["detector", *given, "false alarms", *of_sizes, "AUC, any leak", "a90", "a90/95"], table
 
 
 def _given(known: PriorKnowledge | None) -> str:
@@ -110,20 +72,16 @@ def _given(known: PriorKnowledge | None) -> str:
     return ", ".join(word for word, given in (("true onset", known.onset), ("rig", known.rig)) if given) or "–"
 
 
-def _of_curve(pod: DetectorPod | None, name: Literal["a90", "a90_95"]) -> str:
+def _smallest(pod: DetectorPod | None) -> tuple[str, str]:
+    """Return a90 and a90/95; beyond the sizes that were tested only that they lie there."""
     if pod is None or pod.curve is None:
-        return "–"
-    size = pod.curve.a90 if name == "a90" else pod.curve.a90_95
-    return _within(size, max(tested.size for tested in pod.sizes))
-
-
-def _key(size: float) -> str:
-    return "any" if math.isnan(size) else repr(size)
-
-
-def _heads(result: CampaignResult) -> list[str]:
-    sizes = sizes_of(result.judgement)
-    return ["any leak" if math.isnan(size) else f"{size:g} {result.plan.unit}" for size in sizes]
+        return "–", "–"
+    largest = max(tested.size for tested in pod.sizes)
+    a90, a90_95 = (
+        "–" if math.isnan(size) else f"{size:.3g}" if size <= largest else f"> {largest:.3g}"
+        for size in (pod.curve.a90, pod.curve.a90_95)
+    )
+    return a90, a90_95
 
 
 def result_text(result: CampaignResult) -> str:
@@ -152,23 +110,13 @@ def result_text(result: CampaignResult) -> str:
 
 def campaign_text(result: CampaignResult) -> str:
     """Return the main table as plain text."""
-    lines = lines_of(result)
-    given = [] if not result.known else ["given"]
-    heads = ["detector", *given, "false alarms", *_heads(result), "AUC, any leak", "a90", "a90/95"]
-    body = [
-        [line.detector, *([line.given] if given else []), line.false_alarm, *line.cells, line.area, line.a90,
-         line.a90_95]
-        for line in lines
-    ]  # fmt: skip
-    widths = [max(len(row[k]) for row in (heads, *body)) for k in range(len(heads))]
-    rows = [
-        "  ".join(
-            text.ljust(width) if k == 0 else text.rjust(width)
-            for k, (text, width) in enumerate(zip(row, widths, strict=True))
-        )
-        for row in (heads, *body)
-    ]
-    return "\n".join([result.plan.title, *(row.rstrip() for row in rows), *_notes(result)])
+    heads, rows = main_table(result)
+    widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
+    lines = []
+    for first, *others in (heads, *rows):
+        right = (text.rjust(width) for text, width in zip(others, widths[1:], strict=True))
+        lines.append("  ".join([first.ljust(widths[0]), *right]).rstrip())
+    return "\n".join([result.plan.title, *lines, *_notes(result)])
 
 
 def _notes(result: CampaignResult) -> list[str]:
@@ -249,27 +197,29 @@ def write_campaign_page(result: CampaignResult, path: Path, files: Sequence[str]
 
 def render_campaign_page(result: CampaignResult, files: Sequence[str] = ()) -> str:
     """Return the page as text, with nothing outside it but links to the tables beside it."""
-    judgement = result.judgement
+    judgement, plan = result.judgement, result.plan
+    heads, rows = main_table(result)
+    failed = [
+        (row.id, ", ".join(f"{name} {level}" for name, level in row.levels.items()), row.error)
+        for row in judgement.failed[:200]
+    ]
     return template.render(
         "campaign.html.j2",
-        title=result.plan.title,
-        name=result.plan.name,
-        heads=_heads(result),
-        unit=result.plan.unit,
-        lines=lines_of(result),
-        given=bool(result.known),
+        title=plan.title,
+        name=plan.name,
+        unit=plan.unit,
+        heads=heads,
+        rows=rows,
+        measured=[pod.detector for pod in judgement.pods],
         result=result_text(result),
         notes=_notes(result),
         facts=_facts(result),
-        sections=[_section(pod, judgement, result.plan.unit) for pod in judgement.pods],
-        tables=page_tables(judgement, result.plan.unit, getattr(result.plan, "part", "")),
+        sections=[_section(pod, judgement, plan.unit) for pod in judgement.pods],
+        tables=page_tables(judgement, plan.unit, getattr(plan, "part", "")),
         causes=cause_tables(judgement),
-        failed=[
-            (row.id, ", ".join(f"{k} {v}" for k, v in row.levels.items()), row.error) for row in judgement.failed[:200]
-        ],
+        failed=failed,
         failed_count=len(judgement.failed),
-        files=list(files),
-        campaign_css=template.packaged("templates/campaign.css"),
+        files=files,
     )
 
 
@@ -317,25 +267,27 @@ def _assumed(plan: SimulatedPlan) -> str:
     return f"{plan.assumed.name}, which differs from the rig: {', '.join(other[:6])}{more}"
 
 
-def _section(pod: DetectorPod, judgement: Judgement, unit: str) -> DetectorSection:
+def _section(pod: DetectorPod, judgement: Judgement, unit: str) -> dict[str, Any]:
+    """Return one detector's curves, areas and the table of its cells."""
     name = pod.detector
     rocs = [roc for roc in judgement.rocs if roc.detector == name]
     shown = [roc for roc in rocs if not math.isnan(roc.leak_lpm)]
     shown = shown if 0 < len(shown) <= _MOST_SIZES else [roc for roc in rocs if math.isnan(roc.leak_lpm)]
     cells = [cell for cell in judgement.cells if cell.detector == name]
-    factors = tuple(cells[0].levels) if cells else ()
-    by_cell = {(cell.leak_lpm, tuple(str(level) for level in cell.levels.values())): cell for cell in cells}
+    factors = list(cells[0].levels) if cells else []
     sizes = sorted({cell.leak_lpm for cell in cells})
-    table = []
+    by_levels: dict[tuple[str, ...], dict[float, str]] = defaultdict(dict)
     if factors and len(sizes) <= _MOST_SIZES + 1:
-        table = [
-            (*levels, *(percent(by_cell[size, levels].alarms) if (size, levels) in by_cell else "–" for size in sizes))
-            for levels in dict.fromkeys(levels for _, levels in by_cell)
-        ]
-    plots = tuple(plot for plot in (_pod_plot(pod, unit), _roc_plot(shown, unit)) if plot is not None)
-    heads = (*factors, *("no leak" if size == 0 else f"{size:g} {unit}" for size in sizes))
-    areas = tuple((_size_text(roc, unit), _area(roc.area)) for roc in shown)
-    return DetectorSection(name, _about(name), plots, areas, tuple(table), heads)
+        for cell in cells:
+            by_levels[tuple(map(str, cell.levels.values()))][cell.leak_lpm] = percent(cell.alarms)
+    return {
+        "name": name,
+        "about": _about(name),
+        "plots": [plot for plot in (_pod_plot(pod, unit), _roc_plot(shown, unit)) if plot is not None],
+        "areas": [(_size_text(roc, unit), _area(roc.area)) for roc in shown],
+        "cell_columns": [*factors, *("no leak" if size == 0 else f"{size:g} {unit}" for size in sizes)],
+        "cells": [(*levels, *(own.get(size, "–") for size in sizes)) for levels, own in by_levels.items()],
+    }
 
 
 def _size_text(roc: SizeRoc, unit: str) -> str:
@@ -350,45 +302,50 @@ def _about(name: str) -> str:
         return detector.scorer.about + through
     if detector.of == DIAGNOSE:
         return f"score over threshold of the detector that judged{through}"
-    if detector.of not in detectors():
-        return ""
-    return f"the score of the detector {detector.of!r}{through}"
+    return f"the score of the detector {detector.of!r}{through}" if detector.of in detectors() else ""
 
 
-def _pod_plot(pod: DetectorPod, unit: str) -> CurvePlot | None:
+def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:
     """Draw detection over the size: the fractions with their intervals, the curve with its band, a90 and a90/95."""
     if len(pod.sizes) < 2:
         return None
-    curves = []
-    marks: list[tuple[float, str]] = []
+    first, last = pod.sizes[0].size, pod.sizes[-1].size
+    ends, curves, marks = (first, last), [], []
     if pod.curve is not None:
-        grid = np.geomspace(pod.sizes[0].size / 1.5, pod.sizes[-1].size * 1.5, _CURVE_POINTS)
-        low, high = pod.curve.detection_band(grid)
-        curves.append(PlotCurve("hits and misses", grid, pod.curve.detection(grid), low, high))
-        marks = [
-            (size, label)
-            for size, label in ((pod.curve.a90, "a90"), (pod.curve.a90_95, "a90/95"))
-            if math.isfinite(size) and size <= grid[-1]
-        ]
-    points = [(at.size, at.proportion.value, at.proportion.low, at.proportion.high) for at in pod.sizes]
-    title = f"Detection over leak size, {pod.detector}"
-    return draw(title, f"leak [{unit}]", "detected", curves, points if len(points) <= 60 else [], marks, log=True)
+        ends = first / 1.5, last * 1.5
+        grid = np.geomspace(*ends, _CURVE_POINTS)
+        curves = [("hits and misses", grid, pod.curve.detection(grid), pod.curve.detection_band(grid))]
+        known = ((pod.curve.a90, "a90"), (pod.curve.a90_95, "a90/95"))
+        marks = [(size, label) for size, label in known if math.isfinite(size) and size <= grid[-1]]
+    scale = Scale(WIDTH, HEIGHT, (math.log10(ends[0]) - 0.02, math.log10(ends[1]) + 0.02), (0.0, 1.0), log=True)
+    points = []
+    for at in pod.sizes if len(pod.sizes) <= _MOST_POINTS else ():
+        own = at.proportion
+        points.append((float(scale.x(at.size)), *map(float, scale.y(np.array([own.value, own.high, own.low])))))
+    labels = {"title": f"Detection over leak size, {pod.detector}", "x_label": f"leak [{unit}]"}
+    marked = [(float(scale.x(size)), label) for size, label in marks]
+    return {**_drawn(scale, curves), **labels, "points": points, "marks": marked}
 
 
-def _roc_plot(rocs: Sequence[SizeRoc], unit: str) -> CurvePlot | None:
+def _roc_plot(rocs: Sequence[SizeRoc], unit: str) -> dict[str, Any] | None:
     """Draw detection over false alarms, a line for each size; the band where there is one line alone."""
     if not rocs:
         return None
-    alone = len(rocs) == 1
     curves = [
-        PlotCurve(
-            _size_text(roc, unit),
-            roc.curve.false_alarm,
-            roc.curve.detection,
-            roc.curve.low if alone else None,
-            roc.curve.high if alone else None,
-        )
+        (_size_text(roc, unit), own.false_alarm, own.detection, (own.low, own.high) if len(rocs) == 1 else None)
         for roc in rocs
+        for own in [roc.curve]
     ]
-    title = f"Detection over false alarms, {rocs[0].detector}"
-    return draw(title, "false alarms", "detected", curves, (), (), log=False)
+    labels = {"title": f"Detection over false alarms, {rocs[0].detector}", "x_label": "false alarms"}
+    scale = Scale(WIDTH, HEIGHT, (0.0, 1.0), (0.0, 1.0))
+    return {**_drawn(scale, curves), **labels, "points": [], "marks": []}
+
+
+def _drawn(scale: Scale, curves: Sequence[tuple[str, Array, Array, tuple[Array, Array] | None]]) -> dict[str, Any]:
+    """Return the curves (label, x, y, ends of the band) as a template draws them, of long ones some points."""
+    paths, bands = [], []
+    for label, x, y, ends in curves:
+        kept = np.unique(np.linspace(0, x.size - 1, min(x.size, _MOST_DRAWN)).round().astype(np.int64))
+        paths.append((label, scale.path(x[kept], y[kept], 2)))
+        bands += [] if ends is None else [scale.band(x[kept], ends[0][kept], ends[1][kept])]
+    return {"scale": scale, "paths": paths, "bands": bands, **scale.ticks(5, 5)}

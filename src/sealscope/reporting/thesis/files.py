@@ -47,24 +47,13 @@ def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tu
             put(f"figures/{product.id}.png", png)
             put_rows(f"tables/{product.id}.csv", figure_rows(product))
         elif isinstance(product, ThesisTable):
-            put_rows(f"tables/{product.id}.csv", table_rows(product))
+            put_rows(f"tables/{product.id}.csv", (product.columns, *product.rows))
     claims = [product for product in products if isinstance(product, Claim)]
     if claims:
         taken = f"tables/{item.id}.csv" in files
-        put_rows(f"tables/{item.id}{'-claims' if taken else ''}.csv", claim_rows(claims))
+        heads = [field.name for field in fields(Claim)]
+        put_rows(f"tables/{item.id}{'-claims' if taken else ''}.csv", (heads, *map(astuple, claims)))
     return tuple(files)
-
-
-def table_rows(table: ThesisTable) -> Iterable[Sequence[object]]:
-    """Yield a table's head and rows; numbers in full, an empty cell for no value."""
-    yield table.columns
-    yield from table.rows
-
-
-def claim_rows(claims: Sequence[Claim]) -> Iterable[Sequence[object]]:
-    """Yield the claims as a table."""
-    yield [field.name for field in fields(Claim)]
-    yield from (astuple(claim) for claim in claims)
 
 
 def figure_rows(figure: Figure) -> Iterable[Sequence[object]]:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from base64 import b64encode
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 from sealscope.reporting import template
 from sealscope.reporting.thesis.plot_style import caption
@@ -23,20 +24,20 @@ CHAPTERS = {
     5: "Chapter 5 and Appendix C: leaks, details and their RMS",
     6: "Chapter 6: what follows",
 }
+_TONES = {"holds": "ok", "holds in part": "open", "does not hold": "leak", "cannot be tested": "none"}
 #: A longer table is folded away until somebody opens it.
 _LONG_TABLE = 45
 
 
-@dataclass(frozen=True)
-class PageProduct:
+class PageProduct(NamedTuple):
     """A figure or table as the page shows it."""
 
     id: str
     heading: str
     product: Figure | ThesisTable
     picture: str
-    links: tuple[tuple[str, str], ...]
-    claims: tuple[Claim, ...]
+    links: list[tuple[str, str]]
+    claims: list[Claim]
     search_text: str
 
 
@@ -49,21 +50,9 @@ def write_thesis_page(
 ) -> Path:
     """Write `index.html` into `folder` from the status of every item and its products; return its path.
 
-    The drawn files lie in the folder. `quick`: made with shorter runs; `sheet`: the measured sheet was given. Raises
-    InputError where the page cannot be written.
+    It refers to nothing outside it but the drawn files, which lie in the folder. `quick`: made with shorter runs;
+    `sheet`: the measured sheet was given. Raises InputError where the page cannot be written.
     """
-    target = folder / "index.html"
-    return template.write(target, render_thesis_page(folder, products, quick=quick, sheet=sheet))
-
-
-def render_thesis_page(
-    folder: Path,
-    products: Iterable[tuple[ItemStatus, Sequence[Product | Claim]]],
-    *,
-    quick: bool = False,
-    sheet: bool = False,
-) -> str:
-    """Return the page as text; it refers to nothing outside it but the files beside it."""
     statuses: list[ItemStatus] = []
     shown: list[tuple[ItemStatus, Figure | ThesisTable, str]] = []
     claims: dict[str, Claim] = {}
@@ -72,55 +61,52 @@ def render_thesis_page(
         for product in item_products:
             if isinstance(product, Claim):
                 claims.setdefault(product.id, product)
+            elif isinstance(product, Figure):  # its picture takes the place of its arrays
+                shown.append((status, replace(product, panels=()), _picture(folder, product.id)))
             elif status.item.id != "claims":  # the claims have a section of their own
-                # the picture of a figure takes the place of its arrays
-                if isinstance(product, Figure):
-                    shown.append((status, replace(product, panels=()), _picture(folder, product.id)))
-                else:
-                    shown.append((status, product, ""))
-    by_chapter: dict[int, list[PageProduct]] = {}
-    bearing: dict[str, list[str]] = {}
+                shown.append((status, product, ""))
+    chapters: dict[int, list[PageProduct]] = defaultdict(list)
+    bearing: dict[str, list[str]] = defaultdict(list)
     for status, product, picture in shown:
-        by_chapter.setdefault(status.item.chapter, []).append(_page_product(status, product, picture, claims))
+        chapters[status.item.chapter].append(_page_product(status, product, picture, claims))
         for name in product.claims:
-            bearing.setdefault(name, []).append(product.id)
+            bearing[name].append(product.id)
+    absent: dict[str, list[ItemStatus]] = defaultdict(list)
+    for status in statuses:
+        if not status.available:
+            why = f"{status.state}: {status.reason}"
+            absent["not made yet, or from other sources" if status.state == "not made" else why].append(status)
     claims_files = [name for status in statuses if status.item.id == "claims" for name in status.files]
-    absent = [status for status in statuses if not status.available]
-    script = template.packaged("templates/thesis.js")
-    return template.render(
+    page = template.render(
         "thesis.html.j2",
+        scripts=["templates/thesis.js"],
+        title="The thesis reproduced",
         thesis=THESIS,
-        chapters=[(number, CHAPTERS.get(number, f"Chapter {number}"), of) for number, of in by_chapter.items()],
+        chapters=[(number, CHAPTERS.get(number, f"Chapter {number}"), of) for number, of in chapters.items()],
         claims=list(claims.values()),
-        bearing={name: ids for name, ids in bearing.items() if name in claims},
+        bearing=bearing,
         counts=[(verdict, sum(claim.verdict == verdict for claim in claims.values())) for verdict in VERDICTS],
         slug=lambda verdict: verdict.replace(" ", "-"),
         tone=_TONES,
         claims_csv=next((name for name in claims_files if name.endswith(".csv")), ""),
-        absent=_grouped(absent),
-        absent_count=len(absent),
+        absent=list(absent.items()),
+        absent_count=sum(map(len, absent.values())),
         total=len(statuses),
         unresolved=UNRESOLVED,
         quick=quick,
         sheet=sheet,
         cell=cell,
-        is_number=_is_number,
+        is_number=lambda value: isinstance(value, int | float) and not isinstance(value, bool),
         long_table=_LONG_TABLE,
-        thesis_css=template.packaged("templates/thesis.css"),
-        script=script,
-        script_hash=template.script_hash(script),
     )
-
-
-_TONES = {"holds": "ok", "holds in part": "open", "does not hold": "leak", "cannot be tested": "none"}
+    return template.write(folder / "index.html", page)
 
 
 def _page_product(
     status: ItemStatus, product: Figure | ThesisTable, picture: str, claims: dict[str, Claim]
 ) -> PageProduct:
-    about = tuple(claims[name] for name in product.claims if name in claims)
-    stem = f"/{product.id}."
-    links = tuple((Path(name).suffix[1:].upper(), name) for name in status.files if stem in f"/{name}")
+    about = [claims[name] for name in product.claims if name in claims]
+    links = [(Path(name).suffix[1:].upper(), name) for name in status.files if f"/{product.id}." in f"/{name}"]
     heading = caption(product.id, product.title)
     numbers = [number.name for number in product.numbers] if isinstance(product, Figure) else list(product.columns)
     text = " ".join([product.id, heading, product.notes, *numbers, *(f"{claim.id} {claim.claim}" for claim in about)])
@@ -135,21 +121,6 @@ def _picture(folder: Path, name: str) -> str:
         return ""
     content, kind = min(pictures, key=lambda picture: len(picture[0]))
     return f"data:image/{kind};base64,{b64encode(content).decode()}"
-
-
-def _grouped(absent: Sequence[ItemStatus]) -> list[tuple[str, list[ItemStatus]]]:
-    """Group the items that are not shown by state and reason."""
-    groups: dict[str, list[ItemStatus]] = {}
-    for status in absent:
-        why = (
-            "not made yet, or from other sources" if status.state == "not made" else f"{status.state}: {status.reason}"
-        )
-        groups.setdefault(why, []).append(status)
-    return list(groups.items())
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def cell(value: Any) -> str:

@@ -1,16 +1,17 @@
-"""How thesis figures look: a style for each role, matplotlib's settings, and labels with the thesis's symbols."""
+"""How thesis figures look: a style for each role, and labels with the thesis's symbols."""
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+import tomllib
+from pathlib import Path
+from typing import NamedTuple
 
 from sealscope.thesis.engine.products import Role
 
 
-@dataclass(frozen=True)
-class Style:
-    """How a role is drawn: colour (its lightness is the grey it prints as), dashes, width [pt], marker."""
+class Style(NamedTuple):
+    """How a role is drawn: colour, dashes, width [pt], marker."""
 
     colour: str
     dashes: tuple[float, ...] = ()
@@ -19,48 +20,14 @@ class Style:
     filled: bool = True
 
 
+_TABLES = tomllib.loads(Path(__file__).with_name("styles.toml").read_text(encoding="utf-8"))
 STYLES: dict[Role, Style] = {
-    "command": Style("#59616b", (6, 1.5, 1, 1.5), 1.0),
-    "A": Style("#0d4f8b", (), 1.2),
-    "B": Style("#e08a2c", (5, 1.6), 1.2, "s", False),
-    "literal": Style("#d99a5b", (), 0.8, "s", False),
-    "converged": Style("#0b2f55", (), 1.3),
-    "no leak": Style("#7f8a95", (), 1.1, "o", False),
-    "leak": Style("#8f1d14", (5, 1.5), 1.3, "D"),
-    "measured": Style("#111418", (), 1.0, "o"),
-    "simulated": Style("#4f93cf", (4, 1.5), 1.2, "s", False),
-    "25 %": Style("#79aeda", (5, 1.5), 1.1, "^"),
-    "50 %": Style("#2f73b5", (5, 1.5, 1, 1.5), 1.2, "s"),
-    "75 %": Style("#0b2f55", (1.2, 1.2), 1.5, "D"),
-    "reference": Style("#59616b", (3, 2), 0.8, "x"),
-    "other": Style("#1b1f24", (), 1.0, "o"),
+    role: Style(**{**own, "dashes": tuple(own.get("dashes", ()))}) for role, own in _TABLES["roles"].items()
 }
 #: Line styles that tell curves of one role in one panel apart.
-SAME_ROLE: tuple[tuple[float, ...], ...] = ((), (5, 1.5), (1.2, 1.2), (6, 1.5, 1, 1.5), (3, 1, 1, 1, 1, 1))
-
-SETTINGS = {
-    "font.family": "DejaVu Sans",
-    "font.size": 8.0,
-    "axes.titlesize": 8.5,
-    "axes.labelsize": 8.0,
-    "axes.linewidth": 0.7,
-    "axes.edgecolor": "#444b52",
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.formatter.limits": (-4, 5),
-    "grid.color": "#e1e4e7",
-    "grid.linewidth": 0.5,
-    "legend.fontsize": 7.5,
-    "legend.frameon": False,
-    "legend.handlelength": 2.6,
-    "legend.columnspacing": 1.4,
-    "xtick.labelsize": 7.5,
-    "ytick.labelsize": 7.5,
-    "svg.fonttype": "none",
-    "path.simplify": True,
-    "path.simplify_threshold": 0.2,
-    "mathtext.fontset": "dejavusans",
-}
+SAME_ROLE = tuple(map(tuple, _TABLES["again"]["dashes"]))
+#: matplotlib's settings.
+SETTINGS = Path(__file__).with_name("thesis.mplstyle")
 
 
 def caption(figure_id: str, title: str) -> str:

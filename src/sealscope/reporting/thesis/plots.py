@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure as Canvas
     from matplotlib.legend import Legend
-    from matplotlib.lines import Line2D
 
 UNRESOLVED = "not resolved: halving the step moves it"
 #: Most bytes of an SVG with its curves as curves; a larger one gets them as pixels.
@@ -52,21 +51,17 @@ def draw(figure: Figure) -> tuple[bytes, bytes]:
 
     with matplotlib.rc_context():
         matplotlib.rcdefaults()  # not the settings in the working folder, which may be hostile and run TeX
-        matplotlib.rcParams.update({**SETTINGS, "svg.hashsalt": figure.id})
+        matplotlib.rcParams.update(matplotlib.rc_params_from_file(SETTINGS, use_default_template=False))
+        matplotlib.rcParams["svg.hashsalt"] = figure.id
         canvas = _canvas(figure)
         long = [line for ax in canvas.axes for line in ax.lines if np.size(line.get_xdata()) > _LONG]
-        if sum(np.size(line.get_xdata()) for line in long) * _POINT_BYTES > MOST_SVG_BYTES:
-            _as_pixels(long)
-        svg = _svg(canvas, figure)
-        if len(svg) > MOST_SVG_BYTES:
-            _as_pixels(long)
+        large = sum(np.size(line.get_xdata()) for line in long) * _POINT_BYTES > MOST_SVG_BYTES
+        svg = b"" if large else _svg(canvas, figure)
+        if large or len(svg) > MOST_SVG_BYTES:
+            for line in long:
+                line.set_rasterized(True)
             svg = _svg(canvas, figure)
         return svg, _png(canvas, greys=any(panel.image is not None for panel in figure.panels))
-
-
-def _as_pixels(lines: Sequence[Line2D]) -> None:
-    for line in lines:
-        line.set_rasterized(True)
 
 
 def _svg(canvas: Canvas, figure: Figure) -> bytes:

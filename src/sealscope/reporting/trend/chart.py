@@ -8,7 +8,7 @@ from typing import Any
 
 from sealscope.diagnosis.trend.trend import Trend
 from sealscope.diagnosis.trend.wear import MONTH, Episode
-from sealscope.reporting.charts import ticks
+from sealscope.reporting.picture import ticks
 from sealscope.reporting.trend.text import moment
 
 #: Sizes of the picture: for a screen, and for a telephone.

@@ -14,7 +14,7 @@ from sealscope.diagnosis.trend.reading import DAY
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
-from sealscope.reporting import charts, messages, template
+from sealscope.reporting import charts, messages, picture, template
 from sealscope.reporting.trend.chart import SIZES, Scale, day_ticks, with_margin
 from sealscope.reporting.trend.text import stamp
 
@@ -62,15 +62,12 @@ def render_history_page(judged: Sequence[Judged], title: str, left_out: int = 0)
     InputError
         There is no recording.
     """
-    from markupsafe import Markup
-
     if not judged:
         raise InputError("the page of a machine must have at least 1 recording, got 0")
     ordered = sorted(judged, key=lambda own: (-math.inf if own.start_s is None else own.start_s, own.diagnosis.file))
     newest = ordered[-1].diagnosis
     dates = _dates(ordered)
     shown, drawn, files = _overlay(ordered)
-    scripts = [template.packaged(name) for name in ("vendor/uPlot.iife.min.js", "templates/charts.js")] if shown else []
     rows = [
         {"file": Path(own.diagnosis.file).name, "date": date, "d": own.diagnosis}
         for own, date in zip(ordered, dates, strict=True)
@@ -88,11 +85,7 @@ def render_history_page(judged: Sequence[Judged], title: str, left_out: int = 0)
         still={} if drawn is None else drawn.still,
         events=[] if drawn is None else charts.events(newest, drawn.data["span"], []),
         files=files,
-        uplot_license=str(template.packaged("vendor/uPlot.LICENSE")),
-        uplot_css=template.packaged("vendor/uPlot.min.css") if shown else "",
-        scripts=scripts,
-        script_source=Markup(" ").join(map(template.script_hash, scripts)) if shown else "'none'",
-        chart_data=None if drawn is None else template.script_json(drawn.data),
+        chart_data=None if drawn is None else drawn.data,
     )
 
 
@@ -138,7 +131,7 @@ def history_chart(ordered: Sequence[Judged], size: str) -> dict[str, Any] | None
         "absent": [scale.x(day) for day, level in zip(days, levels, strict=True) if level is None],
         "limit": None if limit is None or limit > top else scale.y(limit),
         "x_ticks": [(scale.x(day), stamp(day * DAY, span) if dated else f"{day:g}") for day in ticks],
-        "y_ticks": [(scale.y(level), f"{level:.6g}") for level in charts.ticks(0.0, top, 4)],
+        "y_ticks": [(scale.y(level), f"{level:.6g}") for level in picture.ticks(0.0, top, 4)],
     }
 
 
