@@ -32,8 +32,11 @@ MOST_MEMORY = 12 * 2**30
 _KEPT_MEMORY = 2**30
 #: Processes that work side by side at most: a file that takes long holds no other thread's files up.
 _MOST_PROCESSES = 4
-#: Threads of libraries take memory each, as many as the machine has cores.
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+#: Threads of libraries take memory each, as many as the machine has cores; Arrow's own allocator reserves a gigabyte.
+_LITTLE_MEMORY = {
+    **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
+    "ARROW_DEFAULT_MEMORY_POOL": "system",
+}
 
 
 class CrashedApartError(RuntimeError):
@@ -58,7 +61,7 @@ class _Process:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            env={**os.environ, **_ONE_THREAD, "TMPDIR": self._folder.name},  # what it leaves there is removed
+            env={**os.environ, **_LITTLE_MEMORY, "TMPDIR": self._folder.name},  # what it leaves there is removed
         )
 
     @property

@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
-from functools import partial
 from importlib import import_module
 from math import isfinite
 from pathlib import Path
@@ -17,11 +15,11 @@ from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.apart import file_apart
 from sealscope.recordings.archives import archive_of, unpacked
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
-from sealscope.recordings.formats.columns import ChannelMap, check_call, choose_columns
+from sealscope.recordings.formats.columns import ChannelMap, Wanted, check_call
 from sealscope.recordings.formats.matlab import is_matlab_4
 from sealscope.recordings.formats.structured.json_log import is_json
 from sealscope.recordings.formats.structured.lvm import is_lvm
-from sealscope.recordings.formats.table import Choose, RawTable
+from sealscope.recordings.formats.table import RecordingFields
 from sealscope.recordings.formats.text import read_text_parts
 from sealscope.recordings.formats.text_layout import SNIFF, encoding_of
 from sealscope.recordings.recording import Recording
@@ -134,18 +132,8 @@ def _member(kind: str, verb: str) -> Callable[..., Any]:
     return getattr(module, f"{verb}_{kind}")  # type: ignore[no-any-return]
 
 
-def _table(kind: str, file: Path, choose: Choose) -> RawTable:
-    """Read a table, by a process of its own where the format is none of text."""
-    if kind in _TEXTS:
-        return _read_here(file, kind, choose)
-    size = file.stat().st_size
-    limit = _LONGEST + size / (_SLOWEST_SHEETS if kind in ("spreadsheet", "json") else _SLOWEST)
-    memory = _MEMORY + _MEMORY_SHARE * size
-    return file_apart(_read_here, file, kind, choose, limit=limit, memory=memory, disk=most_unpacked(file))
-
-
-def _read_here(file: Path, kind: str, choose: Choose) -> RawTable:
-    return _member(kind, "read")(file, choose)  # type: ignore[no-any-return]
+def _read_here(file: Path, kind: str, wanted: Wanted) -> RecordingFields:
+    return _member(kind, "read")(file, wanted)  # type: ignore[no-any-return]
 
 
 @checked_call
@@ -200,10 +188,10 @@ def read(
     >>> recording["p_A"].tolist()
     [300000.0, 350000.0, 300000.0]
     """
-    file, channel_map = Path(path), map or {}
-    check_call(channel_map, rate)
+    file = Path(path)
+    check_call(map or {}, rate)
     with _inner(file) as inner:
-        return _read(inner, file.name, channel_map, rate)
+        return _read(inner, Wanted(map or {}, rate, file.name))
 
 
 @checked_call
@@ -250,29 +238,24 @@ def read_parts(
     >>> [part.duration for part in ss.read_parts("long.csv", every=0.8)]
     [0.8, 0.8, 0.4]
     """
-    file, channel_map = Path(path), map or {}
-    check_call(channel_map, rate)
+    file = Path(path)
+    check_call(map or {}, rate)
     if not (isfinite(every) and every > 0):
         raise InputError(f"every must be > 0 s and finite, got {every:g}")
-    return _parts(file, every, channel_map, rate)
+    return _parts(file, every, Wanted(map or {}, rate, file.name))
 
 
-def _parts(file: Path, every: float, channel_map: ChannelMap, rate: float | None) -> Iterator[Recording]:
+def _parts(file: Path, every: float, wanted: Wanted) -> Iterator[Recording]:
     with _inner(file) as inner:
-        choose = partial(choose_columns, channel_map=channel_map, rate=rate, place=str(inner))
-
-        def recording_of(table: RawTable) -> Recording:
-            return Recording(*table.samples({"file": file.name}, rate=rate, infer_rate=bool(channel_map)))
-
         if _format_of(inner) != "text":
-            whole_file = _read(inner, file.name, channel_map, rate)
+            whole_file = _read(inner, wanted)
             size = max(1, round(every * whole_file.rate))
             for first in range(0, len(whole_file), size):
                 yield whole_file.samples(slice(first, first + size))
             return
         with whole("a text file", inner):
-            for table in read_text_parts(inner, choose, lambda table: max(1, round(every * recording_of(table).rate))):
-                yield recording_of(table)
+            for fields in read_text_parts(inner, wanted, lambda beginning: max(1, round(every * beginning.rate))):
+                yield Recording(*fields[:-1])
 
 
 @contextmanager
@@ -303,15 +286,20 @@ def _inner(file: Path) -> Iterator[Path]:
             raise UnreadableFile(str(error).replace(str(inner), f"{inner.name} in {file}")) from error
 
 
-def _read(file: Path, name: str, channel_map: ChannelMap, rate: float | None) -> Recording:
-    """Read a file that is no archive; `name`: what the recording's provenance calls it."""
+def _read(file: Path, wanted: Wanted) -> Recording:
+    """Read a file that is no archive: by a process of its own where the format is none of text."""
     kind = _format_of(file)
-    choose = partial(choose_columns, channel_map=channel_map, rate=rate, place=str(file))
     with whole(f"{_FORMATS[kind].words} file", file):
-        table = _table(kind, file, choose)
+        if kind in _TEXTS:
+            fields = _read_here(file, kind, wanted)
+        else:
+            size = file.stat().st_size
+            limit = _LONGEST + size / (_SLOWEST_SHEETS if kind in ("spreadsheet", "json") else _SLOWEST)
+            memory = _MEMORY + _MEMORY_SHARE * size
+            fields = file_apart(_read_here, file, kind, wanted, limit=limit, memory=memory, disk=most_unpacked(file))
         if _SUFFIXES.get(file.suffix.lower(), kind) != kind:
-            table = replace(table, notes=(f"name ends in {file.suffix}, content is {table.kind}", *table.notes))
-        return Recording(*table.samples({"file": name}, rate=rate, infer_rate=bool(channel_map)))
+            fields = fields.with_note(f"name ends in {file.suffix}, content is {fields.kind}")
+        return Recording(*fields[:-1])
 
 
 def check_target(path: str | os.PathLike[str]) -> str:

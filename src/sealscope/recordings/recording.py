@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
 from html import escape
 from threading import Lock
 from types import MappingProxyType
@@ -20,7 +19,8 @@ from numpy.typing import NDArray
 from sealscope.calls import checked_call
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, LONG_NAMES, Array
-from sealscope.recordings.formats.columns import ChannelMap, check_call, choose_columns, counted
+from sealscope.recordings.formats.columns import ChannelMap, Wanted, check_call, counted
+from sealscope.storage.opening import whole
 
 if TYPE_CHECKING:
     import pandas
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 __all__ = ["CHANNEL_UNITS", "COUNTS", "Array", "Recording", "remembered"]
 
 _T = TypeVar("_T")
-#: The rate in a data frame's `attrs` is kept where the time stamps agree with it to this share.
-_SAME_RATE = 0.01
 
 
 def _frozen(values: Any) -> Array:
@@ -281,17 +279,12 @@ class Recording:
         """
         from sealscope.recordings.formats.frames import read_pandas
 
-        channel_map = map or {}
-        check_call(channel_map, rate)
-        choose = partial(choose_columns, channel_map=channel_map, rate=rate, place="data frame")
+        check_call(map or {}, rate)
         try:
-            table = read_pandas(frame, choose)
-            samples = table.samples({}, rate=rate, infer_rate=True)
+            with whole("a data frame", "data frame"):
+                return cls(*read_pandas(frame, Wanted(map or {}, rate))[:-1])
         except UnreadableFile as error:
             raise InputError(str(error)) from None
-        own = (table.description or {}).get("rate", samples.rate)
-        same = rate is None and abs(samples.rate / own - 1.0) <= _SAME_RATE
-        return cls(*samples._replace(rate=own if same else samples.rate))
 
 
 def remembered(

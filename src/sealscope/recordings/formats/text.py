@@ -10,6 +10,7 @@ import csv
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.util import find_spec
@@ -20,36 +21,40 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.errors import InputError, UnreadableFile
+from sealscope.errors import InputError
 from sealscope.recordings.channels import Array
-from sealscope.recordings.formats.columns import counted
+from sealscope.recordings.formats.cells import (
+    MISSING,
+    MOST_WORDS,
+    is_missing,
+    is_number,
+    is_value,
+    numbers,
+    plain_cells,
+)
+from sealscope.recordings.formats.columns import Wanted, choose_columns, counted
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.preamble import exported_from
 from sealscope.recordings.formats.headings.proposal import is_time
-from sealscope.recordings.formats.headings.quantities import plain_cells
 from sealscope.recordings.formats.table import (
-    MOST_WORDS,
-    Choose,
     Clock,
-    RawTable,
+    RecordingFields,
     Series,
     check_size,
     check_texts,
+    converted,
     parse_description,
     seconds_of_series,
     table_of,
 )
 from sealscope.recordings.formats.text_layout import (
     COMMENTS,
-    MISSING,
     OWN_MARK,
     SNIFF,
     Layout,
     blank_cells,
     encoding_of,
-    is_number,
     layout_of,
-    ungrouped,
 )
 from sealscope.recordings.formats.timebase import is_stamp, stamps
 
@@ -71,21 +76,22 @@ _NUMBER = re.compile(r"[\s._(-]{0,4}\d{1,4}\b.{0,60}")
 _Rows = list[list[str]] | NDArray[np.float64]
 
 
-def read_text(path: Path, choose: Choose) -> RawTable:
-    """Read the chosen columns of a text log: a table with one time, or a time for each channel, or a long table."""
-    place, layout = str(path), look_at(path)
-    own = None if layout.own is None else parse_description(layout.own, place)
+def read_text(path: Path, wanted: Wanted) -> RecordingFields:
+    """Read the wanted columns of a text log: a table with one time, or a time for each channel, or a long table."""
+    layout = look_at(path)
+    own = None if layout.own is None else parse_description(layout.own)
     held: dict[int, NDArray[Any]] = {}
     times = _times_of_channels(layout.labels)
-    table = partial(table_of, choose=choose, kind=layout.kind, place=place, about=layout.about, rate=layout.rate)
+    table = partial(table_of, wanted=wanted, kind=layout.kind, about=layout.about, rate=layout.rate)
 
-    def prepare(wanted: Sequence[tuple[int, str]], date: int | None) -> Sequence[str]:
-        log = _Log(path, layout, wanted, date)
-        for rows, numbers, cut in log.blocks():
-            log.take(rows, numbers, cut)
+    def prepare(kinds: Mapping[int, str], date: int | None) -> Sequence[str]:
+        log = _Log(path, layout, kinds, date)
+        for block in log.blocks():
+            log.take(*block)
+        rows = log.total
         columns, notes = log.finish()
-        held.update(zip((column for column, _ in wanted), columns, strict=True))
-        return [*layout.notes, *notes, *log.remarks_and_headings(len(columns[0]))]
+        held.update(columns)
+        return [*layout.notes, *notes, *log.remarks_and_headings(rows)]
 
     def series(column: int, clock: Clock | None = None) -> Series:
         return Series("", layout.labels[column], 0, partial(held.__getitem__, column), clock)
@@ -95,22 +101,17 @@ def read_text(path: Path, choose: Choose) -> RawTable:
         owner = {column: max(time for time in times if time < column) for column in values}
         start = exported_from(layout.about)
 
-        def prepare_each(wanted: Sequence[tuple[int, str]], date: int | None) -> Sequence[str]:
-            columns = {values[column]: kind for column, kind in wanted}
+        def prepare_each(kinds: Mapping[int, str], date: int | None) -> Sequence[str]:
+            columns = {values[column]: kind for column, kind in kinds.items()}
             read = {owner[column]: "time" for column in columns}
-            notes = prepare([*columns.items(), *read.items()], None)
-            return [*notes, f"{len(read)} columns of times, one for each channel"]
+            return [*prepare(columns | read, None), f"{len(read)} columns of times, one for each channel"]
 
         clocks = {time: Clock(time, partial(seconds_of_series, series(time), start)) for time in times}
-        each = [series(column, clocks[owner[column]]) for column in values]
         try:
-            return table(each, prepare=prepare_each)
+            return table([series(column, clocks[owner[column]]) for column in values], prepare=prepare_each)
         except InputError:
-            try:
-                choose(layout.labels, layout.rate)
-            except InputError:
-                pass
-            else:
+            with suppress(InputError):
+                choose_columns(layout.labels, wanted, layout.rate)
                 times = []
             if times:
                 raise
@@ -130,37 +131,36 @@ def _times_of_channels(labels: Sequence[Label]) -> list[int]:
     return times if len({names[column] for column in times}) == 1 and len(times) > 1 and apart else []
 
 
-def read_text_parts(path: Path, choose: Choose, rows_of: Callable[[RawTable], int]) -> Iterator[RawTable]:
-    """Yield the chosen columns of a text log part by part, in bounded memory.
+def read_text_parts(path: Path, wanted: Wanted, rows_of: Callable[[RecordingFields], int]) -> Iterator[RecordingFields]:
+    """Yield the wanted columns of a text log part by part, in bounded memory.
 
     `rows_of`: returns how many rows a part shall have, from the beginning of the log. Where the log has several clocks
     or is a long table, the whole of it is the only part.
     """
     layout = look_at(path)
     try:
-        choice = choose(layout.labels, layout.rate)
+        choice = choose_columns(layout.labels, wanted, layout.rate)
     except InputError:
         choice = None
     if choice is None or _times_of_channels(layout.labels):
-        yield read_text(path, choose)
+        yield read_text(path, wanted)
         return
-    wanted = [(column, "time" if time else "numbers") for column, time in choice.columns]
-    own = None if layout.own is None else parse_description(layout.own, str(path))
-    log, size, total = _Log(path, layout, wanted, choice.date), 0, 0
+    own = None if layout.own is None else parse_description(layout.own)
+    log, size, total = _Log(path, layout, choice.columns, choice.date), 0, 0
 
-    def part(source: _Log, more: Sequence[str] = ()) -> RawTable:
+    def part(source: _Log, more: Sequence[str] = ()) -> RecordingFields:
         columns, notes = source.finish()
-        return RawTable(layout.kind, choice, columns, own, (*layout.notes, *notes, *more), layout.about)
+        return converted(choice, columns, layout.kind, wanted, [*layout.notes, *notes, *more], layout.about, own)
 
-    for block, numbers, cut in log.blocks():
+    for block, lines, cut in log.blocks():
         if not size:
-            beginning = _Log(path, layout, wanted, choice.date)
-            beginning.take(block, numbers, cut)
+            beginning = _Log(path, layout, choice.columns, choice.date)
+            beginning.take(block, lines, cut)
             size = rows_of(part(beginning))
         first = 0
         while first < len(block):
             last = min(len(block), first + size - log.total)
-            log.take(block[first:last], numbers[first:last], cut and last == len(block))
+            log.take(block[first:last], lines[first:last], cut and last == len(block))
             total, first = total + last - first, last
             if log.total == size:
                 yield part(log)
@@ -170,20 +170,17 @@ def read_text_parts(path: Path, choose: Choose, rows_of: Callable[[RawTable], in
 
 
 def look_at(path: Path) -> Layout:
-    """Return the layout of a text log, by its beginning; raise UnreadableFile where it is none."""
-    place = str(path)
+    """Return the layout of a text log, by its beginning; raise InputError where it is none."""
     with path.open("rb") as file:
         head = file.read(SNIFF)
-        if not head:
-            raise UnreadableFile(f"a recording must have samples, got an empty file ({place})")
         encoding = encoding_of(head)
         if encoding is None:
-            raise UnreadableFile(f"a recording must be text, NetCDF, HDF5 or Parquet, got other binary data ({place})")
+            raise InputError("a recording must be text, NetCDF, HDF5 or Parquet, got other binary data")
         while head.startswith(OWN_MARK.encode()) and b"\n" not in head[:-SNIFF] and len(head) < _LONGEST_OWN_LINE:
             if not (data := file.read(SNIFF)):  # our first line may be long
                 break
             head += data
-        return layout_of(head, encoding, len(file.read(1)) == 0, place)
+        return layout_of(head, encoding, len(file.read(1)) == 0, str(path))
 
 
 @dataclass
@@ -201,38 +198,38 @@ class _Words:
 
     def add(self, text: str, where: str, row: int = 0) -> None:
         if not self.count:
-            self.first, self.where = text[:40], where
+            self.first, self.where = text.strip()[:40], where
         self.count += 1
         self.at.append(row)
 
     def note(self, what: str, most: float) -> list[str]:
-        """Return a line for the history, where there are any; raise UnreadableFile where there are more than `most`."""
+        """Return a line for the history, where there are any; raise InputError where there are more than `most`."""
         if self.count > most:
-            raise UnreadableFile(f"{self.rule}, got {self.first!r} {self.where}")
+            raise InputError(f"{self.rule}, got {self.first!r} {self.where}")
         return [f"{what}, first {self.first!r} {self.where}"] if self.count else []
 
 
 class _Log:
     """The rows of a text log, and the columns of those taken so far.
 
-    `columns`: (column, kind) as `Prepare` has them; `date`: the column of the date beside a time of the day.
+    `kinds`: column -> how it is read, as `Prepare` has it; `date`: the column of the date beside a time of the day.
     """
 
-    def __init__(self, path: Path, layout: Layout, columns: Sequence[tuple[int, str]], date: int | None) -> None:
-        self.path, self.layout, self.columns, self.date, self.place = path, layout, columns, date, str(path)
-        self.least = max(column for column, _ in columns) + 1
+    def __init__(self, path: Path, layout: Layout, kinds: Mapping[int, str], date: int | None) -> None:
+        self.path, self.layout, self.kinds, self.date, self.place = path, layout, kinds, date, str(path)
+        self.least = max(kinds) + 1
         self.remarks, self.repeated = _Words(), 0
         plain = layout.encoding in ("utf-8", "utf-8-sig", "cp1252") and layout.delimiter != " "
-        numbers = not layout.cell_units and all(kind != "texts" for _, kind in columns)
-        self.fast = plain and numbers and path.stat().st_size >= _LARGE and find_spec("pyarrow") is not None
+        numeric = not layout.cell_units and "texts" not in kinds.values()
+        self.fast = plain and numeric and path.stat().st_size >= _LARGE and find_spec("pyarrow") is not None
         self.stamped: bool | None = None
         self.dated = False
         self._begin()
 
     def _begin(self) -> None:
         self.total = 0
-        self.parts: list[list[NDArray[Any]]] = [[] for _ in self.columns]
-        self.words = [_Words() for _ in self.columns]
+        self.parts: dict[int, list[NDArray[Any]]] = {column: [] for column in self.kinds}
+        self.words = {column: _Words() for column in self.kinds}
 
     def blocks(self) -> Iterator[tuple[_Rows, Sequence[int], bool]]:
         """Yield blocks of rows, their lines' numbers, and whether the last one was not written whole."""
@@ -250,21 +247,21 @@ class _Log:
                 kept = self._samples(lines, max(0, layout.first_row + 1 - number))
                 if not kept:
                     continue
-                numbers: Sequence[int] = [number + i for i in kept]
-                rows = self._cells([lines[i] for i in kept], numbers, cut)
+                where: Sequence[int] = [number + i for i in kept]
+                rows = self._cells([lines[i] for i in kept], where, cut)
                 if cut and len(rows[-1]) < usual and _HALF_A_NUMBER.fullmatch(rows[-1][-1]):
                     # a last line without an end was not written whole: half a number and what follows it are missing
                     rows[-1] = [*rows[-1][:-1], *[""] * (self.least - len(rows[-1]) + 1)]
                 usual = len(rows[-1])
-                rows, numbers = self._checked(rows, numbers)
+                rows, where = self._checked(rows, where)
                 if rows:
-                    yield rows, numbers, cut
+                    yield rows, where, cut
 
     def _plain(self, number: int, block: bytes) -> NDArray[np.float64] | None:
         """Return the columns (n, k) of a block from line `number` on; None where a row is no row of plain numbers."""
         from pyarrow import ArrowInvalid, csv, float64, py_buffer
 
-        layout, columns, start = self.layout, [column for column, _ in self.columns], 0
+        layout, start = self.layout, 0
         for _ in range(max(0, layout.first_row + 1 - number)):
             start = block.find(b"\n", start) + 1
         self.width = width = block.count(layout.delimiter.encode(), start, block.find(b"\n", start)) + 1
@@ -272,22 +269,22 @@ class _Log:
             return None
         if b"\r" in block and block.count(b"\r") != block.count(b"\r\n"):
             return None
-        names = [str(column) for column in range(width)]
+        wanted = [str(column) for column in self.kinds]
         try:
             table = csv.read_csv(
                 py_buffer(block).slice(start),
-                csv.ReadOptions(column_names=names, block_size=len(block)),
+                csv.ReadOptions(column_names=[*map(str, range(width))], block_size=len(block)),
                 csv.ParseOptions(delimiter=layout.delimiter, quote_char=False),
                 csv.ConvertOptions(
-                    include_columns=[names[column] for column in columns],
-                    column_types={names[column]: float64() for column in columns},
+                    include_columns=wanted,
+                    column_types=dict.fromkeys(wanted, float64()),
                     null_values=["NaN", *MISSING],
                     decimal_point=layout.decimal,
                 ),
             )
         except ArrowInvalid:
             return None
-        values = np.empty((table.num_rows, len(columns)), order="F")
+        values = np.empty((table.num_rows, len(wanted)), order="F")
         for index, column in enumerate(table.columns):
             values[:, index] = column.to_numpy()
         return None if np.isinf(values).any() else values
@@ -315,7 +312,7 @@ class _Log:
             if reader.line_num > line + 1:  # the line goes on in the next
                 if cut and line == len(lines) - 1:
                     return [*rows, [*row[:-1], ""]]
-                raise UnreadableFile(
+                raise InputError(
                     f"a quotation mark must be closed on its line, got an open one (line {numbers[line]}, {self.place})"
                 )
             rows.append(row)
@@ -324,124 +321,107 @@ class _Log:
     def _checked(self, rows: list[list[str]], numbers: Sequence[int]) -> tuple[list[list[str]], Sequence[int]]:
         """Return rows and their numbers without short ones of words, which are counted.
 
-        Raises UnreadableFile for rows with too few cells, and with more than the header and not empty.
+        Raises InputError for rows with too few cells, and with more than the header and not empty.
         """
         layout, most, kept = self.layout, len(self.layout.labels), []
         if min(map(len, rows)) >= self.least and max(map(len, rows)) <= most:
             return rows, numbers
         for i, row in enumerate(rows):
             short = len(row) < self.least
-            valued = sum(map(len, row)) > _LONGEST_REMARK or any(
-                is_number(cell, layout.decimal) or is_stamp(cell) for cell in (row if short else ())
+            valued = sum(map(len, row)) > _LONGEST_REMARK or (
+                short and any(is_value(cell, layout.decimal) for cell in row)
             )
             if short and not valued:
                 self.remarks.add(layout.delimiter.join(row), f"(line {numbers[i]}, {self.place})")
             elif short or any(cell.strip() for cell in row[most:]):
-                raise UnreadableFile(
+                raise InputError(
                     f"a row must have {counted(most, 'cell')}, got {len(row)} (line {numbers[i]}, {self.place})"
                 )
             else:
                 kept.append(i)
         return [rows[i] for i in kept], [numbers[i] for i in kept]
 
-    def take(self, rows: _Rows, numbers: Sequence[int], cut: bool) -> None:
+    def take(self, rows: _Rows, lines: Sequence[int], cut: bool) -> None:
         """Read more rows; `cut`: whether the last one was not written whole."""
         before, self.total = self.total, self.total + len(rows)
-        check_size(self.total, len(self.columns), self.place)
+        check_size(self.total, len(self.kinds))
         if isinstance(rows, np.ndarray):
             self.stamped = False
-            for part, values in zip(self.parts, rows.T, strict=True):
-                part.append(values)
+            for part, numeric in zip(self.parts.values(), rows.T, strict=True):
+                part.append(numeric)
             return
-        for part, words, (column, kind) in zip(self.parts, self.words, self.columns, strict=True):
+        for column, kind in self.kinds.items():
             cells = [row[column] for row in rows]
-            where = partial(self._place_of, numbers=numbers, column=column)
+            where = partial(self._place_of, lines=lines, column=column)
             if unit := self.layout.cell_units.get(column):
                 cells = plain_cells(cells, unit, cut, where)
             if kind == "texts":
-                check_texts(self.total, max(map(len, cells)), self.layout.labels[column].whole, self.place)
-                part.append(np.array(cells, dtype=object))
+                check_texts(self.total, max(map(len, cells)), self.layout.labels[column].whole)
+                values: NDArray[Any] = np.array(cells, dtype=object)
             elif kind == "time" and self._is_stamped(cells, rows):
                 if self.dated and self.date is not None:
                     days = [row[self.date].strip() for row in rows]
                     cells = [f"{day} {cell.strip()}" if cell.strip() else "" for day, cell in zip(days, cells)]  # noqa: B905
-                part.append(self._dates(cells, where, words, before))
+                values = self._dates(cells, where, self.words[column], before)
             else:
-                part.append(self._numbers(cells, where, None if kind == "any" else words, before))
+                values, words = numbers(cells, self.layout.decimal, where)
+                if kind == "any":
+                    values[words] = np.inf  # no number is, that may stand in a log
+                else:
+                    for index in words:
+                        self.words[column].add(cells[index], where(index), before + index)
+            self.parts[column].append(values)
 
     def _is_stamped(self, cells: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
         """Return whether the time holds stamps, by its first cell; it may be a time of the day beside a date."""
         if self.stamped is None:
-            index = next((i for i, cell in enumerate(cells) if cell.strip().lower() not in MISSING), 0)
+            index = next((i for i, cell in enumerate(cells) if not is_missing(cell)), 0)
             self.stamped = not is_number(cells[index], self.layout.decimal) and is_stamp(cells[index])
             day = rows[index][self.date] if self.date is not None and self.date < len(rows[index]) else ""
             self.dated = self.stamped and ":" in cells[index][:3] and is_stamp(day) and ":" not in day
         return self.stamped
 
-    def _place_of(self, index: int, numbers: Sequence[int], column: int) -> str:
-        return f"(line {numbers[index]}, column {self.layout.labels[column].whole}, {self.place})"
+    def _place_of(self, index: int, lines: Sequence[int], column: int) -> str:
+        return f"(line {lines[index]}, column {self.layout.labels[column].whole}, {self.place})"
 
     def _dates(
         self, cells: list[str], where: Callable[[int], str], words: _Words, before: int
     ) -> NDArray[np.datetime64]:
-        texts = ["" if cell.strip().lower() in MISSING else cell for cell in cells]
-        try:
+        texts = ["" if is_missing(cell) else cell for cell in cells]
+        with suppress(ValueError):
             return stamps(texts)
-        except ValueError:
-            for index, text in enumerate(texts):
-                if text.strip() and not is_stamp(text) and not any(sign.isdigit() for sign in text):
-                    words.rule = _STAMP_RULE
-                    words.add(text.strip(), where(index), before + index)
-                    texts[index] = ""
+        for index, text in enumerate(texts):
+            if text.strip() and not is_stamp(text) and not any(sign.isdigit() for sign in text):
+                words.rule = _STAMP_RULE
+                words.add(text, where(index), before + index)
+                texts[index] = ""
         try:
             return stamps(texts)
         except ValueError as error:
             bad = int(error.args[0])
-            raise UnreadableFile(f"{_STAMP_RULE}, got {cells[bad]!r} {where(bad)}") from None
+            raise InputError(f"{_STAMP_RULE}, got {cells[bad]!r} {where(bad)}") from None
 
-    def _numbers(self, cells: list[str], where: Callable[[int], str], words: _Words | None, before: int) -> Array:
-        """Read cells as doubles, missing ones as NaN; an infinite one is refused, words are counted and missing."""
-        decimal = self.layout.decimal
-        texts = [cell.replace(".", "?").replace(",", ".") for cell in cells] if decimal == "," else cells
-        try:
-            if any("_" in text for text in texts):  # Python takes 1_000 for a number
-                raise ValueError
-            values = np.fromiter(map(float, texts), np.float64, len(texts))
-        except ValueError:
-            values = np.fromiter((_number(cell, decimal) for cell in cells), np.float64, len(cells))
-        for index in np.flatnonzero(~np.isfinite(values)).tolist():
-            shown = cells[index].strip()
-            if shown.lower() not in MISSING:
-                if is_number(shown, decimal):
-                    raise UnreadableFile(f"a sample must be a finite number, got {shown[:40]!r} {where(index)}")
-                if words is None:
-                    values[index] = np.inf  # no number is, that may stand in a log
-                else:
-                    words.add(shown, where(index), before + index)
-        return values
-
-    def finish(self) -> tuple[list[NDArray[Any]], list[str]]:
+    def finish(self) -> tuple[dict[int, NDArray[Any]], list[str]]:
         """Return the columns taken, and lines for the history; what is taken from now on begins anew."""
-        labels, dates, notes = self.layout.labels, self.date, list[str]()
-        no_time = self.words[-1].at if self.columns[-1][1] == "time" else []
-        joined: list[NDArray[Any]] = []
-        for part in self.parts:  # each column's blocks are let go before the next is joined
-            joined.append(np.concatenate(part) if part else np.empty(0))
+        labels, notes, joined = self.layout.labels, list[str](), dict[int, NDArray[Any]]()
+        last = [*self.kinds][-1]
+        no_time = self.words[last].at if self.kinds[last] == "time" else []
+        for column, part in self.parts.items():  # each column's blocks are let go before the next is joined
+            joined[column] = np.concatenate(part) if part else np.empty(0)
             part.clear()
             if no_time:  # the rows of a summary, where a word stands in place of the time
-                joined[-1] = np.delete(joined[-1], no_time)
-            joined[-1].setflags(write=False)  # made here: a recording takes it as it is
-        for words, (column, _) in zip(self.words, self.columns, strict=True):
+                joined[column] = np.delete(joined[column], no_time)
+            joined[column].setflags(write=False)  # made here: a recording takes it as it is
+        for column, words in self.words.items():
             what = f"column {labels[column].whole}: {counted(words.count, 'cell')} without a number read as missing"
             notes += words.note(what, MOST_WORDS * self.total)
-        if self.dated and dates is not None:
-            time = next(column for column, kind in self.columns if kind == "time")
-            notes.append(f"date and time joined from columns {labels[dates].whole} and {labels[time].whole}")
+        if self.dated and self.date is not None:
+            notes.append(f"date and time joined from columns {labels[self.date].whole} and {labels[last].whole}")
         self._begin()
         return joined, notes
 
     def remarks_and_headings(self, rows: int) -> list[str]:
-        """Return lines for the history on what stands among the `rows`; raise UnreadableFile for many remarks."""
+        """Return lines for the history on what stands among the `rows`; raise InputError for many remarks."""
         most = max(MOST_WORDS * rows, _MOST_REMARKS)
         lines = f"{counted(self.remarks.count, 'line')} of text among the samples left out"
         repeated = f"{counted(self.repeated, 'line')} of the heading repeated among the samples left out"
@@ -457,13 +437,13 @@ def _blocks(file: BinaryIO, encoding: str, place: str) -> Iterator[tuple[int, by
         block = rest + data
         if width == 1 and b"\0" in data:
             line = number + block[: block.index(b"\0")].count(b"\n")
-            raise UnreadableFile(f"a text log must be text throughout, got binary data (line {line}, {place})")
+            raise InputError(f"a text log must be text throughout, got binary data (line {line}, {place})")
         end = block.rfind(newline)
         while width == 2 and end >= 0 and end % 2:  # a newline's bytes across two characters
             end = block.rfind(newline, 0, end + 1)
         if end < 0 and len(block) >= _LONGEST_LINE:
             if b"\r" not in block or width == 2:
-                raise UnreadableFile(f"a text log must have lines, got {len(block)} bytes without ({place})")
+                raise InputError(f"a text log must have lines, got {len(block)} bytes without ({place})")
             end = block.rfind(b"\r")
         if end >= 0:
             block, rest = block[: end + width], block[end + width :]
@@ -481,14 +461,6 @@ def _lines(block: bytes, layout: Layout) -> list[str]:
     if "\r" in text:
         text = text.replace("\r\n", "\n").replace("\r", "\n")
     return text.removesuffix("\n").split("\n")
-
-
-def _number(cell: str, decimal: str) -> float:
-    text = ungrouped(cell.strip().replace("\u2212", "-"), decimal)
-    if not is_number(text, decimal):
-        return np.nan
-    # a Fortran exponent, 1.5D+03
-    return float(text.replace(",", ".").lower().replace("d", "e"))
 
 
 def write_text(
