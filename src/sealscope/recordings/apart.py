@@ -145,10 +145,7 @@ def file_apart(work: Callable[..., T], file: Path, *arguments: Any, **limits: An
 
 
 def _limit(seconds: float, memory: int, disk: int) -> None:
-    """Let this process take so much time, memory and disk at most, where the system can.
-
-    The time is kept here, too: a process whose parent was killed ends all the same.
-    """
+    """Limit time, memory and disk of this process, where the system can: it ends although its parent was killed."""
     with suppress(ImportError, AttributeError, OSError, ValueError):
         signal.setitimer(signal.ITIMER_REAL, seconds)
         import resource

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib import import_module
 from math import isfinite
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from sealscope.calls import checked_call
 from sealscope.errors import InputError, UnreadableFile
@@ -27,69 +28,51 @@ from sealscope.storage.atomic import atomic_write
 from sealscope.storage.opening import open_regular, whole
 from sealscope.storage.unpacking import most_unpacked
 
-
-class _Format(NamedTuple):
-    """A format in words, the module that reads it, and suffixes and first bytes of its files."""
-
-    words: str
-    module: str
-    suffixes: str
-    magic: tuple[bytes, ...] = ()
-
-
 _HDF5 = b"\x89HDF\r\n\x1a\n"
-_FORMATS = {
-    "netcdf": _Format("a NetCDF or HDF5", "netcdf", ".nc .nc4 .h5 .hdf5", (_HDF5,)),
-    "text": _Format("a text", "text", ".csv .tsv .txt"),
-    "parquet": _Format("a Parquet", "parquet", ".parquet .pq", (b"PAR1", b"ARROW1")),
-    "matlab": _Format("a MATLAB", "matlab", ".mat", (b"MATLAB 5.0", b"MATLAB 7.")),
-    "tdms": _Format("a TDMS", "tdms", ".tdms", (b"TDSm",)),
-    "mdf": _Format("an MDF", "mdf", ".mdf .mf4", (b"MDF     ", b"UnFinMF ")),
-    "lvm": _Format("a LabVIEW measurement", "structured.lvm", ".lvm"),
-    "json": _Format("a JSON", "structured.json_log", ".json .jsonl .ndjson"),
-    "spreadsheet": _Format(
-        "a spreadsheet", "spreadsheet", ".xlsx .xlsm .xlsb .xls .ods", (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
-    ),
+#: Format -> its name in words, the module that reads it, suffixes and first bytes of its files.
+_FORMATS: dict[str, tuple[str, str, str, tuple[bytes, ...]]] = {
+    "netcdf": ("a NetCDF or HDF5", "netcdf", ".nc .nc4 .h5 .hdf5", (_HDF5,)),
+    "text": ("a text", "text", ".csv .tsv .txt", ()),
+    "parquet": ("a Parquet", "parquet", ".parquet .pq", (b"PAR1", b"ARROW1")),
+    "matlab": ("a MATLAB", "matlab", ".mat", (b"MATLAB 5.0", b"MATLAB 7.")),
+    "tdms": ("a TDMS", "tdms", ".tdms", (b"TDSm",)),
+    "mdf": ("an MDF", "mdf", ".mdf .mf4", (b"MDF     ", b"UnFinMF ")),
+    "lvm": ("a LabVIEW measurement", "structured.lvm", ".lvm", ()),
+    "json": ("a JSON", "structured.json_log", ".json .jsonl .ndjson", ()),
+    "spreadsheet": ("a spreadsheet", "spreadsheet", ".xlsx .xlsm .xlsb .xls .ods", (b"PK\3\4", b"\xd0\xcf\x11\xe0")),
 }
-#: Suffix -> format of a file to write, and of any file.
-_SUFFIXES = {suffix: kind for kind, form in _FORMATS.items() for suffix in form.suffixes.split()}
+#: Suffix -> format of any file, and of a file to write.
+_SUFFIXES = {suffix: kind for kind, (_, _, suffixes, _) in _FORMATS.items() for suffix in suffixes.split()}
 SUFFIXES = {suffix: kind for suffix, kind in _SUFFIXES.items() if kind in ("netcdf", "text", "parquet")}
-_CSV = "export it as CSV"
 #: First bytes of formats that are known and not read.
 _FOREIGN = {
-    b"CDF\x01": "a NetCDF-3 file: convert it to NetCDF-4",
-    b"CDF\x02": "a NetCDF-3 file: convert it to NetCDF-4",
-    b"CDF\x05": "a NetCDF-3 file: convert it to NetCDF-4",
-    b"%PDF": "a PDF document",
-    b"7z\xbc\xaf": "a 7z archive: unpack it",
-    b"Rar!": "a RAR archive: unpack it",
-    b"SQLite format 3": f"an SQLite data base: {_CSV}",
-    b"\x93NUMPY": f"a NumPy array: {_CSV}",
-    b"\x80\x04\x95": f"a Python pickle: {_CSV}",
-    b"\x80\x05\x95": f"a Python pickle: {_CSV}",
-    b"DIAEXTENDED": "a DIAdem header (.DAT): export it from DIAdem as TDMS or CSV",
-    b"|CF,": "an imc FAMOS file: export it from FAMOS or imc STUDIO as MATLAB, TDMS or CSV",
-    b"DEWESoft": "a Dewesoft file: export it from DewesoftX as MATLAB, TDMS or CSV",
-    b"LOGG": "a BLF log of a bus: export its decoded signals as MDF or CSV",
-    b"    -1\n    58": "a universal file (UFF 58): export it as MATLAB or CSV",
-    b"    -1\r\n    58": "a universal file (UFF 58): export it as MATLAB or CSV",
-    b"    -1\n   151": "a universal file (UFF): export it as MATLAB or CSV",
-    b"\x00\x01\x00\x00Standard": f"an Access data base: {_CSV}",
-    b"\x89PNG": "a picture",
-    b"\xff\xd8\xff": "a picture",
-    b"RIFF": f"a RIFF file, such as sound: {_CSV}",
+    rb"CDF[\x01\x02\x05]": "a NetCDF-3 file: convert it to NetCDF-4",
+    rb"%PDF": "a PDF document",
+    rb"7z\xbc\xaf": "a 7z archive: unpack it",
+    rb"Rar!": "a RAR archive: unpack it",
+    rb"SQLite format 3": "an SQLite data base: export it as CSV",
+    rb"\x93NUMPY": "a NumPy array: export it as CSV",
+    rb"\x80[\x04\x05]\x95": "a Python pickle: export it as CSV",
+    rb"DIAEXTENDED": "a DIAdem header (.DAT): export it from DIAdem as TDMS or CSV",
+    rb"\|CF,": "an imc FAMOS file: export it from FAMOS or imc STUDIO as MATLAB, TDMS or CSV",
+    rb"DEWESoft": "a Dewesoft file: export it from DewesoftX as MATLAB, TDMS or CSV",
+    rb"LOGG": "a BLF log of a bus: export its decoded signals as MDF or CSV",
+    rb"    -1\r?\n    58": "a universal file (UFF 58): export it as MATLAB or CSV",
+    rb"    -1\r?\n   151": "a universal file (UFF): export it as MATLAB or CSV",
+    rb"\x00\x01\x00\x00Standard": "an Access data base: export it as CSV",
+    rb"\x89PNG|\xff\xd8\xff": "a picture",
+    rb"RIFF": "a RIFF file, such as sound: export it as CSV",
+    rb"(?s:.*)<usi:tdm": "a DIAdem header (.tdm): export it as TDMS",
 }
-#: Suffix of binary files that are known and not read -> what writes them, and the way out.
+#: Suffixes of binary files that are known and not read -> what writes them, and the way out.
 _PROPRIETARY = {
     ".bin": "a binary file such as catman's: export it from catman as MATLAB, TDMS or ASCII",
     ".tst": "a catman test: export it from catman as MATLAB, TDMS or ASCII",
     ".tdx": "the samples of a DIAdem .tdm: export them from DIAdem as TDMS or CSV",
     ".dat": "a binary .dat: export it from the program that wrote it as TDMS, MATLAB or CSV",
     ".raw": "an imc file: export it from FAMOS or imc STUDIO as MATLAB, TDMS or CSV",
-    ".dxd": "a Dewesoft file: export it from DewesoftX as MATLAB, TDMS or CSV",
-    ".d7d": "a Dewesoft file: export it from DewesoftX as MATLAB, TDMS or CSV",
-    ".unv": "a universal file: export it as MATLAB or CSV",
-    ".uff": "a universal file: export it as MATLAB or CSV",
+    ".dxd .d7d": "a Dewesoft file: export it from DewesoftX as MATLAB, TDMS or CSV",
+    ".unv .uff": "a universal file: export it as MATLAB or CSV",
     ".wdf": "a file of a Yokogawa recorder: export it as CSV",
     ".trc": "a file of an oscilloscope: export it as CSV",
 }
@@ -107,20 +90,18 @@ def _format_of(path: Path) -> str:
     """Return the format of a file by its content; raise UnreadableFile where it is none that is read."""
     with open_regular(path, "a recording") as file:
         head = file.read(SNIFF)
-        for kind, form in _FORMATS.items():
-            if head.startswith(form.magic):
+        for kind, (_, _, _, magic) in _FORMATS.items():
+            if head.startswith(magic):
                 return kind
         for offset in (512, 1024, 2048, 4096):  # HDF5 may begin after a block of the user's
             file.seek(offset)
             if file.read(8) == _HDF5:
                 return "netcdf"
-    foreign = next((name for magic, name in _FOREIGN.items() if head.startswith(magic)), None)
-    if foreign is None and b"<usi:tdm" in head:
-        foreign = "a DIAdem header (.tdm): export it as TDMS"
+    foreign = next((name for pattern, name in _FOREIGN.items() if re.match(pattern, head)), None)
     if foreign is None and is_matlab_4(head):
         return "matlab"
-    if foreign is None and encoding_of(head) is None:
-        foreign = _PROPRIETARY.get(path.suffix.lower())
+    if foreign is None and path.suffix and encoding_of(head) is None:
+        foreign = next((name for own, name in _PROPRIETARY.items() if path.suffix.lower() in own.split()), None)
     if foreign is not None:
         raise UnreadableFile(f"a recording must be in a format that is read, got {foreign} ({path})")
     return "lvm" if is_lvm(head) else "json" if is_json(head) else "text"
@@ -128,7 +109,7 @@ def _format_of(path: Path) -> str:
 
 def _member(kind: str, verb: str) -> Callable[..., Any]:
     """Return ``read_KIND`` or ``write_KIND`` of the format's module; its library is loaded now."""
-    module = import_module(f"sealscope.recordings.formats.{_FORMATS[kind].module}")
+    module = import_module(f"sealscope.recordings.formats.{_FORMATS[kind][1]}")
     return getattr(module, f"{verb}_{kind}")  # type: ignore[no-any-return]
 
 
@@ -263,8 +244,6 @@ def _inner(file: Path) -> Iterator[Path]:
     """Yield the file, or what is packed in it; what is wrong with either is an UnreadableFile."""
     try:
         archive = archive_of(file)
-    except UnreadableFile:
-        raise
     except FileNotFoundError:
         raise UnreadableFile(f"a recording must exist, got no such file ({file})") from None
     except InputError as error:
@@ -289,7 +268,7 @@ def _inner(file: Path) -> Iterator[Path]:
 def _read(file: Path, wanted: Wanted) -> Recording:
     """Read a file that is no archive: by a process of its own where the format is none of text."""
     kind = _format_of(file)
-    with whole(f"{_FORMATS[kind].words} file", file):
+    with whole(f"{_FORMATS[kind][0]} file", file):
         if kind in _TEXTS:
             fields = _read_here(file, kind, wanted)
         else:
@@ -303,11 +282,7 @@ def _read(file: Path, wanted: Wanted) -> Recording:
 
 
 def check_target(path: str | os.PathLike[str]) -> str:
-    """Return the format of a file to write by its suffix.
-
-    Raises InputError for another suffix or a folder that does not exist. Long work calls this first, so that it does
-    not fail at its end.
-    """
+    """Return the format of a file to write by its suffix; raise InputError for another, or without its folder."""
     file = Path(path)
     kind = SUFFIXES.get(file.suffix.lower())
     if kind is None:
@@ -339,13 +314,10 @@ def write(recording: Recording, path: str | os.PathLike[str]) -> None:
 
     Examples
     --------
-    >>> import numpy as np
     >>> import sealscope as ss
-    >>> t = np.arange(1000) / 500
-    >>> recording = ss.Recording(t, {"p_A": 3e5 + np.sin(t)}, {"p_A": "Pa"}, rate=500.0)
-    >>> ss.write(recording, "log.csv")
-    >>> bool(np.array_equal(ss.read("log.csv")["p_A"], recording["p_A"]))
-    True
+    >>> ss.write(ss.Recording([0.0, 0.002], {"p_A": [3e5, 3.1e5]}, {"p_A": "Pa"}, rate=500.0), "log.csv")
+    >>> ss.read("log.csv")["p_A"].tolist()
+    [300000.0, 310000.0]
     """
     file = Path(path)
     kind = check_target(file)

@@ -98,10 +98,7 @@ def _note(bridged: Flags) -> str:
 
 
 def _with_lost_rows(recording: Recording, needed: Sequence[str]) -> Recording:
-    """Return the recording with rows of NaN where the time stamps show that some were lost, and without untimed rows.
-
-    Steps back, and gaps that are too long to be bridged, stay as they are.
-    """
+    """Return the recording without untimed rows, with rows of NaN where the time stamps show that some were lost."""
     timed = np.isfinite(recording.t)
     if not timed.all():
         recording = recording.between(-math.inf, math.inf)
@@ -134,11 +131,7 @@ def _mean(values: Array) -> float:
 
 
 def _from_other_cycle(channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, cycle: float) -> bool:
-    """Bridge a gap of all channels by other cycles, the nearest first; return whether one is like this one.
-
-    It is where command, or pressures, of half a cycle before and after the gap repeat; where they repeat best within
-    `_SLACK` samples of the cycle's length is where the values are taken from.
-    """
+    """Bridge a gap of all channels by the nearest cycle in which the duty beside it repeats, to within `_SLACK`."""
     half = round(0.5 * cycle)
     least = math.ceil((stop - first + half) / cycle)
     for shift in (sign * round(times * cycle) for times in (least, least + 1) for sign in (-1, 1)):

@@ -64,10 +64,7 @@ def is_value(cell: str, decimal: str) -> bool:
 
 
 def numbers(cells: Sequence[str], decimal: str, where: Callable[[int], str]) -> tuple[Array, list[int]]:
-    """Return cells as doubles (n,), missing ones and words as NaN, and the indices of the words.
-
-    Raises InputError for an infinite number; `where`: the place of a cell by its index.
-    """
+    """Return cells as doubles (n,), missing ones and words as NaN, and the indices of words; none may be infinite."""
     texts = [cell.replace(".", "?").replace(",", ".") for cell in cells] if decimal == "," else cells
     try:
         if any("_" in text for text in texts):  # Python takes 1_000 for a number
@@ -110,10 +107,7 @@ def _unit_behind(cell: str) -> str | None:
 
 
 def units_behind(rows: Sequence[Sequence[str]]) -> dict[int, str]:
-    """Return column -> unit of the columns in which more than half of the cells are a number with a known unit.
-
-    `rows`: cells of a part of the samples.
-    """
+    """Return column -> unit of the columns in which more than half of the cells are a number with a known unit."""
     known: dict[str, bool] = {}
     counts: dict[int, Counter[str]] = {}
     for row in rows:
@@ -149,11 +143,7 @@ def with_units(labels: Sequence[Label], units: Mapping[int, str], place: str) ->
 
 
 def plain_cells(cells: Sequence[str], unit: str, cut: bool, where: Callable[[int], str]) -> list[str]:
-    """Return the cells of a column without their `unit`; other cells, such as words, stay as they are.
-
-    Raises InputError for a number with another unit, or with none but for 0. A last cell that is `cut` short is
-    missing. `where`: place of a cell by its index.
-    """
+    """Return the cells of a column without their `unit`, words as they are; a last one that is `cut` is missing."""
     result = [cell.strip() for cell in cells]
     for index, text in enumerate(result):
         if text.endswith(unit):

@@ -159,10 +159,7 @@ def _columns_of(labels: Sequence[Label]) -> str:
 
 
 def _find(labels: Sequence[Label], name: str, what: str, mapped: bool = False) -> int | None:
-    """Return the column called `name`: as written, else whatever its case, else by its number as in `#4`, from 1.
-
-    A `mapped` one may also be called by the last words of its name: `ch2`, `Pa`.
-    """
+    """Return the column of a name, of a number as in `#4` from 1, or, `mapped`, of a name's last words: `ch2`."""
     folded = name.casefold()
     for is_called in (
         lambda label: label.whole == name,
@@ -182,10 +179,7 @@ def _find(labels: Sequence[Label], name: str, what: str, mapped: bool = False) -
 
 
 def _mapped(labels: Sequence[Label], channel: str, foreign: str) -> Formula[int]:
-    """Return what a map's text stands for: a column, a column and its unit, or a formula.
-
-    A unit of the text goes before that of the column's heading, and this before the ending of the column's name.
-    """
+    """Return what a map's text stands for; its unit goes before that of the heading, and this before the name's."""
     what = f"{foreign}, mapped to {channel},"
     blank = foreign.rpartition(" ")
     for name, unit in ((foreign, None), square_brackets(foreign), (blank[0], blank[2])):
@@ -261,10 +255,7 @@ def _by_own_names(choice: ColumnMap) -> None:
 
 
 def _inside(labels: Sequence[Label], channel: str) -> int | None:
-    """Return the only column that bears a channel's name between points, strokes or brackets, or before a unit.
-
-    `Rig.Cyl.p_A [bar]`, `p_A_bar`.
-    """
+    """Return the only column with a channel's name between points or before a unit: `Rig.Cyl.p_A [bar]`, `p_A_bar`."""
     matches = [
         i
         for i, label in enumerate(labels)

@@ -87,10 +87,7 @@ def _refuse_elsewhere(file: Any) -> None:
 
 
 def _streamed_series(file: Any) -> Iterator[Series]:
-    """Yield the signals of doubles of an open HDF5 file that has `_STREAMS`.
-
-    `Values/DataR2` of a signal is the number of its stream, `Values/CompressedTime` first time, step and count.
-    """
+    """Yield the signals of doubles; `CompressedTime` holds first time, step and count, `DataR2` the stream's number."""
     import h5py
 
     for item in file.get(_REFERENCES, {}).values():

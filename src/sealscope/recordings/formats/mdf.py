@@ -20,10 +20,7 @@ from sealscope.recordings.formats.table import Clock, RecordingFields, Series, t
 
 
 def read_mdf(path: Path, wanted: Wanted) -> RecordingFields:
-    """Read the wanted channels of an MDF file in physical values; raise MissingExtra where asammdf is absent.
-
-    Frames of a bus that nobody has decoded are no channels.
-    """
+    """Read the wanted channels in physical values; frames of a bus that nobody has decoded are no channels."""
     with _opened(library("asammdf", "MDF", "asammdf").MDF, path) as file:
         moment = np.datetime64(file.header.start_time.astimezone(UTC).replace(tzinfo=None), "us")
         start = moment if moment > np.datetime64("1980-01-02") else None  # a file without a date has 1980 or before

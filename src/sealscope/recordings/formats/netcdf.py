@@ -124,10 +124,7 @@ def _values(data: Any, name: str, size: int) -> NDArray[Any]:
 
 
 def _texts(data: Any, name: str, size: int) -> list[str]:
-    """Return the cells of a data set of texts; those of any length are read a few at a time, and none may be long.
-
-    Any number of cells may refer to one text, which is at most as long as the file: `size` [bytes].
-    """
+    """Return the cells of texts, a few at a time: any number of them may refer to one text as long as the file."""
     import h5py
 
     check_texts(data.size, data.dtype.itemsize, name)
@@ -177,10 +174,7 @@ def attributes(description: Mapping[str, Any]) -> dict[str, Any]:
 def write_netcdf(
     path: Path, values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]
 ) -> None:
-    """Write NetCDF-4 (an HDF5 file): dimension `t`, one variable a channel with `units`; doubles, to the bit.
-
-    The file is made in memory first: libhdf5 ends the process where a disk is full.
-    """
+    """Write NetCDF-4, to the bit; made in memory first, as libhdf5 ends the process where a disk is full."""
     import h5netcdf
 
     content = BytesIO()

@@ -23,10 +23,7 @@ _CHUNK = 2**20
 
 
 def read_spreadsheet(path: Path, wanted: Wanted) -> RecordingFields:
-    """Read the wanted columns of the first sheet that holds them: hidden sheets last, those with most rows first.
-
-    Raises MissingExtra where python-calamine is absent, and what the largest sheet lacks where no sheet holds a log.
-    """
+    """Read the wanted columns of the first sheet that holds them: hidden sheets last, those with most rows first."""
     _check_members(path)
     workbook = library("python_calamine", "a spreadsheet", "python-calamine").CalamineWorkbook.from_path(str(path))
     sheets = [workbook.get_sheet_by_name(name) for name in workbook.sheet_names]
@@ -48,10 +45,7 @@ def read_spreadsheet(path: Path, wanted: Wanted) -> RecordingFields:
 
 
 def _check_members(path: Path) -> None:
-    """Raise UnreadableFile where the members of a workbook that is a ZIP archive unpack to more than it may hold.
-
-    What they are said to unpack to may be a lie: they are unpacked, and zipfile refuses what is more.
-    """
+    """Unpack a workbook's members, and refuse more than it may hold: the sizes that they state may be a lie."""
     if not zipfile.is_zipfile(path):
         return
     with zipfile.ZipFile(path) as archive:

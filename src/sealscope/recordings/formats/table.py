@@ -56,10 +56,7 @@ Prepare = Callable[[Mapping[int, str], int | None], Sequence[str]]
 
 @dataclass(frozen=True)
 class Clock:
-    """When samples were taken: `key` is equal for series that were sampled together.
-
-    `read`: returns the times (n,) [s] and the moment 0, or None where it is not known.
-    """
+    """When samples were taken: `key` is equal for series sampled together; `read` gives times (n,) [s] and moment 0."""
 
     key: Hashable
     read: Callable[[], tuple[Array, np.datetime64 | None]]
@@ -119,24 +116,9 @@ def table_of(
 ) -> RecordingFields:
     """Return a recording of the series that are `wanted`; raise InputError where they cannot be brought together.
 
-    Parameters
-    ----------
-    series : sequence of Series
-        All series of the file.
-    wanted : Wanted
-        What the caller asks of it.
-    kind : str
-        The file's format, in words.
-    about : mapping of str to str, optional
-        What the file says of the recording.
-    rate : float, optional
-        Sampling rate that the file states [Hz], for series without a clock.
-    own : mapping, optional
-        The description that Sealscope wrote beside the samples.
-    prepare : callable, optional
-        Reads the columns that are used, where this is better done for all together.
-    size : int, optional
-        Bytes of a file that may be compressed.
+    `kind`: the format, in words; `about`: what the file says of the recording; `rate` [Hz]: that it states, for series
+    without a clock; `own`: what Sealscope wrote beside the samples; `prepare`: reads all columns that are used
+    together; `size`: bytes of a file that may be compressed.
     """
     members, notes = _distinct(_timed(series))
     labels = [member.label for member in members]
@@ -246,10 +228,7 @@ def _has_clock(time: NDArray[Any]) -> bool:
 
 
 def _timed(series: Sequence[Series]) -> list[Series]:
-    """Return series of which those without a clock have that of their group, where the groups hold times of their own.
-
-    A series called `data` or `value` beside them has its group's name.
-    """
+    """Give series without a clock that of their group's times, and one called `data` or `value` the group's name."""
     times: dict[str, Series] = {}
     for member in series:
         if member.clock is None and is_time(member.label):
@@ -405,10 +384,7 @@ def _long_columns(labels: Sequence[Label]) -> dict[str, int] | None:
 def _pivoted(
     series: Sequence[Series], long: Mapping[str, int], prepare: Prepare | None
 ) -> tuple[list[Series], list[str]]:
-    """Return a series for each name, with its unit where a column gives it, and lines for the history.
-
-    The rows of a name are read as a table of one channel: its time may be in any form that the time of a table has.
-    """
+    """Return a series for each name, its rows read as a table of one channel, and lines for the history."""
     value, texts = long["value"], [long[kind] for kind in ("name", "unit") if kind in long]
     labels = [Label("", "") if column in texts else member.label for column, member in enumerate(series)]
     if "timestring" in {label.name.casefold() for label in labels}:  # WinCC's moments have their fraction beside them
@@ -468,11 +444,7 @@ def _pivoted(
 
 
 def check_size(rows: int, columns: int, size: int | None = None) -> None:
-    """Raise InputError where a file holds more than `MAX_VALUES` in the columns used.
-
-    Or more than `_EXPANSION` times its own `size` [bytes]: no logger's samples compress so well, but a fill value can
-    stand for any number of them.
-    """
+    """Refuse more than `MAX_VALUES`, and than `_EXPANSION` times the file's `size` [bytes]: fill values expand so."""
     if rows * columns > MAX_VALUES:
         raise InputError(
             f"a recording must have at most {MAX_VALUES} values in the columns used (2 GiB), got {rows} rows of "

@@ -20,10 +20,7 @@ _UNITS = ("unit_string", "NI_UnitDescription", "units", "unit", "Unit")
 
 
 def read_tdms(path: Path, wanted: Wanted) -> RecordingFields:
-    """Read the wanted channels of a TDMS file; raise MissingExtra where npTDMS is absent.
-
-    A channel with the waveform's interval (``wf_increment``) has a clock; one without needs a time column or a rate.
-    """
+    """Read the wanted channels; one with the waveform's interval (``wf_increment``) has a clock."""
     nptdms = library("nptdms", "TDMS", "npTDMS")
     library("nptdms.log", "TDMS", "npTDMS").log_manager.set_level(logging.ERROR)  # a last segment cut short is read
     with nptdms.TdmsFile.open(path) as file:

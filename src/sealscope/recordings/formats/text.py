@@ -119,10 +119,7 @@ def read_text(path: Path, wanted: Wanted) -> RecordingFields:
 
 
 def _times_of_channels(labels: Sequence[Label]) -> list[int]:
-    """Return the columns of times of a table in which each channel, or group of channels, follows its own; else none.
-
-    They bear one name, but for a number at its end.
-    """
+    """Return the columns of times, of one name but for a number, which each channel or group of channels follows."""
     names = [_NUMBER.sub("", label.name.casefold()) for label in labels]
     if names.count(names[0]) < 2 or not is_time(labels[0]):
         return []
@@ -185,10 +182,7 @@ def look_at(path: Path) -> Layout:
 
 @dataclass
 class _Words:
-    """Cells that hold a word in place of a number (`OVERLOAD`), or lines of words.
-
-    `count`, `first`, `where`: how many, the first and its place; `at`: their rows.
-    """
+    """Cells that hold a word in place of a number (`OVERLOAD`), or lines of words; `at`: their rows."""
 
     rule: str = "a sample must be a number"
     count: int = 0
@@ -210,10 +204,7 @@ class _Words:
 
 
 class _Log:
-    """The rows of a text log, and the columns of those taken so far.
-
-    `kinds`: column -> how it is read, as `Prepare` has it; `date`: the column of the date beside a time of the day.
-    """
+    """The rows of a text log, and the columns of those taken so far; `kinds` and `date` are those of `Prepare`."""
 
     def __init__(self, path: Path, layout: Layout, kinds: Mapping[int, str], date: int | None) -> None:
         self.path, self.layout, self.kinds, self.date, self.place = path, layout, kinds, date, str(path)
@@ -319,10 +310,7 @@ class _Log:
         return rows[:-1]
 
     def _checked(self, rows: list[list[str]], numbers: Sequence[int]) -> tuple[list[list[str]], Sequence[int]]:
-        """Return rows and their numbers without short ones of words, which are counted.
-
-        Raises InputError for rows with too few cells, and with more than the header and not empty.
-        """
+        """Return rows and their numbers without short ones of words, which are counted; refuse any other width."""
         layout, most, kept = self.layout, len(self.layout.labels), []
         if min(map(len, rows)) >= self.least and max(map(len, rows)) <= most:
             return rows, numbers
@@ -470,10 +458,7 @@ def write_text(
     description: Mapping[str, Any],
     delimiter: str,
 ) -> None:
-    """Write `# sealscope: {...}`, the header `t [s],p_A [Pa],...` and one row a sample.
-
-    Numbers read back to the same bits; a missing sample is an empty cell. Raises InputError where a value is infinite.
-    """
+    """Write `# sealscope: {...}`, the header `t [s],p_A [Pa],...` and one row a sample, to the bit."""
     for name, series in values.items():
         if np.isinf(series).any():
             what = name if name == "t" else f"channel {name}"

@@ -188,10 +188,7 @@ def _heading(lines: Sequence[str], first: int, delimiter: str, width: int, decim
 
 
 def _keyed(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int] | None:
-    """Return (labels, rows taken) of a heading whose rows say what they hold: `Name`, `Unit`; None for any other.
-
-    `rows`: the lowest first.
-    """
+    """Return (labels, rows taken) where rows, lowest first, say what they hold: `Name`, `Unit`; else None."""
     keys = [row[0].strip().rstrip(":").casefold() for row in rows]
     at = next((i for i, key in enumerate(keys) if key in WORDS["row"]["name"] and _width(rows[i]) > 1), None)
     unit = next((i for i, key in enumerate(keys) if key in WORDS["row"]["unit"]), None)
@@ -203,10 +200,7 @@ def _keyed(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int] | None:
 
 
 def _stacked(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int]:
-    """Return (labels, rows taken) of a heading of names, with units below or above them, and groups over them.
-
-    Rows that say the same of every column (`REAL`, a ruler) are passed over. `rows`: the lowest first.
-    """
+    """Return (labels, rows taken) of rows, lowest first: names, units below or above, groups over them, rulers."""
     skipped = next((i for i, row in enumerate(rows[:-1]) if not _tells_nothing(row)), len(rows) - 1)
     row, *over = rows[skipped:]
     texts, taken = list(row), skipped + 1
@@ -240,10 +234,7 @@ def _tells_nothing(row: Sequence[str]) -> bool:
 
 
 def layout_of(head: bytes, encoding: str, whole: bool, place: str) -> Layout:
-    """Return the layout of a log that begins with `head`; raise InputError where it has no row of numbers.
-
-    `whole`: the head is all of the log.
-    """
+    """Return the layout of a log that begins with `head`, or is it as a `whole`; refuse one without numbers."""
     text = head.decode(encoding, errors="replace").lstrip("\ufeff")
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     if not whole:

@@ -61,10 +61,7 @@ def square_brackets(text: str) -> tuple[str, str | None]:
 
 
 def _round_brackets_or_stroke(text: str) -> tuple[str, str | None]:
-    """Split `name (unit)`, the unit with one pair of brackets at most, or `name / unit`, where this is possible first.
-
-    Returns (text, None) for any other text.
-    """
+    """Split `name (unit)`, or `name / unit`, where this is possible first; (text, None) for any other text."""
     ends: list[tuple[int, int]] = []  # where the name ends, and the unit begins
     parts = text.split("/")
     for count in (2, 1):  # `name / m/s`, `name / s`
