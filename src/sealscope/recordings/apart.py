@@ -54,7 +54,7 @@ class _Process:
     """A process that carries out one request after the other."""
 
     def __init__(self) -> None:
-        self.fresh = True
+        self._fresh = True
         self._folder = tempfile.TemporaryDirectory(prefix="sealscope-", ignore_cleanup_errors=True)
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "sealscope.recordings.apart"],
@@ -71,9 +71,8 @@ class _Process:
     def ask(self, request: bytes, limit: float) -> tuple[Any, str | None, bool]:
         """Return what the work gave or raised, the traceback of what it raised, and whether the process is spent."""
         process = self._process
-        assert process.stdin is not None
-        assert process.stdout is not None
-        overdue = Timer(limit + 1.0 + _START * self.fresh, process.kill)  # it ends itself at its limit
+        assert process.stdin is not None and process.stdout is not None
+        overdue = Timer(limit + 1.0 + _START * self._fresh, process.kill)  # it ends itself at its limit
         overdue.daemon = True
         overdue.start()
         try:
@@ -87,7 +86,7 @@ class _Process:
             raise CrashedApartError(f"the library that reads it {what}") from None
         finally:
             overdue.cancel()
-        self.fresh = False
+        self._fresh = False
         return value, where, spent
 
     def end(self) -> None:
@@ -102,14 +101,13 @@ _idle: list[_Process] = []
 
 def _process() -> _Process:
     """Return a process that waits for work, else a new one."""
-    while True:
-        try:
+    with suppress(IndexError):
+        while True:
             process = _idle.pop()
-        except IndexError:
-            return _Process()
-        if process.alive:
-            return process
-        process.end()
+            if process.alive:
+                return process
+            process.end()
+    return _Process()
 
 
 def apart(work: Callable[..., T], *arguments: Any, limit: float, memory: int = MOST_MEMORY, disk: int = LARGEST) -> T:
