@@ -102,12 +102,13 @@ class Blocks:
         )
 
     def driving(self, zero: float | None = None, root: bool = False) -> Array:
-        """Return the mean of abs(p_A - p_B - zero) [Pa], or of its root, over each block, shape (K,).
+        """Return the mean of abs(p_A - p_B - zero) [Pa], or of the `root` about its zero, over each block, shape (K,).
 
-        A leak's coefficient times it is the leak's mean flow. The zero is by default that of the sums.
+        A leak's coefficient times it is the leak's mean flow. The zero is by default that of the sums (`zero_of`).
         """
-        size = np.abs(self.pressures - (self.zero[:, None] if zero is None else zero))
-        return np.asarray((np.sqrt(size) if root else size).mean(axis=1))
+        values = np.sign(self.pressures) * np.sqrt(np.abs(self.pressures)) if root else self.pressures
+        about = self.zero[:, None] * (not root) if zero is None else zero
+        return np.asarray(np.abs(values - about).mean(axis=1))
 
     @classmethod
     def joined(cls, parts: Sequence[Blocks]) -> Blocks:
@@ -385,13 +386,17 @@ def cost_of_zero(zero: float) -> float:
     return float(min((zero / usual) ** 2, (zero / far) ** 2 + 2.0 * np.log(far / usual / odds)))
 
 
-def zero_of(blocks: Blocks, columns: Sequence[Columns]) -> float:
-    """Return the zero of p_A - p_B [Pa] that a change of the leak shows, the equations' mean; near 0 without one."""
+def zero_of(blocks: Blocks, columns: Sequence[Columns], test: int | None = None) -> float:
+    """Return the zero of p_A - p_B [Pa] that a change of the leak shows, the equations' mean; near 0 without one.
+
+    `test`: the column of the leak through an orifice, then the zero is that of its root [Pa^0.5].
+    """
     fits = [
-        _fit(blocks.gram[:, e], blocks, own, own.leak, [k for k in own.nuisance if k != own.leak])
+        _fit(blocks.gram[:, e], blocks, own, test or own.leak, [k for k in own.nuisance if k != own.leak])
         for e, own in enumerate(columns)
     ]
-    return float(np.mean(blocks.zero)) + float(np.mean([fit.zero for fit in fits]))
+    own = float(np.mean([fit.zero for fit in fits]))
+    return own if test is not None else float(np.mean(blocks.zero)) + own
 
 
 def pair(blocks: Blocks, columns: Columns) -> tuple[Array, Array, Array]:

@@ -80,14 +80,16 @@ def hypotheses(
     tested.append((SCALE, "sensor fault", information(_with_scale(recorded, columns, orifice), columns, orifice)))
     stepped = []
     cost = cost_of_zero(zero_of(blocks, columns))
+    root = 2.0 * float(np.mean(blocks.driving(root=True)))  # dp over d sqrt(p)
+    costs = {LEAK: cost, PUMP: cost, ORIFICE: cost_of_zero(root * zero_of(blocks, columns, orifice))}
     for name, cause, own in tested:
         signs = (1.0,) if cause in (*LEAKS, "pump leak", "external leak") else (1.0, -1.0)
         best = step_test(own, signs)
         if best is not None:
             stored = lost.get(name.removesuffix(MADE_UP)) if cause == "external leak" else None
             beside = 0.0 if stored is None else _agree(best, stored)
-            if name in (LEAK, ORIFICE, PUMP):
-                beside -= cost
+            if name in costs:
+                beside -= costs[name]
             elif name == SCALE:
                 beside -= _unlikely(best)
             stepped.append(StepHypothesis(name, cause, best, beside))

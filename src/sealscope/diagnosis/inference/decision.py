@@ -25,7 +25,7 @@ from sealscope.diagnosis.inference.causes import stepped as stepped_cause
 from sealscope.diagnosis.inference.onset import Course, Information, Interval, StepTest, course, step_test
 from sealscope.diagnosis.inference.other_steps.step import OtherStep, other_step
 from sealscope.diagnosis.inference.scatter import Rise, Taught, rise
-from sealscope.diagnosis.inference.terms import LAG, ORIFICE, PUMP, Equation
+from sealscope.diagnosis.inference.terms import LAG, LEAK, ORIFICE, PUMP, Equation
 from sealscope.diagnosis.verdict.evidence import (
     LEAKS,
     NO_RIG,
@@ -125,6 +125,11 @@ class RecordedBalance:
         return zero_of(self.blocks, self.columns)
 
     @cached_property
+    def root_zero(self) -> float:
+        """Zero of the root of p_A - p_B [Pa^0.5], as a change of a leak through an orifice shows it."""
+        return zero_of(self.blocks, self.columns, self.columns[0].names.index(ORIFICE))
+
+    @cached_property
     def delay(self) -> tuple[float, float] | None:
         """How much later x is recorded than the flow [s], by the share of its lag in the motion, with its deviation."""
         column = self.columns[0]
@@ -137,7 +142,8 @@ class RecordedBalance:
 
     def mean(self, column: int, since: float = -np.inf) -> float:
         """Return a mean over the blocks whose middle is at `since` or later, of pressures about their zero."""
-        values = self.blocks.means[:, 2] if column == 2 else self.blocks.driving(self.zero, root=column == 1)
+        zero = self.root_zero if column == 1 else self.zero
+        values = self.blocks.means[:, 2] if column == 2 else self.blocks.driving(zero, root=column == 1)
         chosen = self.blocks.time >= since
         if not chosen.any():
             chosen[-1] = True
@@ -318,12 +324,13 @@ def _step(balance: RecordedBalance, causes: dict[Cause, float]) -> Evidence:
     assert test is not None
     onset = test.onset()
     flows, deviations, scores = [], [], []
-    for own, mean in ((test, 0), (orifice, 1)):
+    beside = {own.name: own.beside for own in balance.hypotheses}
+    for name, own, mean in ((LEAK, test, 0), (ORIFICE, orifice, 1)):
         if own is not None:
             pressure = balance.mean(mean, onset.value)
             flows.append(own.fitted[0] * pressure)
             deviations.append(own.fitted[1] * pressure)
-            scores.append(own.score)
+            scores.append(own.score + beside.get(name, 0.0))
     weights = np.exp(0.5 * (np.array(scores) - max(scores)))
     weights /= weights.sum()
     value = float(weights @ flows)

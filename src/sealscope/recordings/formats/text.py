@@ -9,11 +9,12 @@ from __future__ import annotations
 import csv
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.util import find_spec
+from itertools import accumulate, chain
 from math import isnan
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -72,8 +73,6 @@ _STAMP_RULE = "time must be a stamp such as 2024-05-31T12:00:00.002"
 _HALF_A_NUMBER = re.compile(r"[\s+\-\d.,:TeE]{0,40}")
 #: The number of a column of times: `t.1` of pandas, `Time 2 - slow` of catman.
 _NUMBER = re.compile(r"[\s._(-]{0,4}\d{1,4}\b.{0,60}")
-#: Rows as cells, or as numbers (n, k) of the columns asked for.
-_Rows = list[list[str]] | NDArray[np.float64]
 
 
 def read_text(path: Path, wanted: Wanted) -> RecordingFields:
@@ -86,12 +85,9 @@ def read_text(path: Path, wanted: Wanted) -> RecordingFields:
 
     def prepare(kinds: Mapping[int, str], date: int | None) -> Sequence[str]:
         log = _Log(path, layout, kinds, date)
-        for block in log.blocks():
-            log.take(*block)
-        rows = log.total
-        columns, notes = log.finish()
+        columns, notes = log.joined([*log.blocks()])
         held.update(columns)
-        return [*layout.notes, *notes, *log.remarks_and_headings(rows)]
+        return [*layout.notes, *notes, *log.remarks_and_headings()]
 
     def series(column: int, clock: Clock | None = None) -> Series:
         return Series("", layout.labels[column], 0, partial(held.__getitem__, column), clock)
@@ -143,27 +139,37 @@ def read_text_parts(path: Path, wanted: Wanted, rows_of: Callable[[RecordingFiel
         yield read_text(path, wanted)
         return
     own = None if layout.own is None else parse_description(layout.own)
-    log, size, total = _Log(path, layout, choice.columns, choice.date), 0, 0
+    log = _Log(path, layout, choice.columns, choice.date)
 
-    def part(source: _Log, more: Sequence[str] = ()) -> RecordingFields:
-        columns, notes = source.finish()
+    def part(blocks: list[_Block], more: Sequence[str] = ()) -> RecordingFields:
+        columns, notes = log.joined(blocks)
         return converted(choice, columns, layout.kind, wanted, [*layout.notes, *notes, *more], layout.about, own)
 
-    for block, lines, cut in log.blocks():
-        if not size:
-            beginning = _Log(path, layout, choice.columns, choice.date)
-            beginning.take(block, lines, cut)
-            size = rows_of(part(beginning))
-        first = 0
-        while first < len(block):
-            last = min(len(block), first + size - log.total)
-            log.take(block[first:last], lines[first:last], cut and last == len(block))
-            total, first = total + last - first, last
-            if log.total == size:
-                yield part(log)
-    notes = log.remarks_and_headings(total)
-    if log.total or not total:
-        yield part(log, notes)
+    blocks = log.blocks()
+    first = next(blocks, None)
+    size = 1 if first is None else rows_of(part([first[:]]))
+    before: list[_Block] = []
+    for blocks_of_part in _cut([] if first is None else chain([first], blocks), size):
+        if before:
+            yield part(before)
+        before = blocks_of_part
+    yield part(before, log.remarks_and_headings())
+
+
+def _cut(blocks: Iterable[_Block], size: int) -> Iterator[list[_Block]]:
+    """Yield blocks that together have `size` rows, the last ones fewer."""
+    held: list[_Block] = []
+    room = size
+    for block in blocks:
+        rest = block
+        while len(rest) >= room:
+            yield [*held, rest[:room]]
+            held, room, rest = [], size, rest[room:]
+        if len(rest):
+            held.append(rest)
+            room -= len(rest)
+    if held:
+        yield held
 
 
 def look_at(path: Path) -> Layout:
@@ -181,58 +187,48 @@ def look_at(path: Path) -> Layout:
 
 
 @dataclass
-class _Words:
-    """Cells that hold a word in place of a number (`OVERLOAD`), or lines of words; `at`: their rows."""
+class _Block:
+    """Rows of a log: its columns (n,); of the cells that hold a word in place of a number, the rows and the first."""
 
-    rule: str = "a sample must be a number"
-    count: int = 0
-    first: str = ""
-    where: str = ""
-    at: list[int] = field(default_factory=list)
+    columns: dict[int, NDArray[Any]] = field(default_factory=dict)
+    words: dict[int, NDArray[np.intp]] = field(default_factory=dict)
+    first: dict[int, str] = field(default_factory=dict)
 
-    def add(self, text: str, where: str, row: int = 0) -> None:
-        if not self.count:
-            self.first, self.where = text.strip()[:40], where
-        self.count += 1
-        self.at.append(row)
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values())))
 
-    def note(self, what: str, most: float) -> list[str]:
-        """Return a line for the history, where there are any; raise InputError where there are more than `most`."""
-        if self.count > most:
-            raise InputError(f"{self.rule}, got {self.first!r} {self.where}")
-        return [f"{what}, first {self.first!r} {self.where}"] if self.count else []
+    def __getitem__(self, rows: slice) -> _Block:
+        first, stop, _ = rows.indices(len(self))
+        words = {column: at[(at >= first) & (at < stop)] - first for column, at in self.words.items()}
+        return _Block({column: cells[rows] for column, cells in self.columns.items()}, words, self.first)
 
 
 class _Log:
-    """The rows of a text log, and the columns of those taken so far; `kinds` and `date` are those of `Prepare`."""
+    """The rows of a text log in blocks; `kinds` and `date` are those of `Prepare`."""
 
     def __init__(self, path: Path, layout: Layout, kinds: Mapping[int, str], date: int | None) -> None:
         self.path, self.layout, self.kinds, self.date, self.place = path, layout, kinds, date, str(path)
         self.least = max(kinds) + 1
-        self.remarks, self.repeated = _Words(), 0
+        self.total = self.repeated = self.remarks = 0
+        self.remark = ""
         plain = layout.encoding in ("utf-8", "utf-8-sig", "cp1252") and layout.delimiter != " "
         numeric = not layout.cell_units and "texts" not in kinds.values()
         self.fast = plain and numeric and path.stat().st_size >= _LARGE and find_spec("pyarrow") is not None
         self.stamped: bool | None = None
         self.dated = False
-        self._begin()
 
-    def _begin(self) -> None:
-        self.total = 0
-        self.parts: dict[int, list[NDArray[Any]]] = {column: [] for column in self.kinds}
-        self.words = {column: _Words() for column in self.kinds}
-
-    def blocks(self) -> Iterator[tuple[_Rows, Sequence[int], bool]]:
-        """Yield blocks of rows, their lines' numbers, and whether the last one was not written whole."""
+    def blocks(self) -> Iterator[_Block]:
+        """Yield the rows in blocks that are read one after the other."""
         layout, usual, first = self.layout, 0, True
         with self.path.open("rb") as file:
             for number, block, cut in _blocks(file, layout.encoding, self.place):
                 if self.fast and not cut:
-                    values = self._plain(number, block)
-                    self.fast, first = values is not None or not first, False
-                    if values is not None:
-                        usual = self.width
-                        yield values, range(number, number + len(values)), False
+                    plain = self._plain(number, block)
+                    self.fast, first = plain is not None or not first, False
+                    if plain is not None:
+                        self.stamped, usual = False, self.width
+                        self._count(len(plain))
+                        yield plain
                         continue
                 lines = _lines(block, layout)
                 kept = self._samples(lines, max(0, layout.first_row + 1 - number))
@@ -246,10 +242,15 @@ class _Log:
                 usual = len(rows[-1])
                 rows, where = self._checked(rows, where)
                 if rows:
-                    yield rows, where, cut
+                    self._count(len(rows))
+                    yield self._read(rows, where, cut)
 
-    def _plain(self, number: int, block: bytes) -> NDArray[np.float64] | None:
-        """Return the columns (n, k) of a block from line `number` on; None where a row is no row of plain numbers."""
+    def _count(self, rows: int) -> None:
+        self.total += rows
+        check_size(self.total, len(self.kinds))
+
+    def _plain(self, number: int, block: bytes) -> _Block | None:
+        """Read a block from line `number` on; None where a row is no row of plain numbers."""
         from pyarrow import ArrowInvalid, csv, float64, py_buffer
 
         layout, start = self.layout, 0
@@ -275,10 +276,8 @@ class _Log:
             )
         except ArrowInvalid:
             return None
-        values = np.empty((table.num_rows, len(wanted)), order="F")
-        for index, column in enumerate(table.columns):
-            values[:, index] = column.to_numpy()
-        return None if np.isinf(values).any() else values
+        columns = {column: cells.to_numpy() for column, cells in zip(self.kinds, table.columns, strict=True)}
+        return None if any(np.isinf(cells).any() for cells in columns.values()) else _Block(columns)
 
     def _samples(self, lines: Sequence[str], first: int) -> list[int]:
         """Return the indices of the lines from `first` on that are no comments, blank or repeated headings."""
@@ -320,7 +319,9 @@ class _Log:
                 short and any(is_value(cell, layout.decimal) for cell in row)
             )
             if short and not valued:
-                self.remarks.add(layout.delimiter.join(row), f"(line {numbers[i]}, {self.place})")
+                where = f"(line {numbers[i]}, {self.place})"
+                self.remark = self.remark or f"{layout.delimiter.join(row).strip()[:40]!r} {where}"
+                self.remarks += 1
             elif short or any(cell.strip() for cell in row[most:]):
                 raise InputError(
                     f"a row must have {counted(most, 'cell')}, got {len(row)} (line {numbers[i]}, {self.place})"
@@ -329,36 +330,31 @@ class _Log:
                 kept.append(i)
         return [rows[i] for i in kept], [numbers[i] for i in kept]
 
-    def take(self, rows: _Rows, lines: Sequence[int], cut: bool) -> None:
-        """Read more rows; `cut`: whether the last one was not written whole."""
-        before, self.total = self.total, self.total + len(rows)
-        check_size(self.total, len(self.kinds))
-        if isinstance(rows, np.ndarray):
-            self.stamped = False
-            for part, numeric in zip(self.parts.values(), rows.T, strict=True):
-                part.append(numeric)
-            return
+    def _read(self, rows: Sequence[Sequence[str]], lines: Sequence[int], cut: bool) -> _Block:
+        """Read rows of cells; `cut`: whether the last one was not written whole."""
+        block = _Block()
         for column, kind in self.kinds.items():
             cells = [row[column] for row in rows]
-            where = partial(self._place_of, lines=lines, column=column)
+            where, words = partial(self._place_of, lines=lines, column=column), list[int]()
             if unit := self.layout.cell_units.get(column):
                 cells = plain_cells(cells, unit, cut, where)
             if kind == "texts":
                 check_texts(self.total, max(map(len, cells)), self.layout.labels[column].whole)
-                values: NDArray[Any] = np.array(cells, dtype=object)
+                block.columns[column] = np.array(cells, dtype=object)
             elif kind == "time" and self._is_stamped(cells, rows):
                 if self.dated and self.date is not None:
                     days = [row[self.date].strip() for row in rows]
                     cells = [f"{day} {cell.strip()}" if cell.strip() else "" for day, cell in zip(days, cells)]  # noqa: B905
-                values = self._dates(cells, where, self.words[column], before)
+                block.columns[column], words = self._dates(cells, where)
             else:
-                values, words = numbers(cells, self.layout.decimal, where)
+                block.columns[column], words = numbers(cells, self.layout.decimal, where)
                 if kind == "any":
-                    values[words] = np.inf  # no number is, that may stand in a log
-                else:
-                    for index in words:
-                        self.words[column].add(cells[index], where(index), before + index)
-            self.parts[column].append(values)
+                    block.columns[column][words] = np.inf  # no number is, that may stand in a log
+                    continue
+            if words:
+                block.words[column] = np.array(words)
+                block.first[column] = f"{cells[words[0]].strip()[:40]!r} {where(words[0])}"
+        return block
 
     def _is_stamped(self, cells: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
         """Return whether the time holds stamps, by its first cell; it may be a time of the day beside a date."""
@@ -372,48 +368,56 @@ class _Log:
     def _place_of(self, index: int, lines: Sequence[int], column: int) -> str:
         return f"(line {lines[index]}, column {self.layout.labels[column].whole}, {self.place})"
 
-    def _dates(
-        self, cells: list[str], where: Callable[[int], str], words: _Words, before: int
-    ) -> NDArray[np.datetime64]:
+    def _dates(self, cells: list[str], where: Callable[[int], str]) -> tuple[NDArray[np.datetime64], list[int]]:
+        """Return cells as moments (n,), missing ones and words as NaT, and the indices of the words."""
         texts = ["" if is_missing(cell) else cell for cell in cells]
         with suppress(ValueError):
-            return stamps(texts)
-        for index, text in enumerate(texts):
-            if text.strip() and not is_stamp(text) and not any(sign.isdigit() for sign in text):
-                words.rule = _STAMP_RULE
-                words.add(text, where(index), before + index)
-                texts[index] = ""
+            return stamps(texts), []
+        words = [
+            index
+            for index, text in enumerate(texts)
+            if text.strip() and not is_stamp(text) and not any(sign.isdigit() for sign in text)
+        ]
+        for index in words:
+            texts[index] = ""
         try:
-            return stamps(texts)
+            return stamps(texts), words
         except ValueError as error:
             bad = int(error.args[0])
             raise InputError(f"{_STAMP_RULE}, got {cells[bad]!r} {where(bad)}") from None
 
-    def finish(self) -> tuple[dict[int, NDArray[Any]], list[str]]:
-        """Return the columns taken, and lines for the history; what is taken from now on begins anew."""
-        labels, notes, joined = self.layout.labels, list[str](), dict[int, NDArray[Any]]()
-        last = [*self.kinds][-1]
-        no_time = self.words[last].at if self.kinds[last] == "time" else []
-        for column, part in self.parts.items():  # each column's blocks are let go before the next is joined
-            joined[column] = np.concatenate(part) if part else np.empty(0)
-            part.clear()
-            if no_time:  # the rows of a summary, where a word stands in place of the time
-                joined[column] = np.delete(joined[column], no_time)
-            joined[column].setflags(write=False)  # made here: a recording takes it as it is
-        for column, words in self.words.items():
-            what = f"column {labels[column].whole}: {counted(words.count, 'cell')} without a number read as missing"
-            notes += words.note(what, MOST_WORDS * self.total)
+    def joined(self, blocks: list[_Block]) -> tuple[dict[int, NDArray[Any]], list[str]]:
+        """Return the columns of blocks, which let go of them, and lines for the history; refuse many words."""
+        labels, notes, columns = self.layout.labels, list[str](), dict[int, NDArray[Any]]()
+        starts, last = [0, *accumulate(map(len, blocks))], [*self.kinds][-1]
+        words = {
+            column: [start + at for start, own in zip(starts, blocks, strict=False) for at in own.words.get(column, ())]
+            for column in self.kinds
+        }
+        for column, at in words.items():  # each column's blocks are let go before the next is joined
+            first = next((own.first[column] for own in blocks if len(own.words.get(column, ()))), "")
+            if len(at) > MOST_WORDS * starts[-1]:
+                stamped = self.stamped and self.kinds[column] == "time"
+                raise InputError(f"{_STAMP_RULE if stamped else 'a sample must be a number'}, got {first}")
+            if at:
+                many = f"{counted(len(at), 'cell')} without a number read as missing"
+                notes.append(f"column {labels[column].whole}: {many}, first {first}")
+            cells = np.concatenate([own.columns.pop(column) for own in blocks]) if blocks else np.empty(0)
+            # the rows of a summary, where a word stands in place of the time
+            cells = np.delete(cells, words[last]) if words[last] and self.kinds[last] == "time" else cells
+            cells.setflags(write=False)  # made here: a recording takes it as it is
+            columns[column] = cells
         if self.dated and self.date is not None:
             notes.append(f"date and time joined from columns {labels[self.date].whole} and {labels[last].whole}")
-        self._begin()
-        return joined, notes
+        return columns, notes
 
-    def remarks_and_headings(self, rows: int) -> list[str]:
-        """Return lines for the history on what stands among the `rows`; raise InputError for many remarks."""
-        most = max(MOST_WORDS * rows, _MOST_REMARKS)
-        lines = f"{counted(self.remarks.count, 'line')} of text among the samples left out"
+    def remarks_and_headings(self) -> list[str]:
+        """Return lines for the history on what stands among the rows; raise InputError for many remarks."""
+        if self.remarks > max(MOST_WORDS * self.total, _MOST_REMARKS):
+            raise InputError(f"a sample must be a number, got {self.remark}")
+        remarks = f"{counted(self.remarks, 'line')} of text among the samples left out, first {self.remark}"
         repeated = f"{counted(self.repeated, 'line')} of the heading repeated among the samples left out"
-        return [*self.remarks.note(lines, most), *([repeated] if self.repeated else [])]
+        return [*([remarks] if self.remarks else []), *([repeated] if self.repeated else [])]
 
 
 def _blocks(file: BinaryIO, encoding: str, place: str) -> Iterator[tuple[int, bytes, bool]]:
