@@ -90,3 +90,13 @@ def test_mean_flow_from_pressures_and_command(law: str) -> None:
     assert evidence.leak_interval_lpm is not None
     assert evidence.leak_interval_lpm[0] <= result.truth.mean_leak_lpm <= evidence.leak_interval_lpm[1]
     assert evidence.onset_s == pytest.approx(ONSET, abs=4.0)
+
+
+def test_pressures_that_hardly_vary_leave_the_size_as_it_is() -> None:
+    """A laminar leak passes for an orifice whose zero is off: its flow is counted about that zero."""
+    recording = simulate(
+        rig="single-rod-eha", command="2 sin(6t)", leak="0.1 L/min from 60 s", duration="120 s", seed=1
+    )
+    diagnosis = diagnose(recording, rig="single-rod-eha", quick=True)
+    assert diagnosis.verdict == "leak"
+    assert diagnosis.leak_lpm == pytest.approx(0.1, rel=0.03)

@@ -70,7 +70,7 @@ def test_units_and_sides_do_not_matter() -> None:
     )
     swapped = replace(recording, channels={**recording.channels, "p_A": recording["p_B"], "p_B": recording["p_A"]})
     for other in (counts, swapped):
-        assert sorted(test.score for test in level_tests(other)) == pytest.approx(sorted(scores), rel=0.02)
+        assert sorted(test.score for test in level_tests(other)) == pytest.approx(sorted(scores), rel=0.05)
 
 
 CHANGES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -113,12 +113,13 @@ def test_faults_of_the_simulated_rig(fault: str, cause: str) -> None:
     assert (step.cause, round(step.onset / 10.0)) == (cause, 6)
 
 
-@pytest.mark.parametrize("leak", [(), "0.0042 L/min from 60 s", "0.1 L/min from 60 s"])
+@pytest.mark.parametrize("leak", [(), "0.0042 L/min from 60 s", "0.02 L/min from 60 s"])
 def test_a_leak_moves_none_of_them(leak: str) -> None:
     assert other_step(simulate(command="3 sin(4t)", leak=leak, duration="120 s", seed=1)) is None
 
 
-def test_a_large_leak_slows_the_piston_and_is_a_leak() -> None:
-    recording = simulate(command="3 sin(4t)", leak="0.5 L/min from 60 s", duration="120 s", seed=1)
+@pytest.mark.parametrize("leak", ["0.1 L/min from 60 s", "0.5 L/min from 60 s"])
+def test_a_large_leak_slows_the_piston_and_is_a_leak(leak: str) -> None:
+    recording = simulate(command="3 sin(4t)", leak=leak, duration="120 s", seed=1)
     assert other_step(recording) is not None
     assert diagnose(recording, quick=True).verdict == "leak"

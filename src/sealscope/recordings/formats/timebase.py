@@ -153,19 +153,16 @@ def nominal_rate(t: Array) -> float:
     positive.
     """
     steps = np.diff(t)
+    span = float(t[-1] - t[0])
+    if steps.size and np.isfinite(span) and steps.min() > 0:
+        mean = span / steps.size
+        off_line = float(np.abs(t - t[0] - mean * np.arange(t.size)).max())
+        if off_line < 0.6 * mean:
+            return _shortest(1.0 / mean, max(1e-9, min(2 * off_line / span, 1e-3)))
     steps = steps[np.isfinite(steps) & (steps > 0)]
     if not steps.size:
         raise InputError("time must increase between some samples")
-    step = float(np.median(steps))
-    span = float(t[-1] - t[0])
-    slack = 1e-9
-    if np.isfinite(span) and steps.size == t.size - 1:
-        mean = span / (t.size - 1)
-        off_line = float(np.max(np.abs(t - t[0] - mean * np.arange(t.size))))
-        if off_line < 0.6 * mean:
-            step = mean
-            slack = max(slack, min(2 * off_line / span, 1e-3))
-    return _shortest(1.0 / step, slack)
+    return _shortest(1.0 / float(np.median(steps)), 1e-9)
 
 
 def _shortest(value: float, slack: float) -> float:
@@ -305,11 +302,11 @@ def time_base(
 
 def _finer(t: Array) -> tuple[float, Array] | None:
     """Return the resolution [s] of times (n,) that samples share as their distances ask for, and uniform times."""
-    if t.size < _FEWEST_SHARED or not np.isfinite(t).all():
-        return None
     steps = np.diff(t)
+    if t.size < _FEWEST_SHARED or 2 * np.count_nonzero(steps) > steps.size:
+        return None
     changes = np.flatnonzero(steps)
-    if (steps < 0).any() or changes.size < 3 or 2 * changes.size > steps.size:
+    if not np.isfinite(t).all() or (steps < 0).any() or changes.size < 3:
         return None
     resolution = float(steps[changes].min())
     counts = np.diff(changes) / np.round(steps[changes][1:] / resolution)
