@@ -143,17 +143,13 @@ def _texts(data: Any, name: str, size: int) -> list[str]:
 
 def _description(file: Any) -> dict[str, Any]:
     try:
-        history = _text(file.attrs["history"]) or "[]"
+        history, provenance = (_text(file.attrs[name]) for name in ("history", "provenance"))
+        description: dict[str, Any] = {"format": int(_number(file.attrs[OWN])), "rate": _number(file.attrs["rate"])}
+        description["provenance"] = json.loads(provenance or "{}")
         try:
-            lines = json.loads(history)
+            description["history"] = json.loads(history or "[]")
         except ValueError:  # another tool has added its own line, as the CF conventions ask
-            lines = history.splitlines()
-        description = {
-            "format": int(_number(file.attrs[OWN])),
-            "rate": _number(file.attrs["rate"]),
-            "provenance": json.loads(_text(file.attrs["provenance"]) or "{}"),
-            "history": lines,
-        }
+            description["history"] = (history or "").splitlines()
     except (KeyError, IndexError, ValueError, TypeError, OverflowError) as error:
         raise InputError("the recording's description must be whole, got damaged attributes") from error
     return parse_description(json.dumps(description))

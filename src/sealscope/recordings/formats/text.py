@@ -434,13 +434,11 @@ def _blocks(file: BinaryIO, encoding: str, place: str) -> Iterator[tuple[int, by
     newline = "\n".encode(encoding if width == 2 else "ascii")
     number = 1
     while block := file.read(_CHUNK):
-        while (end := block.rfind(newline)) < 0 and len(block) < _LONGEST_LINE and (more := file.read(_CHUNK)):
+        while (end := _end(block, newline)) < 0 and len(block) < _LONGEST_LINE and (more := file.read(_CHUNK)):
             block += more
         if width == 1 and b"\0" in block:
             line = number + block[: block.index(b"\0")].count(b"\n")
             raise InputError(f"a text log must be text throughout, got binary data (line {line}, {place})")
-        while width == 2 and end >= 0 and end % 2:  # a newline's bytes across two characters
-            end = block.rfind(newline, 0, end + 1)
         if end < 0 and len(block) >= _LONGEST_LINE:
             if b"\r" not in block or width == 2:
                 raise InputError(f"a text log must have lines, got {len(block)} bytes without")
@@ -451,11 +449,17 @@ def _blocks(file: BinaryIO, encoding: str, place: str) -> Iterator[tuple[int, by
         end += width
         file.seek(end - len(block), SEEK_CUR)  # what is read again costs less than a copy of the block
         yield number, block, end, False
-        # numpy counts a byte faster than bytes do
-        lines = (
-            block.count(newline, 0, end) if width == 2 else np.count_nonzero(np.frombuffer(block, np.uint8, end) == 10)
-        )
-        number += int(lines) or block.count(b"\r", 0, end)
+        signs = np.frombuffer(block, f"<u{width}", end // width)  # numpy counts them faster than bytes do
+        lines = int(np.count_nonzero(signs == int.from_bytes(newline, "little")))
+        number += lines or block.count(b"\r", 0, end)
+
+
+def _end(block: bytes, newline: bytes) -> int:
+    """Return where the last newline begins, not across two characters of UTF-16; -1 where there is none."""
+    end = block.rfind(newline)
+    while end >= 0 and end % len(newline):
+        end = block.rfind(newline, 0, end + 1)
+    return end
 
 
 def _lines(block: bytes, layout: Layout) -> list[str]:
