@@ -60,8 +60,8 @@ from sealscope.recordings.formats.text_layout import (
 )
 from sealscope.recordings.formats.timebase import is_stamp, stamps
 
-#: Bytes that are read at a time, and of the longest line.
-_CHUNK, _LONGEST_LINE = 2**21, 2**23
+#: Bytes that are read at a time, so many times more by pyarrow, and bytes of the longest line.
+_CHUNK, _FAST, _LONGEST_LINE = 2**19, 4, 2**23
 #: Logs of so many bytes are worth the import of pyarrow.
 _LARGE = 2**20
 #: Signs that begin quoted cells and comments.
@@ -217,13 +217,15 @@ class _Log:
         self.fast = plain and numeric and path.stat().st_size >= _LARGE and find_spec("pyarrow") is not None
         self.stamped: bool | None = None
         self.dated = False
-        self.nulls = ["", "NaN"]
+        self.nulls, self.width = ["", "NaN"], 0
 
     def blocks(self) -> Iterator[_Block]:
         """Yield the rows in blocks that are read one after the other."""
         layout, usual, first = self.layout, 0, True
         with self.path.open("rb") as file:
-            for number, block, end, cut in _blocks(file, layout.encoding, self.place):
+            for number, block, end, cut in _blocks(
+                file, layout.encoding, self.place, lambda: _CHUNK * (_FAST if self.fast and self.width else 1)
+            ):
                 if self.fast and not cut:
                     plain = self._plain(number, block, end)
                     self.fast, first = plain is not None or not first, False
@@ -378,7 +380,7 @@ class _Log:
 
     def _dates(self, cells: list[str], where: Callable[[int], str]) -> tuple[NDArray[np.datetime64], list[int]]:
         """Return cells as moments (n,), missing ones and words as NaT, and the indices of the words."""
-        texts = ["" if is_missing(cell) else cell for cell in cells]
+        texts = ["" if cell.strip().lower() in MISSING else cell for cell in cells]
         with suppress(ValueError):
             return stamps(texts), []
         words = [
@@ -428,13 +430,15 @@ class _Log:
         return [*([remarks] if self.remarks else []), *([repeated] if self.repeated else [])]
 
 
-def _blocks(file: BinaryIO, encoding: str, place: str) -> Iterator[tuple[int, bytes, int, bool]]:
+def _blocks(
+    file: BinaryIO, encoding: str, place: str, chunk: Callable[[], int]
+) -> Iterator[tuple[int, bytes, int, bool]]:
     """Yield (number of the first line, bytes, where their whole lines end, whether the last one has no end)."""
     width = 2 if encoding.startswith("utf-16") else 1
     newline = "\n".encode(encoding if width == 2 else "ascii")
     number = 1
-    while block := file.read(_CHUNK):
-        while (end := _end(block, newline)) < 0 and len(block) < _LONGEST_LINE and (more := file.read(_CHUNK)):
+    while block := file.read(chunk()):
+        while (end := _end(block, newline)) < 0 and len(block) < _LONGEST_LINE and (more := file.read(chunk())):
             block += more
         if width == 1 and b"\0" in block:
             line = number + block[: block.index(b"\0")].count(b"\n")

@@ -129,7 +129,6 @@ def _date_of(match: re.Match[str], day_first: bool) -> str:
     """Return the date of a stamp as ISO writes it; 1970-01-01 for the time of a day alone."""
     if match["days"]:  # a length of time, as pandas writes it
         return str(np.datetime64(_NO_DATE) + int(match["days"]))
-    year, month, day = _NO_DATE.split("-")
     if match["first"]:
         first, second = match["first"], match["second"]
         day_first = day_first or (match["stroke"] == "-" and int(second) <= 12)
@@ -140,9 +139,10 @@ def _date_of(match: re.Match[str], day_first: bool) -> str:
         year, month = match["year_named"] or match["year_after"], str(_month(name))
         day = match["day_named"] or match["day_after"]
     elif match["year"] or match["year_cjk"]:
-        year, month, day = (match[part] or match[f"{part}_cjk"] for part in ("year", "month", "day"))
-    elif match["date"]:
-        year, month, day = re.split("[-/.]", match["date"])
+        year, month = match["year"] or match["year_cjk"], match["month"] or match["month_cjk"]
+        day = match["day"] or match["day_cjk"]
+    else:
+        year, month, day = re.split("[-/.]", match["date"] or _NO_DATE)
     return f"{'20' if len(year) == 2 else ''}{year}-{month:0>2}-{day:0>2}"
 
 
