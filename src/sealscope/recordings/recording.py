@@ -208,7 +208,7 @@ class Recording:
         Its ``attrs`` hold the units by column, the rate, the provenance and the history; `from_pandas` reads them.
         Raises MissingExtra without pandas, and InputError where the provenance holds other values than JSON's.
         """
-        from sealscope.recordings.formats.frames import to_pandas
+        from sealscope.recordings.frames import to_pandas
 
         return to_pandas(*self.series())
 
@@ -217,7 +217,7 @@ class Recording:
 
         Raises MissingExtra without xarray, and InputError where the provenance holds other values than JSON's.
         """
-        from sealscope.recordings.formats.frames import to_xarray
+        from sealscope.recordings.frames import to_xarray
 
         return to_xarray(*self.series())
 
@@ -252,7 +252,7 @@ class Recording:
             If no column is a channel, a unit is of another dimension, a value is no number, or there is neither time
             nor rate.
         """
-        from sealscope.recordings.formats.frames import read_pandas
+        from sealscope.recordings.frames import read_pandas
 
         check_call(map or {}, rate)
         try:
