@@ -18,6 +18,7 @@ from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.preamble import entries
 from sealscope.recordings.formats.table import Clock, RecordingFields, Series, check_size, table_of
 from sealscope.recordings.formats.text_layout import SNIFF, encoding_of
+from sealscope.recordings.formats.timebase import stamps
 
 #: What ends each header of the format.
 _END = "***End_of_Header***"
@@ -48,9 +49,11 @@ class _Packet:
     def moment(self, index: int) -> np.datetime64 | None:
         """Return when a channel's first sample was taken; None where the header does not say."""
         try:
-            day, clock = self.head["date"][index].replace("/", "-"), self.head["time"][index].replace(",", ".")
-            seconds, _, fraction = clock.partition(".")
-            return np.datetime64(f"{day}T{seconds}.{fraction[:9] or '0'}", "ns")
+            day, (seconds, _, fraction) = (
+                self.head["date"][index],
+                self.head["time"][index].replace(",", ".").partition("."),
+            )
+            return stamps([f"{day} {seconds}.{fraction[:9] or '0'}"])[0] if day else None
         except (KeyError, IndexError, ValueError):
             return None
 
