@@ -8,115 +8,57 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from sealscope.errors import UnreadableFile
 from sealscope.recordings import Recording, inspect, read, write
 
+from ..recordings.dialects import DIALECTS, P_A, P_B, RATE, T, pack
 from ..recordings.exports import EXPORTS
 from .mutations import changed_bytes
 from .targets import Use
 
-RATE, N = 500.0, 240
-T = np.arange(N) / RATE
-RECORDING = Recording(
-    T,
-    {"p_A": 2e5 + 5e4 * np.sin(20 * T), "p_B": 2e5 - 5e4 * np.sin(20 * T), "x": 0.01 * np.sin(20 * T)},
-    {"p_A": "Pa", "p_B": "Pa", "x": "m"},
-    RATE,
-)
+RECORDING = Recording(T, {"p_A": 1e5 * P_A, "p_B": 1e5 * P_B}, {"p_A": "Pa", "p_B": "Pa"}, RATE)
 #: Longest time that a file may take [s], with the start of a process that reads it; a loop takes for ever.
 LONGEST = 45.0
+#: Kind -> the dialect that is mutated, and the library that it needs.
+_DIALECTS = {
+    "text": ("text, preamble", "numpy"),
+    "TDMS": ("TDMS, waveform", "nptdms"),
+    "MATLAB 4": ("MATLAB 4", "matio"),
+    "MATLAB 5": ("MATLAB 5, struct", "matio"),
+    "MATLAB 7.3": ("MATLAB v7.3, struct", "matio"),
+    "MDF 3": ("MDF 3.30", "asammdf"),
+    "MDF 4": ("MDF 4.10", "asammdf"),
+    "LabVIEW": ("LabVIEW, packets", "numpy"),
+    "spreadsheet": ("Excel", "python_calamine"),
+    "JSON lines": ("JSON lines, value and unit", "numpy"),
+    "JSON document": ("JSON, array of signals", "numpy"),
+    "long table": ("long, historian with units", "numpy"),
+    "scope": ("a clock each, TwinCAT Scope", "numpy"),
+    "quantity": ("units in cells, quoted decimal commas", "numpy"),
+    "channel table": ("Graphtec GL", "numpy"),
+    "split time": ("time, date and hours, minutes, seconds", "numpy"),
+}
 
 
-def own(folder: Path, name: str) -> Path:
+def dialect(kind: str, folder: Path) -> Path:
+    name, library = _DIALECTS[kind]
+    pytest.importorskip(library)
+    return {**DIALECTS, **EXPORTS}[name].write(folder)
+
+
+def own(name: str, folder: Path) -> Path:
     write(RECORDING, folder / name)
     return folder / name
 
 
-def logged(folder: Path) -> Path:
-    rows = "".join(f"{t:.3f};{a:.3f};{b:.3f}\n" for t, a, b in zip(T, RECORDING["p_A"], RECORDING["p_B"], strict=True))
-    text = "Operator: N. N.\nOil temperature = 41 degC\nTime [s];p_A [Pa];p_B [kPa]\n" + rows
-    (folder / "log.txt").write_text(text)
-    return folder / "log.txt"
-
-
-def tdms(folder: Path) -> Path:
-    nptdms = pytest.importorskip("nptdms")
-    channels = [
-        nptdms.ChannelObject("Log", name, RECORDING[name], {"unit_string": unit, "wf_increment": 1 / RATE})
-        for name, unit in RECORDING.units.items()
-    ]
-    with nptdms.TdmsWriter(folder / "log.tdms") as writer:
-        writer.write_segment(channels)
-    return folder / "log.tdms"
-
-
-def matlab(folder: Path, version: str) -> Path:
-    held = {"t": T, **RECORDING.channels}
-    if version == "v7.3":
-        matio = pytest.importorskip("matio")
-        matio.save_to_mat(folder / "log.mat", {"log": held}, version=version)
-    else:
-        pytest.importorskip("matio")
-        from scipy.io import savemat
-
-        savemat(folder / "log.mat", held if version == "4" else {"log": held}, format=version)
-    return folder / "log.mat"
-
-
-def mdf(folder: Path, version: str) -> Path:
-    asammdf = pytest.importorskip("asammdf")
-    signals = [asammdf.Signal(RECORDING[name], T, unit=unit, name=name) for name, unit in RECORDING.units.items()]
-    with asammdf.MDF(version=version) as file:
-        file.append(signals)
-        return Path(file.save(folder / "log.mf4", overwrite=True))
-
-
-def xlsx(folder: Path) -> Path:
-    openpyxl = pytest.importorskip("openpyxl")
-    pytest.importorskip("python_calamine")
-    book = openpyxl.Workbook()
-    book.active.append(["t [s]", "p_A [Pa]", "p_B [Pa]"])
-    for row in zip(T, RECORDING["p_A"], RECORDING["p_B"], strict=True):
-        book.active.append([float(value) for value in row])
-    book.save(folder / "log.xlsx")
-    return folder / "log.xlsx"
-
-
-def gzipped(folder: Path) -> Path:
-    import gzip
-
-    (folder / "log.csv.gz").write_bytes(gzip.compress(own(folder, "log.csv").read_bytes()))
-    return folder / "log.csv.gz"
-
-
 KINDS: dict[str, Callable[[Path], Path]] = {
-    "text": logged,
-    "own text": lambda folder: own(folder, "log.csv"),
-    "NetCDF": lambda folder: own(folder, "log.nc"),
-    "Parquet": lambda folder: own(folder, "log.parquet"),
-    "TDMS": tdms,
-    "MATLAB 4": lambda folder: matlab(folder, "4"),
-    "MATLAB 5": lambda folder: matlab(folder, "5"),
-    "MATLAB 7.3": lambda folder: matlab(folder, "v7.3"),
-    "MDF 3": lambda folder: mdf(folder, "3.30"),
-    "MDF 4": lambda folder: mdf(folder, "4.10"),
-    "spreadsheet": xlsx,
-    "gzip": gzipped,
-    **{
-        kind: EXPORTS[name].write
-        for kind, name in {
-            "JSON lines": "JSON lines, value and unit",
-            "JSON document": "JSON, array of signals",
-            "long table": "long, historian with units",
-            "scope": "a clock each, TwinCAT Scope",
-            "quantity": "units in cells, quoted decimal commas",
-            "channel table": "Graphtec GL",
-            "split time": "time, date and hours, minutes, seconds",
-        }.items()
-    },
+    **{kind: partial(dialect, kind) for kind in _DIALECTS},
+    "own text": partial(own, "log.csv"),
+    "NetCDF": partial(own, "log.nc"),
+    "Parquet": partial(own, "log.parquet"),
+    "gzip": lambda folder: pack(own("log.csv", folder).read_bytes(), folder, "gz"),
 }
 
 

@@ -31,7 +31,7 @@ from sealscope.diagnosis.commissioned.machine import JudgedAlarm
 from sealscope.errors import SealscopeError
 from sealscope.parameters import load_rig, parse_overrides, rig_names
 from sealscope.recordings import split_map_option
-from sealscope.recordings.formats.columns import Label, check_call, choose_columns
+from sealscope.recordings.formats.columns import Label, Wanted, check_call, choose_columns
 from sealscope.reporting.campaign.page import PAGE, campaign_text, write_campaign_page
 from sealscope.simulation.bench.profile import load_profile
 from sealscope.simulation.commands import parse_command
@@ -120,7 +120,7 @@ def _fault(text: str) -> None:
 def _columns(text: str) -> None:
     channel, column = split_map_option(text)
     check_call({channel: column}, None)
-    choose_columns(LABELS, channel_map={channel: column}, rate=500.0, place="FILE")
+    choose_columns(LABELS, Wanted({channel: column}, 500.0))
 
 
 def _experiment(key: str, text: str) -> None:

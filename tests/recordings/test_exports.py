@@ -54,9 +54,9 @@ def refused(path: Path, **options: object) -> str:
         ('{"a": {}}', "JSON must hold records or columns of samples, got none (FILE)"),
         ('{"t": [0, 1], "p_A [Pa]": [1, 2, 3]}', "p_A [Pa] must have as many samples as t (2), got 3 (FILE)"),
         ("\n".join(f'{{"n{k}": 1}}' for k in range(2000)), "records must have at most 1024 names, got more (FILE)"),
-        ("[" + "[]," * 50_000, "JSON must hold records or columns of samples, got none (FILE)"),
+        ("[" + "[]," * 20_000, "JSON must hold records or columns of samples, got none (FILE)"),
         ('{"a": "' + "x" * 3_000_000, "JSON must be whole, got: Unterminated string starting at (line 1, FILE)"),
-        ('{"a":[' + "{}," * 4_300_000 + "0]}", "JSON must hold records or columns of samples, got none (FILE)"),
+        ('{"a":[' + "{}," * 400_000 + "0]}", "JSON must hold records or columns of samples, got none (FILE)"),
     ],
 )  # fmt: skip
 def test_json_that_is_no_log(content: str, message: str, tmp_path: Path) -> None:
@@ -274,7 +274,7 @@ def test_no_cell_keeps_the_search_for_units_busy(cell: str, tmp_path: Path) -> N
     start = time.process_time()
     (tmp_path / "log.csv").write_text("t [s];p_A [Pa]\n" + f"{cell};{cell}\n" * 900)
     refused(tmp_path / "log.csv")
-    odd = ";".join(f"{k} q{chr(97 + k % 26)}{chr(97 + k // 26 % 26)}" for k in range(65, 3000))
+    odd = ";".join(f"{k} q{chr(97 + k % 26)}{chr(97 + k // 26 % 26)}" for k in range(65, 1500))
     (tmp_path / "log.csv").write_text("t [s];p_A [Pa]\n" + f"{odd}\n" * 3)
     refused(tmp_path / "log.csv")
     assert time.process_time() - start < 5.0

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from sealscope.errors import UnreadableFile
 from sealscope.recordings import Recording, inspect, read, write
-from sealscope.recordings.formats.columns import Label
+from sealscope.units import to_si
 
 T = np.arange(900) / 500
 P = 3e5 + 1e4 * np.sin(4 * T)
@@ -129,13 +129,13 @@ SLOW = {
     "a cell of blanks": "t [s],p_A [Pa]\n0,1\n1," + " " * 60_000 + "x\n2,3\n",
     "many cells of blanks": "t [s],p_A [Pa]\n" + ("0,1\n1," + " " * 900 + "x\n") * 60,
     "nearly stamps": "t [s],p_A [Pa]\n" + ("2024-01-01 " + " " * 900 + ",1\n") * 60,
-    "many unknown units": "t,p_A," + ",".join(f"a{i}" for i in range(4000)) + "\ns,Pa,"
-    + ",".join(f"q{i}" for i in range(4000)) + "\n" + ("1" + ",1" * 4001 + "\n") * 3,
+    "many unknown units": "t,p_A," + ",".join(f"a{i}" for i in range(1500)) + "\ns,Pa,"
+    + ",".join(f"q{i}" for i in range(1500)) + "\n" + ("1" + ",1" * 1501 + "\n") * 3,
     "square brackets": "t [s],p_A " + "[" * 60_000 + "\n0,1\n1,2\n",
     "round brackets": "t [s],p_A " + "(" * 30_000 + ")" * 30_000 + "\n0,1\n1,2\n",
     "blanks in a heading": "t [s],p_A" + " " * 60_000 + "x\n0,1\n1,2\n",
     "strokes": "t [s],p_A" + " / " * 20_000 + "x\n0,1\n1,2\n",
-    "headings between blanks": "a [a " * 12_000 + "\n0 1\n1 2\n",
+    "headings between blanks": "a [a " * 6_000 + "\n0 1\n1 2\n",
     "digits": "t [s],p_A [Pa]\n0," + "1" * 60_000 + "x\n1,2\n",
     "nested powers": "t [s],p_A [" + "(" * 30 + "mPa^9" + ")^9" * 30 + "]\n0,1\n1,2\n",
     "a long origin of time": "t [s since " + " " * 30_000 + "x],p_A [Pa]\n0,1\n1,2\n",
@@ -154,25 +154,18 @@ def test_no_text_takes_long(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "name", "unit"),
-    [
-        ("p_A [psi]", "p_A", "psi"),
-        ("p_A(bar)", "p_A", "bar"),
-        ("p_A / bar", "p_A", "bar"),
-        ("v / m/s", "v", "m/s"),
-        ("p (N/(m m))", "p", "N/(m m)"),
-        ("p (port A)", "p", None),
-        ("p ()", "p", None),
-        ("p (a (b) (c))", "p (a (b) (c))", None),
-        ("p/bar", "p", "bar"),
-        ("[s]", "", "s"),
-    ],
-)
-def test_headings(text: str, name: str, unit: str | None) -> None:
-    assert (Label.parse(text).name, Label.parse(text).unit) == (name, unit)
+    ("heading", "unit"),
+    [("p [psi]", "psi"), ("p(bar)", "bar"), ("p / bar", "bar"), ("p/bar", "bar"), ("p (N/(m m))", "Pa"),
+     ("[kPa]", "kPa"), ("p (port A)", "count"), ("p ()", "count"), ("p (a (b) (c))", "count")],
+)  # fmt: skip
+def test_headings(tmp_path: Path, heading: str, unit: str) -> None:
+    (tmp_path / "log.csv").write_text(f"t [s],{heading}\n0,1\n1,2\n2,3\n")
+    assert read(tmp_path / "log.csv", map={"p_A": "#2"})["p_A"][0] == to_si(
+        1.0, unit, "count" if unit == "count" else "Pa"
+    )
 
 
-@settings(deadline=None, max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(text=st.text(alphabet='t[s]p_A Pa,;\t0123.\n\n-eE"()/ ', max_size=200))
 def test_any_text_is_a_recording_that_can_be_inspected_or_one_line(tmp_path: Path, text: str) -> None:
     path = tmp_path / "log.csv"

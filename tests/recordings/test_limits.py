@@ -41,13 +41,10 @@ def test_texts_in_place_of_numbers(tmp_path: Path, count: int, kind: str) -> Non
     assert refused(path).startswith("p_A must hold numbers, or at most 4194304 texts of 400 bytes, got ")
 
 
-@pytest.mark.parametrize("own", [False, True])
-def test_many_references_to_one_long_text(own: bool, tmp_path: Path) -> None:
+def test_many_references_to_one_long_text(tmp_path: Path) -> None:
     """HDF5 holds texts of any length beside the data set, which refers to them: 20 000 times a megabyte in 1.3 MB."""
     path, count = tmp_path / "log.h5", 20_000
     with h5py.File(path, "w") as file:
-        if own:  # the mark of files that are read in this process
-            file.attrs["sealscope_format"] = 1
         data = file.create_dataset("p_A", (count,), h5py.string_dtype())
         data.attrs["units"] = "Pa"
         data[0] = "1" * 1_000_000

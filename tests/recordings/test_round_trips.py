@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as hnp
 from sealscope.errors import InputError
 from sealscope.recordings import CHANNEL_UNITS, COUNTS, Recording, read, write
 
-FORMATS = ["nc", "h5", "hdf5", "csv", "tsv", "txt", "parquet"]
+FORMATS = ["nc", "csv", "tsv", "parquet"]
 json_values = st.recursive(
     st.none()
     | st.booleans()
@@ -61,7 +61,7 @@ def test_marks_of_other_formats_within_our_own_are_text(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
-@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(recording=recordings())
 def test_exact(tmp_path: Path, suffix: str, recording: Recording) -> None:
     path = tmp_path / f"log.{suffix}"
@@ -73,6 +73,12 @@ def plain(count: int = 600) -> Recording:
     t = np.arange(count) / 500
     p = 3e5 + 1e4 * np.sin(4 * t)
     return Recording(t, {"p_A": p, "x": 0.01 * np.cos(4 * t)}, CHANNEL_UNITS, 500.0, {"by": "test"}, ("made",))
+
+
+@pytest.mark.parametrize("suffix", ["nc4", "h5", "hdf5", "txt", "pq"])
+def test_other_suffixes_of_these_formats(tmp_path: Path, suffix: str) -> None:
+    write(plain(), tmp_path / f"log.{suffix}")
+    assert_same(read(tmp_path / f"log.{suffix}"), plain())
 
 
 def test_long_provenance(tmp_path: Path) -> None:
@@ -105,9 +111,8 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(
         Path(str(args[0])).write_bytes(b"half a rec")
         raise DiskFullError(28, "No space left on device")
 
-    module = {"nc": "netcdf", "csv": "text", "parquet": "parquet"}[suffix]
-    writer = {"nc": "write_netcdf", "csv": "write_text", "parquet": "write_parquet"}[suffix]
-    monkeypatch.setattr(f"sealscope.recordings.formats.{module}.{writer}", fail)
+    module = {"nc": "netcdf", "csv": "text"}.get(suffix, suffix)
+    monkeypatch.setattr(f"sealscope.recordings.formats.{module}.write_{module}", fail)
     with pytest.raises(InputError, match="No space left on device"):
         write(plain(), path)
     assert path.read_bytes() == before

@@ -28,13 +28,9 @@ def body(delimiter: str, decimal: str = ".", newline: str = "\n") -> str:
 
 
 LAYOUTS = {
-    "comma": "t [s],p_A [bar]\n" + body(","),
-    "semicolon": "t [s];p_A [bar]\n" + body(";"),
-    "tab, decimal comma": "t [s]\tp_A [bar]\n" + body("\t", ","),
     "blanks, decimal comma": "t[s] p_A[bar]\n" + body("  ", ","),
     "bar": "t [s]|p_A [bar]\n" + body("|"),
     "comma and blank": "t [s], p_A [bar]\n" + body(", "),
-    "round brackets": "time (s),p_A (bar)\n" + body(","),
     "units over a stroke": "Zeit / s;p_A / bar\n" + body(";", ","),
     "units row in brackets": "Time\tp_A\n[s]\t[bar]\n" + body("\t"),
     "other case": "Time [s],P_a [BAR]\n" + body(","),
@@ -45,7 +41,6 @@ LAYOUTS = {
     "blank lines within": "t [s],p_A [bar]\n" + body(",").replace("\n", "\n\n", 2),
     "preamble, units row": "DAQ export\nDate;2024-05-31\n\nTime;p_A;note\ns;bar;\n"
     + body(";", ",").replace("\n", ";\n"),
-    "milliseconds": "time [ms],p_A [MPa]\n" + "".join(f"{1e3 * t},{p / 10!r}\n" for t, p in zip(T, P, strict=True)),
     "time without unit": "time,p_A [bar]\n" + body(","),
     "text beside": "who,t [s],p_A [bar],remark\n" + "".join(f"N,{t},{p!r},a b\n" for t, p in zip(T, P, strict=True)),
     "empty columns at the end": "t [s],p_A [bar],,\n" + body(",").replace("\n", ",,\n"),
@@ -88,12 +83,6 @@ def test_map_and_rate(tmp_path: Path) -> None:
     assert any("raw counts" in line for line in recording.history)
     with pytest.raises(UnreadableFile, match="count of rows 1, 2"):
         read(path, map={"p_A": "PG_1"})
-
-
-def test_map_by_number_without_a_header(tmp_path: Path) -> None:
-    recording = read(saved(tmp_path, body(",")), map={"t": "1[s]", "p_A": "2[bar]"})
-    assert recording["p_A"] == pytest.approx(BAR)
-    assert recording.rate == 500
 
 
 def test_mapped_column_comes_before_the_namesake(tmp_path: Path) -> None:
@@ -143,7 +132,7 @@ def test_a_cut_last_line_is_missing(tmp_path: Path) -> None:
     assert np.array_equal(recording["p_A"], [1e5, 2e5, 3e5, np.nan], equal_nan=True)
 
 
-@settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     delimiter=st.sampled_from([",", ";", "\t", "  ", "|"]),
     comma=st.booleans(),
@@ -174,7 +163,7 @@ def test_any_layout_gives_the_same_numbers(
 def test_rate_from_rounded_stamps(tmp_path: Path, rate: float, stamp_digits: int) -> None:
     if rate > 1000 and stamp_digits == 3:
         pytest.skip("stamps coarser than the step tell the rate only on average")
-    rows = "".join(f"{i / rate:.{stamp_digits}f},{i}\n" for i in range(5000))
+    rows = "".join(f"{i / rate:.{stamp_digits}f},{i}\n" for i in range(2500))
     assert read(saved(tmp_path, "t [s],x [m]\n" + rows)).rate == rate
 
 

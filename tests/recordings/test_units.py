@@ -1,6 +1,7 @@
 """Units: known values, agreement with pint, dimensions kept apart, and texts from outside."""
 
 import contextlib
+import functools
 import math
 import subprocess
 import sys
@@ -52,6 +53,13 @@ def test_a_decimal_is_rounded_once() -> None:
     assert to_si(633, "mm^2", "m^2") == 633e-6
 
 
+@functools.cache
+def pint_registry():
+    import pint
+
+    return pint.UnitRegistry()
+
+
 @pytest.mark.parametrize(
     ("unit", "si_unit", "pint_unit"),
     [
@@ -66,9 +74,7 @@ def test_a_decimal_is_rounded_once() -> None:
     ],
 )
 def test_agrees_with_pint(unit: str, si_unit: str, pint_unit: str) -> None:
-    import pint
-
-    registry = pint.UnitRegistry()
+    registry = pint_registry()
     target = {"m^3/rev": "m**3/revolution"}.get(si_unit, si_unit)
     expected = registry.Quantity(3.7, pint_unit).to(target).magnitude
     assert to_si(3.7, unit, si_unit) == pytest.approx(expected, rel=1e-14)

@@ -32,8 +32,11 @@ MOST_MEMORY = 12 * 2**30
 _KEPT_MEMORY = 2**30
 #: Processes that work side by side at most: a file that takes long holds no other thread's files up.
 _MOST_PROCESSES = 4
-#: Threads of libraries take memory each, as many as the machine has cores.
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+#: Threads of libraries take memory each, as many as the machine has cores; Arrow's own allocator reserves a gigabyte.
+_LITTLE_MEMORY = {
+    **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
+    "ARROW_DEFAULT_MEMORY_POOL": "system",
+}
 
 
 class CrashedApartError(RuntimeError):
@@ -51,14 +54,14 @@ class _Process:
     """A process that carries out one request after the other."""
 
     def __init__(self) -> None:
-        self.fresh = True
+        self._fresh = True
         self._folder = tempfile.TemporaryDirectory(prefix="sealscope-", ignore_cleanup_errors=True)
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "sealscope.recordings.apart"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            env={**os.environ, **_ONE_THREAD, "TMPDIR": self._folder.name},  # what it leaves there is removed
+            env={**os.environ, **_LITTLE_MEMORY, "TMPDIR": self._folder.name},  # what it leaves there is removed
         )
 
     @property
@@ -68,9 +71,8 @@ class _Process:
     def ask(self, request: bytes, limit: float) -> tuple[Any, str | None, bool]:
         """Return what the work gave or raised, the traceback of what it raised, and whether the process is spent."""
         process = self._process
-        assert process.stdin is not None
-        assert process.stdout is not None
-        overdue = Timer(limit + 1.0 + _START * self.fresh, process.kill)  # it ends itself at its limit
+        assert process.stdin is not None and process.stdout is not None
+        overdue = Timer(limit + 1.0 + _START * self._fresh, process.kill)  # it ends itself at its limit
         overdue.daemon = True
         overdue.start()
         try:
@@ -84,7 +86,7 @@ class _Process:
             raise CrashedApartError(f"the library that reads it {what}") from None
         finally:
             overdue.cancel()
-        self.fresh = False
+        self._fresh = False
         return value, where, spent
 
     def end(self) -> None:
@@ -99,14 +101,13 @@ _idle: list[_Process] = []
 
 def _process() -> _Process:
     """Return a process that waits for work, else a new one."""
-    while True:
-        try:
+    with suppress(IndexError):
+        while True:
             process = _idle.pop()
-        except IndexError:
-            return _Process()
-        if process.alive:
-            return process
-        process.end()
+            if process.alive:
+                return process
+            process.end()
+    return _Process()
 
 
 def apart(work: Callable[..., T], *arguments: Any, limit: float, memory: int = MOST_MEMORY, disk: int = LARGEST) -> T:
@@ -142,10 +143,7 @@ def file_apart(work: Callable[..., T], file: Path, *arguments: Any, **limits: An
 
 
 def _limit(seconds: float, memory: int, disk: int) -> None:
-    """Let this process take so much time, memory and disk at most, where the system can.
-
-    The time is kept here, too: a process whose parent was killed ends all the same.
-    """
+    """Limit time, memory and disk of this process, where the system can: it ends although its parent was killed."""
     with suppress(ImportError, AttributeError, OSError, ValueError):
         signal.setitimer(signal.ITIMER_REAL, seconds)
         import resource

@@ -10,9 +10,10 @@ import tarfile
 import tempfile
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from importlib import import_module
 from pathlib import Path
-from typing import IO, Any, TypeVar, cast
+from typing import IO, Any, TypeVar
 
 from sealscope.errors import UnreadableFile
 from sealscope.recordings.apart import file_apart
@@ -23,6 +24,7 @@ from sealscope.storage.unpacking import check_unpacked
 T = TypeVar("T")
 #: First bytes -> archive.
 _MAGIC = {b"\x1f\x8b": "gzip", b"BZh": "bz2", b"\xfd7zXZ\x00": "xz", b"\x28\xb5\x2f\xfd": "zstd", b"PK\x03\x04": "zip"}
+_SUFFIXES = (".gz", ".bz2", ".xz", ".zst", ".zip", ".tar", ".tgz")
 #: Where a tar archive says that it is one.
 _TAR_AT, _TAR = 257, b"ustar"
 #: What lies beside a recording in an archive and is none.
@@ -35,10 +37,7 @@ _CHUNK, _MEMORY = 2**20, 2**30
 
 
 def archive_of(path: Path) -> str | None:
-    """Return the kind of archive that a file is by its first bytes; None for a workbook and any other file.
-
-    Raises UnreadableFile for a damaged ZIP.
-    """
+    """Return the kind of archive that a file is by its first bytes; None for a workbook and any other file."""
     with open_regular(path, "a recording") as file:
         head = file.read(512)
     if head[_TAR_AT : _TAR_AT + len(_TAR)] == _TAR:
@@ -76,7 +75,7 @@ def unpacked(path: Path, kind: str, most: int) -> Iterator[Path]:
 
 def _unpack(path: Path, kind: str, folder: Path, most: int) -> Path:
     """Write the single file of an archive into a folder, and return its path."""
-    name = path.stem if path.suffix.lower() in (".gz", ".bz2", ".xz", ".zst", ".zip", ".tar", ".tgz") else path.name
+    name = path.stem if path.suffix.lower() in _SUFFIXES else path.name
     with _opened(path, kind) as (source, member, size):
         check_unpacked(size, most, path)
         last = Path(member or name).name
@@ -91,22 +90,23 @@ def _unpack(path: Path, kind: str, folder: Path, most: int) -> Path:
 @contextmanager
 def _opened(path: Path, kind: str) -> Iterator[tuple[IO[bytes], str, int]]:
     """Open the single file of an archive; its name and size are "" and 0 where the archive does not say."""
-    if kind == "zip":
-        with zipfile.ZipFile(path) as archive:
-            name = _only([info.filename for info in archive.infolist() if not info.is_dir()], path)
-            with archive.open(name) as file:
-                yield file, name, archive.getinfo(name).file_size
-        return
-    if kind == "tar":
-        with tarfile.open(path) as archive:
-            name = _only([member.name for member in archive.getmembers() if member.isfile()], path)
-            inner = archive.extractfile(name)
+    with ExitStack() as stack:
+        if kind == "zip":
+            packed = stack.enter_context(zipfile.ZipFile(path))
+            name = _only([info.filename for info in packed.infolist() if not info.is_dir()], path)
+            yield stack.enter_context(packed.open(name)), name, packed.getinfo(name).file_size
+        elif kind == "tar":
+            tape = stack.enter_context(tarfile.open(path))
+            name = _only([member.name for member in tape.getmembers() if member.isfile()], path)
+            inner = tape.extractfile(name)
             assert inner is not None
-            with inner:
-                yield inner, name, archive.getmember(name).size
-        return
-    with cast("IO[bytes]", _stream(path, kind)) as file:
-        yield file, "", 0
+            yield stack.enter_context(inner), name, tape.getmember(name).size
+        elif kind == "zstd":
+            stream = library("pyarrow", "a .zst archive", "pyarrow").CompressedInputStream(str(path), "zstd")
+            yield stack.enter_context(stream), "", 0
+        else:
+            module = import_module({"gzip": "gzip", "bz2": "bz2", "xz": "lzma"}[kind])
+            yield stack.enter_context(module.open(path)), "", 0
 
 
 def _only(names: Sequence[str], path: Path) -> str:
@@ -120,19 +120,3 @@ def _only(names: Sequence[str], path: Path) -> str:
             f"an archive must hold a single file, got {len(names)}: {shown}: unpack it, and name its files ({path})"
         )
     return data[0]
-
-
-def _stream(path: Path, kind: str) -> Any:
-    if kind == "gzip":
-        import gzip
-
-        return gzip.open(path)
-    if kind == "bz2":
-        import bz2
-
-        return bz2.open(path)
-    if kind == "xz":
-        import lzma
-
-        return lzma.open(path)
-    return library("pyarrow", "a .zst archive", "pyarrow").CompressedInputStream(str(path), "zstd")

@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
-from functools import partial
 from importlib import import_module
 from math import isfinite
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from sealscope.calls import checked_call
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.apart import file_apart
 from sealscope.recordings.archives import archive_of, unpacked
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
-from sealscope.recordings.formats.columns import ChannelMap, check_call, choose_columns
+from sealscope.recordings.formats.columns import ChannelMap, Wanted, check_call
 from sealscope.recordings.formats.matlab import is_matlab_4
 from sealscope.recordings.formats.structured.json_log import is_json
 from sealscope.recordings.formats.structured.lvm import is_lvm
-from sealscope.recordings.formats.table import Choose, RawTable
+from sealscope.recordings.formats.table import RecordingFields
 from sealscope.recordings.formats.text import read_text_parts
 from sealscope.recordings.formats.text_layout import SNIFF, encoding_of
 from sealscope.recordings.recording import Recording
@@ -29,69 +28,51 @@ from sealscope.storage.atomic import atomic_write
 from sealscope.storage.opening import open_regular, whole
 from sealscope.storage.unpacking import most_unpacked
 
-
-class _Format(NamedTuple):
-    """A format in words, the module that reads it, and suffixes and first bytes of its files."""
-
-    words: str
-    module: str
-    suffixes: str
-    magic: tuple[bytes, ...] = ()
-
-
 _HDF5 = b"\x89HDF\r\n\x1a\n"
-_FORMATS = {
-    "netcdf": _Format("a NetCDF or HDF5", "netcdf", ".nc .nc4 .h5 .hdf5", (_HDF5,)),
-    "text": _Format("a text", "text", ".csv .tsv .txt"),
-    "parquet": _Format("a Parquet", "parquet", ".parquet .pq", (b"PAR1", b"ARROW1")),
-    "matlab": _Format("a MATLAB", "matlab", ".mat", (b"MATLAB 5.0", b"MATLAB 7.")),
-    "tdms": _Format("a TDMS", "tdms", ".tdms", (b"TDSm",)),
-    "mdf": _Format("an MDF", "mdf", ".mdf .mf4", (b"MDF     ", b"UnFinMF ")),
-    "lvm": _Format("a LabVIEW measurement", "structured.lvm", ".lvm"),
-    "json": _Format("a JSON", "structured.json_log", ".json .jsonl .ndjson"),
-    "spreadsheet": _Format(
-        "a spreadsheet", "spreadsheet", ".xlsx .xlsm .xlsb .xls .ods", (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
-    ),
+#: Format -> its name in words, the module that reads it, suffixes and first bytes of its files.
+_FORMATS: dict[str, tuple[str, str, str, tuple[bytes, ...]]] = {
+    "netcdf": ("a NetCDF or HDF5", "netcdf", ".nc .nc4 .h5 .hdf5", (_HDF5,)),
+    "text": ("a text", "text", ".csv .tsv .txt", ()),
+    "parquet": ("a Parquet", "parquet", ".parquet .pq", (b"PAR1", b"ARROW1")),
+    "matlab": ("a MATLAB", "matlab", ".mat", (b"MATLAB 5.0", b"MATLAB 7.")),
+    "tdms": ("a TDMS", "tdms", ".tdms", (b"TDSm",)),
+    "mdf": ("an MDF", "mdf", ".mdf .mf4", (b"MDF     ", b"UnFinMF ")),
+    "lvm": ("a LabVIEW measurement", "structured.lvm", ".lvm", ()),
+    "json": ("a JSON", "structured.json_log", ".json .jsonl .ndjson", ()),
+    "spreadsheet": ("a spreadsheet", "spreadsheet", ".xlsx .xlsm .xlsb .xls .ods", (b"PK\3\4", b"\xd0\xcf\x11\xe0")),
 }
-#: Suffix -> format of a file to write, and of any file.
-_SUFFIXES = {suffix: kind for kind, form in _FORMATS.items() for suffix in form.suffixes.split()}
+#: Suffix -> format of any file, and of a file to write.
+_SUFFIXES = {suffix: kind for kind, (_, _, suffixes, _) in _FORMATS.items() for suffix in suffixes.split()}
 SUFFIXES = {suffix: kind for suffix, kind in _SUFFIXES.items() if kind in ("netcdf", "text", "parquet")}
-_CSV = "export it as CSV"
 #: First bytes of formats that are known and not read.
 _FOREIGN = {
-    b"CDF\x01": "a NetCDF-3 file: convert it to NetCDF-4",
-    b"CDF\x02": "a NetCDF-3 file: convert it to NetCDF-4",
-    b"CDF\x05": "a NetCDF-3 file: convert it to NetCDF-4",
-    b"%PDF": "a PDF document",
-    b"7z\xbc\xaf": "a 7z archive: unpack it",
-    b"Rar!": "a RAR archive: unpack it",
-    b"SQLite format 3": f"an SQLite data base: {_CSV}",
-    b"\x93NUMPY": f"a NumPy array: {_CSV}",
-    b"\x80\x04\x95": f"a Python pickle: {_CSV}",
-    b"\x80\x05\x95": f"a Python pickle: {_CSV}",
-    b"DIAEXTENDED": "a DIAdem header (.DAT): export it from DIAdem as TDMS or CSV",
-    b"|CF,": "an imc FAMOS file: export it from FAMOS or imc STUDIO as MATLAB, TDMS or CSV",
-    b"DEWESoft": "a Dewesoft file: export it from DewesoftX as MATLAB, TDMS or CSV",
-    b"LOGG": "a BLF log of a bus: export its decoded signals as MDF or CSV",
-    b"    -1\n    58": "a universal file (UFF 58): export it as MATLAB or CSV",
-    b"    -1\r\n    58": "a universal file (UFF 58): export it as MATLAB or CSV",
-    b"    -1\n   151": "a universal file (UFF): export it as MATLAB or CSV",
-    b"\x00\x01\x00\x00Standard": f"an Access data base: {_CSV}",
-    b"\x89PNG": "a picture",
-    b"\xff\xd8\xff": "a picture",
-    b"RIFF": f"a RIFF file, such as sound: {_CSV}",
+    rb"CDF[\x01\x02\x05]": "a NetCDF-3 file: convert it to NetCDF-4",
+    rb"%PDF": "a PDF document",
+    rb"7z\xbc\xaf": "a 7z archive: unpack it",
+    rb"Rar!": "a RAR archive: unpack it",
+    rb"SQLite format 3": "an SQLite data base: export it as CSV",
+    rb"\x93NUMPY": "a NumPy array: export it as CSV",
+    rb"\x80[\x04\x05]\x95": "a Python pickle: export it as CSV",
+    rb"DIAEXTENDED": "a DIAdem header (.DAT): export it from DIAdem as TDMS or CSV",
+    rb"\|CF,": "an imc FAMOS file: export it from FAMOS or imc STUDIO as MATLAB, TDMS or CSV",
+    rb"DEWESoft": "a Dewesoft file: export it from DewesoftX as MATLAB, TDMS or CSV",
+    rb"LOGG": "a BLF log of a bus: export its decoded signals as MDF or CSV",
+    rb"    -1\r?\n    58": "a universal file (UFF 58): export it as MATLAB or CSV",
+    rb"    -1\r?\n   151": "a universal file (UFF): export it as MATLAB or CSV",
+    rb"\x00\x01\x00\x00Standard": "an Access data base: export it as CSV",
+    rb"\x89PNG|\xff\xd8\xff": "a picture",
+    rb"RIFF": "a RIFF file, such as sound: export it as CSV",
+    rb"(?s:.*)<usi:tdm": "a DIAdem header (.tdm): export it as TDMS",
 }
-#: Suffix of binary files that are known and not read -> what writes them, and the way out.
+#: Suffixes of binary files that are known and not read -> what writes them, and the way out.
 _PROPRIETARY = {
     ".bin": "a binary file such as catman's: export it from catman as MATLAB, TDMS or ASCII",
     ".tst": "a catman test: export it from catman as MATLAB, TDMS or ASCII",
     ".tdx": "the samples of a DIAdem .tdm: export them from DIAdem as TDMS or CSV",
     ".dat": "a binary .dat: export it from the program that wrote it as TDMS, MATLAB or CSV",
     ".raw": "an imc file: export it from FAMOS or imc STUDIO as MATLAB, TDMS or CSV",
-    ".dxd": "a Dewesoft file: export it from DewesoftX as MATLAB, TDMS or CSV",
-    ".d7d": "a Dewesoft file: export it from DewesoftX as MATLAB, TDMS or CSV",
-    ".unv": "a universal file: export it as MATLAB or CSV",
-    ".uff": "a universal file: export it as MATLAB or CSV",
+    ".dxd .d7d": "a Dewesoft file: export it from DewesoftX as MATLAB, TDMS or CSV",
+    ".unv .uff": "a universal file: export it as MATLAB or CSV",
     ".wdf": "a file of a Yokogawa recorder: export it as CSV",
     ".trc": "a file of an oscilloscope: export it as CSV",
 }
@@ -109,20 +90,18 @@ def _format_of(path: Path) -> str:
     """Return the format of a file by its content; raise UnreadableFile where it is none that is read."""
     with open_regular(path, "a recording") as file:
         head = file.read(SNIFF)
-        for kind, form in _FORMATS.items():
-            if head.startswith(form.magic):
+        for kind, (_, _, _, magic) in _FORMATS.items():
+            if head.startswith(magic):
                 return kind
         for offset in (512, 1024, 2048, 4096):  # HDF5 may begin after a block of the user's
             file.seek(offset)
             if file.read(8) == _HDF5:
                 return "netcdf"
-    foreign = next((name for magic, name in _FOREIGN.items() if head.startswith(magic)), None)
-    if foreign is None and b"<usi:tdm" in head:
-        foreign = "a DIAdem header (.tdm): export it as TDMS"
+    foreign = next((name for pattern, name in _FOREIGN.items() if re.match(pattern, head)), None)
     if foreign is None and is_matlab_4(head):
         return "matlab"
-    if foreign is None and encoding_of(head) is None:
-        foreign = _PROPRIETARY.get(path.suffix.lower())
+    if foreign is None and path.suffix and encoding_of(head) is None:
+        foreign = next((name for own, name in _PROPRIETARY.items() if path.suffix.lower() in own.split()), None)
     if foreign is not None:
         raise UnreadableFile(f"a recording must be in a format that is read, got {foreign} ({path})")
     return "lvm" if is_lvm(head) else "json" if is_json(head) else "text"
@@ -130,22 +109,12 @@ def _format_of(path: Path) -> str:
 
 def _member(kind: str, verb: str) -> Callable[..., Any]:
     """Return ``read_KIND`` or ``write_KIND`` of the format's module; its library is loaded now."""
-    module = import_module(f"sealscope.recordings.formats.{_FORMATS[kind].module}")
+    module = import_module(f"sealscope.recordings.formats.{_FORMATS[kind][1]}")
     return getattr(module, f"{verb}_{kind}")  # type: ignore[no-any-return]
 
 
-def _table(kind: str, file: Path, choose: Choose) -> RawTable:
-    """Read a table, by a process of its own where the format is none of text."""
-    if kind in _TEXTS:
-        return _read_here(file, kind, choose)
-    size = file.stat().st_size
-    limit = _LONGEST + size / (_SLOWEST_SHEETS if kind in ("spreadsheet", "json") else _SLOWEST)
-    memory = _MEMORY + _MEMORY_SHARE * size
-    return file_apart(_read_here, file, kind, choose, limit=limit, memory=memory, disk=most_unpacked(file))
-
-
-def _read_here(file: Path, kind: str, choose: Choose) -> RawTable:
-    return _member(kind, "read")(file, choose)  # type: ignore[no-any-return]
+def _read_here(file: Path, kind: str, wanted: Wanted) -> RecordingFields:
+    return _member(kind, "read")(file, wanted)  # type: ignore[no-any-return]
 
 
 @checked_call
@@ -200,10 +169,10 @@ def read(
     >>> recording["p_A"].tolist()
     [300000.0, 350000.0, 300000.0]
     """
-    file, channel_map = Path(path), map or {}
-    check_call(channel_map, rate)
+    file = Path(path)
+    check_call(map or {}, rate)
     with _inner(file) as inner:
-        return _read(inner, file.name, channel_map, rate)
+        return _read(inner, Wanted(map or {}, rate, file.name))
 
 
 @checked_call
@@ -250,29 +219,24 @@ def read_parts(
     >>> [part.duration for part in ss.read_parts("long.csv", every=0.8)]
     [0.8, 0.8, 0.4]
     """
-    file, channel_map = Path(path), map or {}
-    check_call(channel_map, rate)
+    file = Path(path)
+    check_call(map or {}, rate)
     if not (isfinite(every) and every > 0):
         raise InputError(f"every must be > 0 s and finite, got {every:g}")
-    return _parts(file, every, channel_map, rate)
+    return _parts(file, every, Wanted(map or {}, rate, file.name))
 
 
-def _parts(file: Path, every: float, channel_map: ChannelMap, rate: float | None) -> Iterator[Recording]:
+def _parts(file: Path, every: float, wanted: Wanted) -> Iterator[Recording]:
     with _inner(file) as inner:
-        choose = partial(choose_columns, channel_map=channel_map, rate=rate, place=str(inner))
-
-        def recording_of(table: RawTable) -> Recording:
-            return Recording(*table.samples({"file": file.name}, rate=rate, infer_rate=bool(channel_map)))
-
         if _format_of(inner) != "text":
-            whole_file = _read(inner, file.name, channel_map, rate)
+            whole_file = _read(inner, wanted)
             size = max(1, round(every * whole_file.rate))
             for first in range(0, len(whole_file), size):
                 yield whole_file.samples(slice(first, first + size))
             return
         with whole("a text file", inner):
-            for table in read_text_parts(inner, choose, lambda table: max(1, round(every * recording_of(table).rate))):
-                yield recording_of(table)
+            for fields in read_text_parts(inner, wanted, lambda beginning: max(1, round(every * beginning.rate))):
+                yield Recording(*fields[:-1])
 
 
 @contextmanager
@@ -280,8 +244,6 @@ def _inner(file: Path) -> Iterator[Path]:
     """Yield the file, or what is packed in it; what is wrong with either is an UnreadableFile."""
     try:
         archive = archive_of(file)
-    except UnreadableFile:
-        raise
     except FileNotFoundError:
         raise UnreadableFile(f"a recording must exist, got no such file ({file})") from None
     except InputError as error:
@@ -303,23 +265,24 @@ def _inner(file: Path) -> Iterator[Path]:
             raise UnreadableFile(str(error).replace(str(inner), f"{inner.name} in {file}")) from error
 
 
-def _read(file: Path, name: str, channel_map: ChannelMap, rate: float | None) -> Recording:
-    """Read a file that is no archive; `name`: what the recording's provenance calls it."""
+def _read(file: Path, wanted: Wanted) -> Recording:
+    """Read a file that is no archive: by a process of its own where the format is none of text."""
     kind = _format_of(file)
-    choose = partial(choose_columns, channel_map=channel_map, rate=rate, place=str(file))
-    with whole(f"{_FORMATS[kind].words} file", file):
-        table = _table(kind, file, choose)
+    with whole(f"{_FORMATS[kind][0]} file", file):
+        if kind in _TEXTS:
+            fields = _read_here(file, kind, wanted)
+        else:
+            size = file.stat().st_size
+            limit = _LONGEST + size / (_SLOWEST_SHEETS if kind in ("spreadsheet", "json") else _SLOWEST)
+            memory = _MEMORY + _MEMORY_SHARE * size
+            fields = file_apart(_read_here, file, kind, wanted, limit=limit, memory=memory, disk=most_unpacked(file))
         if _SUFFIXES.get(file.suffix.lower(), kind) != kind:
-            table = replace(table, notes=(f"name ends in {file.suffix}, content is {table.kind}", *table.notes))
-        return Recording(*table.samples({"file": name}, rate=rate, infer_rate=bool(channel_map)))
+            fields = fields.with_note(f"name ends in {file.suffix}, content is {fields.kind}")
+        return Recording(*fields[:-1])
 
 
 def check_target(path: str | os.PathLike[str]) -> str:
-    """Return the format of a file to write by its suffix.
-
-    Raises InputError for another suffix or a folder that does not exist. Long work calls this first, so that it does
-    not fail at its end.
-    """
+    """Return the format of a file to write by its suffix; raise InputError for another, or without its folder."""
     file = Path(path)
     kind = SUFFIXES.get(file.suffix.lower())
     if kind is None:
@@ -351,13 +314,10 @@ def write(recording: Recording, path: str | os.PathLike[str]) -> None:
 
     Examples
     --------
-    >>> import numpy as np
     >>> import sealscope as ss
-    >>> t = np.arange(1000) / 500
-    >>> recording = ss.Recording(t, {"p_A": 3e5 + np.sin(t)}, {"p_A": "Pa"}, rate=500.0)
-    >>> ss.write(recording, "log.csv")
-    >>> bool(np.array_equal(ss.read("log.csv")["p_A"], recording["p_A"]))
-    True
+    >>> ss.write(ss.Recording([0.0, 0.002], {"p_A": [3e5, 3.1e5]}, {"p_A": "Pa"}, rate=500.0), "log.csv")
+    >>> ss.read("log.csv")["p_A"].tolist()
+    [300000.0, 310000.0]
     """
     file = Path(path)
     kind = check_target(file)

@@ -44,29 +44,29 @@ def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
     Rows that were lost come back; in bridged rows every other channel is bridged as well. Values that were recorded
     stay as they are.
     """
-    whole = _with_lost_rows(recording, needed)
-    known = _known(whole, needed)
+    whole = _with_lost_rows(recording)
+    known = np.all([np.isfinite(whole[name]) for name in needed], axis=0)
     if not len(whole) or known.all() or not known.any():
         return recording
     joined = even_steps(whole)
     channels = {name: np.where(np.isfinite(values), values, np.nan) for name, values in whole.channels.items()}
-    cycle = _cycle(whole, needed)
-    bridged = np.zeros(len(whole), dtype=bool)
-    by_spline = np.zeros(len(whole), dtype=bool)
-    for first, length in runs_of(~known):
+    stretches = uniform_segments(whole, needed)
+    longest = max(stretches, key=lambda stretch: stretch.stop - stretch.start, default=None)
+    cycle = None if longest is None else find_cycle(whole.samples(longest).only(needed))
+    bridged, by_spline = np.zeros(len(whole), dtype=bool), np.zeros(len(whole), dtype=bool)
+    for first, length in runs_of(~known).tolist():
         stop = first + length
         if first == 0 or stop == len(whole) or not joined[first - 1 : stop].all():
             continue
         if length <= SPLINE:
             by_spline[first:stop] = True
+        elif length > LONGEST_SHARE * len(whole):
             continue
-        if length > LONGEST_SHARE * len(whole):
-            continue
-        if cycle is not None and _from_other_cycle(channels, needed, int(first), int(stop), cycle * whole.rate):
+        elif cycle is not None and _from_other_cycle(channels, needed, first, stop, cycle * whole.rate):
             bridged[first:stop] = True
         elif length <= LINE_SECONDS * whole.rate:
             for values in channels.values():
-                _line(values, int(first), int(stop))
+                _line(values, first, stop)
             bridged[first:stop] = True
     if by_spline.any():
         for values in channels.values():
@@ -74,7 +74,8 @@ def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
     bridged |= by_spline
     if not bridged.any() or np.mean(bridged) > LONGEST_SHARE:
         return recording
-    return replace(whole, channels=channels, bridged=bridged, history=(*whole.history, _note(bridged)))
+    note = f"{np.count_nonzero(bridged)} samples in {len(runs_of(bridged))} gaps bridged"
+    return replace(whole, channels=channels, bridged=bridged, history=(*whole.history, note))
 
 
 def touched(recording: Recording, bounds: Array | NDArray[np.integer]) -> Flags:
@@ -86,24 +87,9 @@ def touched(recording: Recording, bounds: Array | NDArray[np.integer]) -> Flags:
     return np.asarray(counts > MOST_BRIDGED * np.diff(bounds))
 
 
-def _known(recording: Recording, needed: Sequence[str]) -> Flags:
-    known = np.ones(len(recording), dtype=bool)
-    for name in needed:
-        known &= np.isfinite(recording[name])
-    return known
-
-
-def _note(bridged: Flags) -> str:
-    return f"{np.count_nonzero(bridged)} samples in {len(runs_of(bridged))} gaps bridged"
-
-
-def _with_lost_rows(recording: Recording, needed: Sequence[str]) -> Recording:
-    """Return the recording with rows of NaN where the time stamps show that some were lost, and without untimed rows.
-
-    Steps back, and gaps that are too long to be bridged, stay as they are.
-    """
-    timed = np.isfinite(recording.t)
-    if not timed.all():
+def _with_lost_rows(recording: Recording) -> Recording:
+    """Return the recording without untimed rows, with rows of NaN where the time stamps show that some were lost."""
+    if not np.isfinite(recording.t).all():
         recording = recording.between(-math.inf, math.inf)
     steps = np.round(np.diff(recording.t) * recording.rate)
     lost = np.where((steps > 1) & (steps <= LONGEST_SHARE * len(recording)), steps - 1, 0).astype(np.int64)
@@ -119,26 +105,13 @@ def _with_lost_rows(recording: Recording, needed: Sequence[str]) -> Recording:
     return replace(recording, t=t, channels=channels)
 
 
-def _cycle(recording: Recording, needed: Sequence[str]) -> float | None:
-    """Return the cycle of the duty [s] by the longest stretch without a gap."""
-    stretches = uniform_segments(recording, needed)
-    if not stretches:
-        return None
-    longest = max(stretches, key=lambda stretch: stretch.stop - stretch.start)
-    return find_cycle(recording.samples(longest).only(needed))
-
-
 def _mean(values: Array) -> float:
     known = values[np.isfinite(values)]
     return float(known.mean()) if known.size else math.nan
 
 
 def _from_other_cycle(channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, cycle: float) -> bool:
-    """Bridge a gap of all channels by other cycles, the nearest first; return whether one is like this one.
-
-    It is where command, or pressures, of half a cycle before and after the gap repeat; where they repeat best within
-    `_SLACK` samples of the cycle's length is where the values are taken from.
-    """
+    """Bridge a gap of all channels by the nearest cycle in which the duty beside it repeats, to within `_SLACK`."""
     half = round(0.5 * cycle)
     least = math.ceil((stop - first + half) / cycle)
     for shift in (sign * round(times * cycle) for times in (least, least + 1) for sign in (-1, 1)):

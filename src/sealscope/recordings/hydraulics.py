@@ -49,10 +49,7 @@ def _means(values: Array, every: int) -> Array:
 
 
 def lack_of_chambers(recording: Recording) -> str | None:
-    """Return that a recording has no chamber pressure, and which columns of its file were not used; None where it has.
-
-    What the names of those columns tell stands in the same line, as the `--map` that would read them.
-    """
+    """Return that a recording has no chamber pressure, and the columns not used with the map that would read them."""
     if chambers_of(recording):
         return None
     unused = [line for line in recording.history if line.startswith(UNUSED)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -54,10 +55,8 @@ def _stamp_in_name(name: str) -> float | None:
 
 def _start(recording: Recording) -> float | None:
     """Return the moment t = 0 in seconds of some clock of the day; None where it is not known."""
-    provenance = recording.provenance
-    if "start_epoch_s" in provenance:
-        return float(provenance["start_epoch_s"])
-    return seconds_of(str(provenance.get("start", "")))
+    epoch = recording.provenance.get("start_epoch_s")
+    return seconds_of(str(recording.provenance.get("start", ""))) if epoch is None else float(epoch)
 
 
 @checked_call
@@ -86,61 +85,49 @@ def join(recordings: Sequence[Recording], *, names: Sequence[str] | None = None)
 
     Examples
     --------
-    >>> import numpy as np
     >>> import sealscope as ss
     >>> from sealscope.recordings import join
-    >>> t = np.arange(2000) / 500
-    >>> whole = ss.Recording(t, {"p_A": 3e5 + t}, {"p_A": "Pa"}, rate=500.0)
+    >>> t = [k / 500 for k in range(2000)]
+    >>> whole = ss.Recording(t, {"p_A": t}, {"p_A": "Pa"}, rate=500.0)
     >>> join([whole.between(2.0, 4.0), whole.between(0.0, 2.0)])
     Recording(p_A [Pa]; 2000 samples, 500 Hz, 4 s)
     """
     if len(recordings) < 2:
         raise InputError(f"recordings to join must be two or more, got {len(recordings)}")
     first = recordings[0]
-    names = names or [
-        str(recording.provenance.get("file", f"recording {number}")) for number, recording in enumerate(recordings, 1)
-    ]
-    for number, other in enumerate(recordings):
+    names = names or [str(own.provenance.get("file", f"recording {k}")) for k, own in enumerate(recordings, 1)]
+    for name, other in zip(names, recordings, strict=True):
         if len(other) == 0:
-            raise InputError(f"a recording to join must have samples, got none ({names[number]})")
+            raise InputError(f"a recording to join must have samples, got none ({name})")
         if dict(other.units) != dict(first.units):
-            raise InputError(
-                f"recordings to join must have the same channels and units, got {', '.join(first.units)} and "
-                f"{', '.join(other.units)} ({names[number]})"
-            )
+            both = f"{', '.join(first.units)} and {', '.join(other.units)}"
+            raise InputError(f"recordings to join must have the same channels and units, got {both} ({name})")
         if other.rate != first.rate:
-            raise InputError(
-                f"recordings to join must have the same rate, got {first.rate:g} and {other.rate:g} Hz "
-                f"({names[number]})"
-            )
+            both = f"{first.rate:g} and {other.rate:g} Hz"
+            raise InputError(f"recordings to join must have the same rate, got {both} ({name})")
     starts = [_start(recording) for recording in recordings]
     known = [start for start in starts if start is not None]
-    if len(known) == len(starts) and max(known) - min(known) > _SAME_START:
-        offsets = [start - min(known) for start in known]
-    else:
-        offsets = [0.0] * len(recordings)
+    dated = len(known) == len(starts) and max(known) - min(known) > _SAME_START
+    offsets = [start - min(known) for start in known] if dated else [0.0] * len(recordings)
     times = [recording.t + offset for recording, offset in zip(recordings, offsets, strict=True)]
     order = sorted(range(len(recordings)), key=lambda number: float(np.nanmin(times[number])))
     for before, after in pairwise(order):
         begin, end = float(np.nanmin(times[after])), float(np.nanmax(times[before]))
         if begin <= end:
-            clocks = "the moments of the files" if any(offsets) else "their times, as no moment of the files is known"
+            clocks = "the moments of the files" if dated else "their times, as no moment of the files is known"
             raise InputError(
                 f"the clocks of recordings to join must go on from file to file, got {end:g} s at the end of "
-                f"{names[before]} and {begin:g} s at the beginning of "
-                f"{names[after]}, by {clocks}"
+                f"{names[before]} and {begin:g} s at the beginning of {names[after]}, by {clocks}"
             )
     parts = [recordings[number] for number in order]
     files = [names[number] for number in order]
-    channels = {name: np.concatenate([part[name] for part in parts]) for name in parts[0].channels}
     bridged = [np.zeros(len(part), dtype=bool) if part.bridged is None else part.bridged for part in parts]
     history = tuple(dict.fromkeys(line for part in parts for line in part.history))
-    return Recording(
-        np.concatenate([times[number] for number in order]),
-        channels,
-        parts[0].units,
-        first.rate,
-        {**parts[0].provenance, "files": files},
-        (*history, f"joined from {len(parts)} files: {', '.join(files)}"),
-        np.concatenate(bridged),
+    return replace(
+        parts[0],
+        t=np.concatenate([times[number] for number in order]),
+        channels={name: np.concatenate([part[name] for part in parts]) for name in parts[0].channels},
+        provenance={**parts[0].provenance, "files": files},
+        history=(*history, f"joined from {len(parts)} files: {', '.join(files)}"),
+        bridged=np.concatenate(bridged),
     )

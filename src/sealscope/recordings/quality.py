@@ -22,7 +22,7 @@ from sealscope.recordings.recording import Recording
 
 Severity = Literal["note", "warning", "fatal"]
 
-#: The level 4 detail of db8 looks at this many samples at once; fewer tell nothing about it: (16 - 1)(2^4 - 1) + 1.
+#: Samples that the level 4 detail of db8 looks at together: (16 - 1)(2^4 - 1) + 1.
 SHORTEST = 226
 #: An interval over this many sampling steps is a gap, one under the inverse share of a step is crowded.
 _GAP = 1.5
@@ -115,21 +115,16 @@ def _time_findings(recording: Recording) -> list[Finding]:
     t, findings, step = recording.t, list[Finding](), 1.0 / recording.rate
 
     def add(code: str, where: NDArray[Any], text: str, severity: Severity = "fatal") -> None:
-        findings.append(Finding(code, severity, None, len(where), _moment(recording, int(where[0])), text))
+        if where.size:
+            findings.append(Finding(code, severity, None, where.size, _moment(recording, int(where[0])), text))
 
-    unknown = np.flatnonzero(~np.isfinite(t))
-    if unknown.size:
-        add("missing_time", unknown, f"{counted(unknown.size, 'sample')} without a time")
-    known = np.flatnonzero(np.isfinite(t))
+    unknown, known = np.flatnonzero(~np.isfinite(t)), np.flatnonzero(np.isfinite(t))
     steps = np.diff(t[known])
-    back = np.flatnonzero(steps < 0)
-    if back.size:
-        worst = float(-steps[back].min())
-        add("reversed_time", known[back + 1], f"time goes back {_times(back.size)}, by up to {worst:g} s")
-    same = np.flatnonzero(steps == 0)
-    if same.size:
-        add("duplicated_time", known[same + 1], f"{counted(same.size, 'time stamp')} equal to the one before")
-    forward = steps[steps > 0]
+    back, same, forward = np.flatnonzero(steps < 0), np.flatnonzero(steps == 0), steps[steps > 0]
+    add("missing_time", unknown, f"{counted(unknown.size, 'sample')} without a time")
+    worst = float(-steps[back].min(initial=0.0))
+    add("reversed_time", known[back + 1], f"time goes back {_times(back.size)}, by up to {worst:g} s")
+    add("duplicated_time", known[same + 1], f"{counted(same.size, 'time stamp')} equal to the one before")
     if forward.size:
         typical = float(np.median(forward))
         if abs(typical / step - 1.0) > _RATE_ERROR and not (same.size and typical < 2.5 * step):
@@ -137,12 +132,10 @@ def _time_findings(recording: Recording) -> list[Finding]:
             add("rate_mismatch", known[:1], text)
             step = typical
         gaps = np.flatnonzero(steps > _GAP * step)
-        if gaps.size:
-            lost = np.round(steps[gaps] / step - 1.0).sum()
-            samples = counted(int(lost), "sample") if lost < 1e15 else f"{lost:.3g} samples"
-            longest = float(steps[gaps].max())
-            text = f"{counted(gaps.size, 'gap')}, about {samples} lost, the longest {longest:g} s"
-            add("gap", known[gaps], text)
+        lost = np.round(steps[gaps] / step - 1.0).sum()
+        samples = counted(int(lost), "sample") if lost < 1e15 else f"{lost:.3g} samples"
+        longest = float(steps[gaps].max(initial=0.0))
+        add("gap", known[gaps], f"{counted(gaps.size, 'gap')}, about {samples} lost, the longest {longest:g} s")
         usual = forward[forward <= _GAP * step] / step
         scatter = float(usual.std()) if usual.size else 0.0
         if scatter > _JITTER:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
 from html import escape
 from threading import Lock
 from types import MappingProxyType
@@ -20,7 +19,8 @@ from numpy.typing import NDArray
 from sealscope.calls import checked_call
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, LONG_NAMES, Array
-from sealscope.recordings.formats.columns import ChannelMap, check_call, choose_columns, counted
+from sealscope.recordings.formats.columns import ChannelMap, Wanted, check_call, counted
+from sealscope.storage.opening import whole
 
 if TYPE_CHECKING:
     import pandas
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 __all__ = ["CHANNEL_UNITS", "COUNTS", "Array", "Recording", "remembered"]
 
 _T = TypeVar("_T")
-#: The rate in a data frame's `attrs` is kept where the time stamps agree with it to this share.
-_SAME_RATE = 0.01
 
 
 def _frozen(values: Any) -> Array:
@@ -114,27 +112,23 @@ class Recording:
             rate = float(self.rate)
         except (TypeError, ValueError) as error:
             raise InputError(f"the values of a recording must be numbers: {error}") from None
+        bridged = None if self.bridged is None else np.array(self.bridged, dtype=bool)
         if t.ndim != 1:
             raise InputError(f"t must be one-dimensional, got shape {t.shape}")
-        for name, values in channels.items():
-            if values.shape != t.shape:
-                raise InputError(f"channel {name} must have as many samples as t ({t.size}), got shape {values.shape}")
-            if name not in self.units:
-                raise InputError(f"channel {name} must have a unit, got none")
-        if self.bridged is not None:
-            bridged = np.array(self.bridged, dtype=bool)
-            if bridged.shape != t.shape:
-                raise InputError(f"bridged must have as many samples as t ({t.size}), got shape {bridged.shape}")
-            bridged.setflags(write=False)
-            object.__setattr__(self, "bridged", bridged if bridged.any() else None)
+        for name, values in {**{f"channel {name}": own for name, own in channels.items()}, "bridged": bridged}.items():
+            if values is not None and values.shape != t.shape:
+                raise InputError(f"{name} must have as many samples as t ({t.size}), got shape {values.shape}")
+        if absent := next((name for name in channels if name not in self.units), None):
+            raise InputError(f"channel {absent} must have a unit, got none")
         if not (np.isfinite(rate) and rate > 0):
             raise InputError(f"rate must be > 0 Hz, got {self.rate}")
-        object.__setattr__(self, "t", t)
-        object.__setattr__(self, "channels", MappingProxyType(channels))
-        object.__setattr__(self, "units", MappingProxyType({name: self.units[name] for name in channels}))
-        object.__setattr__(self, "rate", rate)
-        object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
-        object.__setattr__(self, "history", tuple(self.history))
+        if bridged is not None:
+            bridged.setflags(write=False)
+        units = MappingProxyType({name: self.units[name] for name in channels})
+        frozen = {"t": t, "channels": MappingProxyType(channels), "units": units, "rate": rate}
+        frozen |= {"provenance": MappingProxyType(dict(self.provenance)), "history": tuple(self.history)}
+        for name, value in (frozen | {"bridged": bridged if bridged is not None and bridged.any() else None}).items():
+            object.__setattr__(self, name, value)
 
     def __getitem__(self, name: str) -> Array:
         try:
@@ -209,42 +203,21 @@ class Recording:
         return {"t": self.t, **self.channels}, {"t": "s", **self.units}, description
 
     def to_pandas(self) -> pandas.DataFrame:
-        """Return a data frame: index ``t [s]``, columns such as ``p_A [Pa]``.
+        """Return a data frame of copies: index ``t [s]``, columns such as ``p_A [Pa]``.
 
         Its ``attrs`` hold the units by column, the rate, the provenance and the history; `from_pandas` reads them.
-
-        Returns
-        -------
-        pandas.DataFrame
-            A copy of the samples.
-
-        Raises
-        ------
-        MissingExtra
-            If pandas is not installed.
-        InputError
-            If the provenance holds other values than JSON's.
+        Raises MissingExtra without pandas, and InputError where the provenance holds other values than JSON's.
         """
-        from sealscope.recordings.formats.frames import to_pandas
+        from sealscope.recordings.frames import to_pandas
 
         return to_pandas(*self.series())
 
     def to_xarray(self) -> xarray.Dataset:
-        """Return a data set over the coordinate ``t`` with the variables and attributes of the NetCDF files.
+        """Return a data set of copies over the coordinate ``t``, with the variables and attributes of NetCDF files.
 
-        Returns
-        -------
-        xarray.Dataset
-            A copy of the samples; each variable has ``units`` and ``long_name``.
-
-        Raises
-        ------
-        MissingExtra
-            If xarray is not installed.
-        InputError
-            If the provenance holds other values than JSON's.
+        Raises MissingExtra without xarray, and InputError where the provenance holds other values than JSON's.
         """
-        from sealscope.recordings.formats.frames import to_xarray
+        from sealscope.recordings.frames import to_xarray
 
         return to_xarray(*self.series())
 
@@ -279,19 +252,14 @@ class Recording:
             If no column is a channel, a unit is of another dimension, a value is no number, or there is neither time
             nor rate.
         """
-        from sealscope.recordings.formats.frames import read_pandas
+        from sealscope.recordings.frames import read_pandas
 
-        channel_map = map or {}
-        check_call(channel_map, rate)
-        choose = partial(choose_columns, channel_map=channel_map, rate=rate, place="data frame")
+        check_call(map or {}, rate)
         try:
-            table = read_pandas(frame, choose)
-            samples = table.samples({}, rate=rate, infer_rate=True)
+            with whole("a data frame", "data frame"):
+                return cls(*read_pandas(frame, Wanted(map or {}, rate))[:-1])
         except UnreadableFile as error:
             raise InputError(str(error)) from None
-        own = (table.description or {}).get("rate", samples.rate)
-        same = rate is None and abs(samples.rate / own - 1.0) <= _SAME_RATE
-        return cls(*samples._replace(rate=own if same else samples.rate))
 
 
 def remembered(

@@ -10,9 +10,9 @@ from math import isfinite
 from typing import Literal
 
 from sealscope.calls import nearest
-from sealscope.errors import InputError, UnreadableFile
+from sealscope.errors import InputError
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, UNUSED
-from sealscope.recordings.formats.headings.formula import Formula
+from sealscope.recordings.formats.headings.formula import Formula, parse_formula
 from sealscope.recordings.formats.headings.labels import Label, square_brackets
 from sealscope.recordings.formats.headings.proposal import (
     ends_in,
@@ -23,11 +23,11 @@ from sealscope.recordings.formats.headings.proposal import (
     split_unit,
     unit_of_time,
 )
-from sealscope.recordings.formats.headings.split_time import below_seconds, parts_of_time
+from sealscope.recordings.formats.headings.split_time import parts_of_time
 from sealscope.recordings.formats.headings.words import WORDS
 from sealscope.units import same_dimension, to_si
 
-_PARTS = re.compile(r"[./\\\\:<>]")
+_PARTS = re.compile(r"[./\\:<>]")
 #: Channel (or `t`) -> column, as a caller gives it; or the word for what the columns' names tell. In a mapping the
 #: key `REST` with that word asks for the channels that it does not name.
 ChannelMap = Mapping[str, str] | Literal["auto"]
@@ -35,25 +35,41 @@ REST = "*"
 
 
 @dataclass(frozen=True)
-class ColumnMap:
-    """What to load of a table: the number of the time column and its label, name -> formula of each channel.
+class Wanted:
+    """What a caller asks of a table: a map and a rate [Hz]; `file`: how the provenance calls it."""
 
-    `notes`: lines for the history; `date`: the column of the date, where the time column may hold the time of a day, or
-    the time column itself where a date is taken for it; `names`: channel -> label of its column, where the file calls
-    it otherwise; `rate`: of the samples [Hz], as the caller or the file says, or None; `parts`: part of the time -> its
-    column, where several columns hold the time; `unused`: recorded pressures, positions and speeds that no channel is
-    made of.
+    map: ChannelMap
+    rate: float | None = None
+    file: str = ""
+
+    @property
+    def infers_rate(self) -> bool:
+        """Whether the time tells the rate, although the table says it: a data frame may have lost rows since."""
+        return bool(self.map) or not self.file
+
+
+@dataclass
+class ColumnMap:
+    """What to read of the columns with these `labels`, by their numbers.
+
+    `time`, `time_label`: its column, and the name and unit that hold for it; `channels`: name -> what it is made of;
+    `parts`: part of the time -> its column, where several columns hold the time; `date`: the column of the date, where
+    the time column may hold the time of a day, or the time column itself where a date is taken for it; `rate`: of the
+    samples [Hz], as the caller or the file says, or None; `names`: channel -> what the file calls it, where this is
+    another name; `unused`: recorded pressures, positions and speeds that no channel is made of; `notes`: lines for the
+    history.
     """
 
-    time: int | None
-    time_label: Label | None
-    channels: Mapping[str, Formula[int]]
-    notes: tuple[str, ...] = ()
-    date: int | None = None
-    names: Mapping[str, str] = field(default_factory=dict)
+    labels: Sequence[Label]
     rate: float | None = None
-    parts: Mapping[str, int] = field(default_factory=dict)
+    time: int | None = None
+    time_label: Label | None = None
+    channels: dict[str, Formula[int]] = field(default_factory=dict)
+    parts: dict[str, int] = field(default_factory=dict)
+    date: int | None = None
+    names: dict[str, str] = field(default_factory=dict)
     unused: tuple[str, ...] = ()
+    notes: list[str] = field(default_factory=list)
 
     @property
     def channel_of(self) -> dict[int, str]:
@@ -61,14 +77,13 @@ class ColumnMap:
         return {column: name for name, made in self.channels.items() for column in made.factors}
 
     @property
-    def columns(self) -> list[tuple[int, bool]]:
-        """(column, whether it is read as time): those of channels and parts of the time in the table's order, the time.
-
-        A column of hours is the time and a part of it.
-        """
-        read = {*self.channel_of} | (set(self.parts.values()) - {self.time})
-        channels = [(column, False) for column in sorted(read)]
-        return channels if self.time is None else [*channels, (self.time, True)]
+    def columns(self) -> dict[int, str]:
+        """Column -> "numbers", or "time" for the last one, the time; a column of hours is the time and a part of it."""
+        read = {*self.channel_of, *self.parts.values()} - {self.time}
+        columns = dict.fromkeys(sorted(read), "numbers")
+        if self.time is not None:
+            columns[self.time] = "numbers" if self.time in self.channel_of else "time"
+        return columns
 
 
 def split_map_option(text: str) -> tuple[str, str]:
@@ -138,255 +153,218 @@ def _unit_of(label: Label, channel: str) -> str | None:
     return ending if fits else label.unit
 
 
-@dataclass
-class _Choice:
-    """What is taken of a table so far, as in `ColumnMap`; `formulas`: channel -> text of a map that is no column."""
-
-    labels: Sequence[Label]
-    place: str
-    time: int | None = None
-    time_label: Label | None = None
-    channels: dict[str, Formula[int]] = field(default_factory=dict)
-    formulas: dict[str, str] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-
-    @property
-    def columns(self) -> set[int]:
-        """Columns that channels are made of."""
-        return {column for made in self.channels.values() for column in made.factors}
-
-    @property
-    def have(self) -> str:
-        """The names of the columns, for messages."""
-        return listed(label.whole for label in self.labels)
-
-    def find(self, name: str, what: str, mapped: bool = False) -> int | None:
-        """Return the column called `name`: as written, else whatever its case, else by its number as in `#4`, from 1.
-
-        A `mapped` one may also be called by the last words of its name: `ch2`, `Pa`.
-        """
-        folded, columns = name.casefold(), list(enumerate(self.labels))
-        for matches in (
-            [i for i, label in columns if label.whole == name],
-            [i for i, label in columns if label.name == name],
-            [i for i, label in columns if label.called and label.called == name],
-            [i for i, label in columns if folded in (label.whole.casefold(), label.name.casefold())],
-            [i for i, label in columns if mapped and ends_in(label.name, name)],
-        ):
-            if len(matches) > 1:
-                numbers = " and ".join(str(i + 1) for i in matches)
-                raise UnreadableFile(
-                    f"{what} must be one column, got columns {numbers}: map its number, #{matches[0] + 1} "
-                    f"({self.place})"
-                )
-            if matches:
-                return matches[0]
-        number = name[1:] if name.startswith("#") else ""
-        if number.isascii() and number.isdigit() and 1 <= int(number[:9]) <= len(self.labels):
-            return int(number) - 1
-        return None
-
-    def mapped(self, channel: str, foreign: str) -> Formula[int]:
-        """Return what a map's text stands for: a column, a column and its unit, or a formula.
-
-        A unit of the text goes before that of the column's heading, and this before the ending of the column's name.
-        """
-        what = f"{foreign}, mapped to {channel},"
-        blank = foreign.rpartition(" ")
-        for name, unit in ((foreign, None), square_brackets(foreign), (blank[0], blank[2])):
-            column = self.find(name, what) if name else None
-            if column is not None:
-                return Formula({column: 1.0}, 0.0, _unit_of(self.labels[column], channel) if unit is None else unit)
-        try:
-            formula = Formula.parse(foreign)
-        except InputError as error:
-            if any(sign in foreign for sign in "*+"):
-                raise UnreadableFile(f"{error} ({self.place})") from None
-            formula = Formula({foreign: 1.0})
-        factors: dict[int, float] = {}
-        for name, factor in formula.factors.items():
-            own = what if name == foreign else f"{name} of {what}"
-            column = self.find(name, own, mapped=True)
-            if column is None:
-                raise UnreadableFile(f"{own} must be a column, got columns {self.have} ({self.place})")
-            factors[column] = factors.get(column, 0.0) + factor
-        units = {_unit_of(self.labels[column], channel) for column in factors}
-        if formula.unit is None and len(units) > 1:
-            raise UnreadableFile(f"{what} must state its unit, got columns in different ones ({self.place})")
-        return Formula(factors, formula.constant, units.pop() if formula.unit is None else formula.unit)
-
-    def checked_unit(self, channel: str, unit: str | None, what: str) -> tuple[str, str | None]:
-        """Return (unit, note): raw counts where no unit is given."""
-        if unit is None:
-            return COUNTS, f"{what} has no unit: taken as raw counts"
-        if same_dimension(unit, COUNTS):
-            return COUNTS, None
-        if channel == "omega" and unit in WORDS["turns"]:
-            return "rpm", None
-        to_si(0.0, unit, CHANNEL_UNITS[channel], name=channel, place=self.place)
-        return unit, None
-
-    def by_map(self, columns: Mapping[str, str]) -> None:
-        """Take what a map says."""
-        for channel, foreign in columns.items():
-            made = self.mapped(channel, foreign)
-            whole = self.labels[made.column].whole if made.is_column else foreign
-            if channel == "t":
-                if not made.is_column:
-                    raise UnreadableFile(
-                        f"t must be a column and its unit, such as t=time ms, got {foreign} ({self.place})"
-                    )
-                self.time, self.time_label = made.column, Label(whole, whole, made.unit)
-                continue
-            kind = "column" if made.is_column else "formula"
-            unit, note = self.checked_unit(channel, made.unit, f"{kind} {whole}, read as {channel},")
-            self.channels[channel] = replace(made, unit=unit)
-            if not made.is_column:
-                self.formulas[channel] = whole
-            self.notes.append(note or f"{kind} {whole} read as {channel} in {unit}")
-
-    def by_own_names(self) -> None:
-        """Take the other channels from the columns that bear their names, and the time where no map names it."""
-        for channel in CHANNEL_UNITS:
-            if channel in self.channels:
-                continue
-            own = self.find(channel, f"channel {channel}")
-            own = self._inside(channel) if own is None else own
-            if own is not None and own != self.time and own not in self.columns:
-                label = self.labels[own]
-                unit, note = self.checked_unit(channel, _unit_of(label, channel), f"column {label.whole}")
-                self.channels[channel] = Formula({own: 1.0}, 0.0, unit)
-                self.notes += [note] if note else []
-        if self.time is None and (time := self._find_time()) is not None:
-            label = self.labels[time]
-            unit_of_name = label.unit or WORDS["time"].get(label.name.casefold()) or unit_of_time(label)
-            self.time, self.time_label = time, Label(label.whole, label.name, unit_of_name)
-
-    def _inside(self, channel: str) -> int | None:
-        """Return the only column that bears a channel's name between points, strokes or brackets, or before a unit.
-
-        `Rig.Cyl.p_A [bar]`, `p_A_bar`.
-        """
-        unit = CHANNEL_UNITS[channel]
-        matches = [
-            i
-            for i, label in enumerate(self.labels)
-            if (channel in _PARTS.split(label.name) and label.unit is not None and same_dimension(label.unit, unit))
-            or (split_unit(label.name)[0] == channel and _unit_of(label, channel) is not None)
-        ]
-        return matches[0] if len(matches) == 1 else None
-
-    def _find_time(self) -> int | None:
-        labels = self.labels
-        if (exact := next((i for i, label in enumerate(labels) if label.name == "t"), None)) is not None:
-            self.find("t", "t")
-            return exact
-        for name in WORDS["time"]:
-            matches = [i for i, label in enumerate(labels) if name in (label.whole.casefold(), label.name.casefold())]
-            if matches:
-                return next((i for i in matches if labels[i].unit is not None), matches[0])
-        named = [i for i, label in enumerate(labels) if is_time(label) and label.name.casefold() not in WORDS["date"]]
-        return next((i for i in named if labels[i].unit is not None), named[0] if named else None)
-
-    def split_time(self, rated: bool) -> dict[str, int]:
-        """Return the parts of the time, where several columns hold it together, and set the time column.
-
-        Hours, minutes and seconds stand beside a date or alone; then the column of seconds or of hours is the time.
-        Where nothing else tells it, a date is the time, or the only column in a unit of time; `rated`: the file states
-        a rate.
-        """
-        labels, used = self.labels, self.columns
-        parts = parts_of_time(labels, [*used])
-        if parts and self.time is not None and self.time not in parts.values():
-            parts = {}
-        dates = [i for i in self.dates() if i not in parts.values()]
-        if parts:
-            column = dates[0] if dates and "year" not in parts else parts["hour"] if self.time is None else self.time
-            whole = ", ".join(labels[i].whole for i in dict.fromkeys((column, *parts.values())))
-            self.time_label = Label(whole, whole, "s" if self.time is not None else None)
-            self.time = column
-            return parts
-        if self.time is None and not rated:
-            timed = [i for i, own in enumerate(labels) if i not in used and own.unit and same_dimension(own.unit, "s")]
-            if dates or len(timed) == 1:  # `x-axis` over `second`, as oscilloscopes write
-                self.time = (dates or timed)[0]
-                self.time_label = labels[self.time]
-        return {} if self.time is None else below_seconds(labels, [*used, self.time])
-
-    def dates(self) -> list[int]:
-        """Return the columns called dates that no channel is made of."""
-        named = [i for i, label in enumerate(self.labels) if label.name.casefold() in WORDS["date"]]
-        return [i for i in named if i not in self.columns]
-
-    def check(self, rate: float | None, stated_rate: float | None) -> None:
-        """Raise UnreadableFile where there is no channel, or neither a time nor a rate [Hz]."""
-        if not self.channels:
-            guess = map_options(proposed_map(self.labels))
-            raise UnreadableFile(
-                f"a recording must have a channel ({', '.join(CHANNEL_UNITS)}) or be given a map such as p_A=COLUMN, "
-                f"got columns {self.have} ({self.place})" + (f"; map auto would read {guess}" if guess else "")
-            )
-        if rate is None and self.time is None:
-            if stated_rate is None:
-                raise UnreadableFile(
-                    "a recording must have a time column such as t [s] or be given a rate, "
-                    f"got columns {self.have} ({self.place})"
-                )
-            self.notes.append(f"no time column: sampled at {stated_rate:g} Hz, as the file says")
+def _columns_of(labels: Sequence[Label]) -> str:
+    """Return the names of the columns, for messages."""
+    return listed(label.whole for label in labels)
 
 
-def choose_columns(
-    labels: Sequence[Label],
-    stated_rate: float | None = None,
-    *,
-    channel_map: ChannelMap,
-    rate: float | None,
-    place: str,
-) -> ColumnMap:
+def _find(labels: Sequence[Label], name: str, what: str, mapped: bool = False) -> int | None:
+    """Return the column of a name, of a number as in `#4` from 1, or, `mapped`, of a name's last words: `ch2`."""
+    folded = name.casefold()
+    for is_called in (
+        lambda label: label.whole == name,
+        lambda label: label.name == name,
+        lambda label: label.called and label.called == name,
+        lambda label: folded in (label.whole.casefold(), label.name.casefold()),
+        lambda label: mapped and ends_in(label.name, name),
+    ):
+        matches = [i for i, label in enumerate(labels) if is_called(label)]
+        if len(matches) > 1:
+            numbers = " and ".join(str(i + 1) for i in matches)
+            raise InputError(f"{what} must be one column, got columns {numbers}: map its number, #{matches[0] + 1}")
+        if matches:
+            return matches[0]
+    number = name[1:] if name.startswith("#") else ""
+    return int(number) - 1 if number.isascii() and number.isdigit() and 1 <= int(number[:9]) <= len(labels) else None
+
+
+def _mapped(labels: Sequence[Label], channel: str, foreign: str) -> Formula[int]:
+    """Return what a map's text stands for; its unit goes before that of the heading, and this before the name's."""
+    what = f"{foreign}, mapped to {channel},"
+    blank = foreign.rpartition(" ")
+    for name, unit in ((foreign, None), square_brackets(foreign), (blank[0], blank[2])):
+        column = _find(labels, name, what) if name else None
+        if column is not None:
+            return Formula({column: 1.0}, 0.0, _unit_of(labels[column], channel) if unit is None else unit)
+    try:
+        formula = parse_formula(foreign)
+    except InputError:
+        if any(sign in foreign for sign in "*+"):
+            raise
+        formula = Formula({foreign: 1.0})
+    factors: dict[int, float] = {}
+    for name, factor in formula.factors.items():
+        own = what if name == foreign else f"{name} of {what}"
+        column = _find(labels, name, own, mapped=True)
+        if column is None:
+            raise InputError(f"{own} must be a column, got columns {_columns_of(labels)}")
+        factors[column] = factors.get(column, 0.0) + factor
+    units = {_unit_of(labels[column], channel) for column in factors}
+    if formula.unit is None and len(units) > 1:
+        raise InputError(f"{what} must state its unit, got columns in different ones")
+    return Formula(factors, formula.constant, units.pop() if formula.unit is None else formula.unit)
+
+
+def _checked_unit(channel: str, unit: str | None, what: str) -> tuple[str, str | None]:
+    """Return (unit, note): raw counts where no unit is given."""
+    if unit is None:
+        return COUNTS, f"{what} has no unit: taken as raw counts"
+    if same_dimension(unit, COUNTS):
+        return COUNTS, None
+    if channel == "omega" and unit in WORDS["turns"]:
+        return "rpm", None
+    to_si(0.0, unit, CHANNEL_UNITS[channel], name=channel)
+    return unit, None
+
+
+def _by_map(choice: ColumnMap, columns: Mapping[str, str]) -> None:
+    """Take what a map says."""
+    for channel, foreign in columns.items():
+        made = _mapped(choice.labels, channel, foreign)
+        whole = foreign if made.column is None else choice.labels[made.column].whole
+        if channel == "t":
+            if made.column is None:
+                raise InputError(f"t must be a column and its unit, such as t=time ms, got {foreign}")
+            choice.time, choice.time_label = made.column, Label(whole, whole, made.unit)
+            continue
+        kind = "formula" if made.column is None else "column"
+        unit, note = _checked_unit(channel, made.unit, f"{kind} {whole}, read as {channel},")
+        choice.channels[channel] = replace(made, unit=unit)
+        if made.column is None or choice.labels[made.column].name != channel:
+            choice.names[channel] = whole
+        choice.notes.append(note or f"{kind} {whole} read as {channel} in {unit}")
+
+
+def _by_own_names(choice: ColumnMap) -> None:
+    """Take the other channels from the columns that bear their names, and the time where no map names it."""
+    labels = choice.labels
+    for channel in CHANNEL_UNITS:
+        if channel in choice.channels:
+            continue
+        own = _find(labels, channel, f"channel {channel}")
+        own = _inside(labels, channel) if own is None else own
+        if own is not None and own != choice.time and own not in choice.channel_of:
+            unit, note = _checked_unit(channel, _unit_of(labels[own], channel), f"column {labels[own].whole}")
+            choice.channels[channel] = Formula({own: 1.0}, 0.0, unit)
+            choice.names |= {} if labels[own].name == channel else {channel: labels[own].whole}
+            choice.notes += [note] if note else []
+    if choice.time is None and (time := _find_time(labels)) is not None:
+        label = labels[time]
+        unit_of_name = label.unit or WORDS["time"].get(label.name.casefold()) or unit_of_time(label)
+        choice.time, choice.time_label = time, replace(label, unit=unit_of_name)
+
+
+def _inside(labels: Sequence[Label], channel: str) -> int | None:
+    """Return the only column with a channel's name between points or before a unit: `Rig.Cyl.p_A [bar]`, `p_A_bar`."""
+    matches = [
+        i
+        for i, label in enumerate(labels)
+        if (
+            channel in _PARTS.split(label.name)
+            and label.unit is not None
+            and same_dimension(label.unit, CHANNEL_UNITS[channel])
+        )
+        or (split_unit(label.name)[0] == channel and _unit_of(label, channel) is not None)
+    ]
+    return matches[0] if len(matches) == 1 else None
+
+
+def _find_time(labels: Sequence[Label]) -> int | None:
+    if (exact := next((i for i, label in enumerate(labels) if label.name == "t"), None)) is not None:
+        _find(labels, "t", "t")  # which must be one column
+        return exact
+    known = [
+        [i for i, own in enumerate(labels) if name in (own.whole.casefold(), own.name.casefold())]
+        for name in WORDS["time"]
+    ]
+    known.append([i for i, own in enumerate(labels) if is_time(own) and own.name.casefold() not in WORDS["date"]])
+    matches = next(filter(None, known), [])
+    return next((i for i in matches if labels[i].unit is not None), matches[0] if matches else None)
+
+
+def _split_time(choice: ColumnMap) -> None:
+    """Take the parts of the time, where several columns hold it together, and the time column where none has its name.
+
+    Hours, minutes and seconds stand beside a date or alone; then the column of seconds or of hours is the time. Where
+    nothing else tells it, and the file states no rate, a date is the time, or the only column in a unit of time.
+    """
+    labels, used = choice.labels, choice.channel_of
+    parts = parts_of_time(labels, used)
+    if "hour" in parts and choice.time in (None, *parts.values()):
+        dates = [i for i in _dates(choice) if i not in parts.values()]
+        time = parts["hour"] if choice.time is None else choice.time
+        time = dates[0] if dates and "year" not in parts else time
+        whole = ", ".join(labels[i].whole for i in dict.fromkeys((time, *parts.values())))
+        choice.time_label = Label(whole, whole, "s" if choice.time is not None else None)
+        choice.time, choice.parts = time, parts
+        return
+    if choice.time is None and choice.rate is None:
+        timed = [i for i, own in enumerate(labels) if i not in used and own.unit and same_dimension(own.unit, "s")]
+        dates = _dates(choice)
+        if dates or len(timed) == 1:  # `x-axis` over `second`, as oscilloscopes write
+            choice.time = (dates or timed)[0]
+            choice.time_label = labels[choice.time]
+    if choice.time is not None:
+        choice.parts = parts_of_time(labels, {*used, choice.time}, below=True)
+
+
+def _dates(choice: ColumnMap) -> list[int]:
+    """Return the columns called dates that no channel is made of."""
+    named = [i for i, label in enumerate(choice.labels) if label.name.casefold() in WORDS["date"]]
+    return [i for i in named if i not in choice.channel_of]
+
+
+def choose_columns(labels: Sequence[Label], wanted: Wanted, stated_rate: float | None = None) -> ColumnMap:
     """Decide which columns are read, and as what.
 
-    Without a time column the samples have the `rate` given, else the `stated_rate` of the file itself [Hz]. A map
-    `auto` is what `proposed_map` makes of the labels, for the channels and columns that the map does not name. A mapped
-    channel comes before a column that bears the channel's own name. Raises UnreadableFile where a mapped column is
-    missing, where no column is a channel, and where there is neither time nor rate; InputError for a unit of another
-    dimension.
+    Without a time column the samples have the rate that is wanted, else the `stated_rate` of the file itself [Hz]. A
+    map `auto` is what `proposed_map` makes of the labels, for the channels and columns that the map does not name. A
+    mapped channel comes before a column that bears the channel's own name. Raises InputError where a mapped column is
+    missing, where no column is a channel, where there is neither time nor rate, and for a unit of another dimension.
     """
-    choice, columns = _Choice(labels, place), stated_columns(channel_map)
-    if by_names(channel_map):
+    choice, columns, rate = ColumnMap(labels, stated_rate), stated_columns(wanted.map), wanted.rate
+    if by_names(wanted.map):
         taken: set[int] = set()
         for channel, foreign in columns.items():
-            with suppress(UnreadableFile):  # said where the map is gone through
-                taken.update(choice.mapped(channel, foreign).factors)
+            with suppress(InputError):  # said where the map is gone through
+                taken.update(_mapped(labels, channel, foreign).factors)
         free = [Label("", "") if column in taken else label for column, label in enumerate(labels)]
         columns = {**proposed_map(free), **columns}
-    choice.by_map(columns)
-    choice.by_own_names()
-    parts = choice.split_time(stated_rate is not None) if rate is None else {}
-    choice.check(rate, stated_rate)
-    time, time_label, channels, notes = choice.time, choice.time_label, choice.channels, choice.notes
-    used = choice.columns | {time} | set(parts.values())
-    date = next((i for i in choice.dates() if i not in used), None) if time is not None else None
-    left = [label for i, label in enumerate(labels) if i not in used and i != date and label.whole]
-    if rate is not None and time_label is not None:
-        notes.append(f"time column {time_label.whole} not used: the rate was given as {rate:g} Hz")
-        time = time_label = None
+    _by_map(choice, columns)
+    _by_own_names(choice)
+    if rate is None:
+        _split_time(choice)
+    if not choice.channels:
+        guess = map_options(proposed_map(labels))
+        raise InputError(
+            f"a recording must have a channel ({', '.join(CHANNEL_UNITS)}) or be given a map such as p_A=COLUMN, "
+            f"got columns {_columns_of(labels)}" + (f"; map auto would read {guess}" if guess else "")
+        )
+    used = {*choice.channel_of, choice.time, *choice.parts.values()}
+    if rate is not None:
+        choice.rate = rate
+        if choice.time_label is not None:
+            choice.notes.append(f"time column {choice.time_label.whole} not used: the rate was given as {rate:g} Hz")
+    elif choice.time is None:
+        if stated_rate is None:
+            raise InputError(
+                "a recording must have a time column such as t [s] or be given a rate, "
+                f"got columns {_columns_of(labels)}"
+            )
+        choice.notes.append(f"no time column: sampled at {stated_rate:g} Hz, as the file says")
+    if choice.time is not None:
+        choice.date = next((i for i in _dates(choice) if i not in used), None)
+    left = [label for i, label in enumerate(labels) if i not in used and i != choice.date and label.whole]
     if left:
-        guesses = {name: column for name, column in proposed_map(labels).items() if name not in {*channels, "t"}}
-        hint = f"; map auto would also read {map_options(guesses)}" if guesses else ""
-        notes.append(f"{UNUSED}: {listed((label.whole for label in left), 40)}{hint}")
-    if time is None:
-        date = None
-    elif "t" not in columns and not parts and labels[time].name.casefold() in WORDS["date"]:
-        date = time
-    own = {channel: labels[made.column] for channel, made in channels.items()}
-    return ColumnMap(
-        time,
-        time_label,
-        dict(sorted(channels.items(), key=lambda item: item[1].column)),
-        tuple(notes),
-        date,
-        {channel: label.whole for channel, label in own.items() if label.name != channel} | choice.formulas,
-        stated_rate if rate is None else rate,
-        parts,
-        tuple(label.whole for label in left if is_recorded(label)),
-    )
+        own = {*choice.channels, "t"}
+        guess = map_options({name: column for name, column in proposed_map(labels).items() if name not in own})
+        hint = f"; map auto would also read {guess}" if guess else ""
+        choice.notes.append(f"{UNUSED}: {listed((label.whole for label in left), 40)}{hint}")
+    if rate is not None:
+        choice.time = choice.time_label = choice.date = None
+    elif "t" not in columns and not choice.parts and choice.time is not None:
+        is_date = labels[choice.time].name.casefold() in WORDS["date"]
+        choice.date = choice.time if is_date else choice.date
+    choice.unused = tuple(label.whole for label in left if is_recorded(label))
+    choice.channels = dict(sorted(choice.channels.items(), key=lambda item: next(iter(item[1].factors))))
+    return choice

@@ -12,11 +12,7 @@ from sealscope.errors import MissingExtra
 
 
 def library(module: str, reads: str, package: str) -> ModuleType:
-    """Import a library of the extra `io`; raise MissingExtra where it is absent.
-
-    `reads`: what it is needed for, in words; `package`: its name on an index. What it logs goes to handlers that a
-    program has set up, and not by itself to the terminal.
-    """
+    """Import a library of the extra `io`, silent but for handlers that a program has set up, or raise MissingExtra."""
     fresh = module not in sys.modules
     try:
         with warnings.catch_warnings():

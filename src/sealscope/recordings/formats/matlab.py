@@ -14,14 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.errors import UnreadableFile
+from sealscope.errors import InputError
 from sealscope.recordings.channels import Array
+from sealscope.recordings.formats.columns import Wanted
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.preamble import stated_rate
 from sealscope.recordings.formats.libraries import library
 from sealscope.recordings.formats.netcdf import refuse_elsewhere
 from sealscope.recordings.formats.structured.tree import number_of, series_in
-from sealscope.recordings.formats.table import MAX_VALUES, Choose, RawTable, Series, table_of, uniform
+from sealscope.recordings.formats.table import MAX_VALUES, RecordingFields, Series, table_of, uniform
 
 #: Group of the streams, by which such a file is known; what refers to them.
 _STREAMS, _REFERENCES = "#sigstream#", "#refs#"
@@ -29,14 +30,13 @@ _STREAMS, _REFERENCES = "#sigstream#", "#refs#"
 
 def is_matlab_4(head: bytes) -> bool:
     """Return whether a file that begins with `head` is a MATLAB 4 file: five integers, and a name that ends in zero."""
-    for order in "<>" if len(head) > 20 else "":
+    for machine, order in enumerate("<>" if len(head) > 20 else ""):
         kind, rows, columns, imaginary, length = struct.unpack(f"{order}5i", head[:20])
-        machine, zero, precision, storage = kind // 1000, kind // 100 % 10, kind // 10 % 10, kind % 10
         if (
-            machine == ("<>".index(order))
-            and zero == 0
-            and precision <= 5
-            and storage <= 2
+            kind // 1000 == machine
+            and kind // 100 % 10 == 0
+            and kind // 10 % 10 <= 5  # precision
+            and kind % 10 <= 2  # storage
             and min(rows, columns) >= 0
             and imaginary in (0, 1)
             and 1 < length <= 64
@@ -46,64 +46,48 @@ def is_matlab_4(head: bytes) -> bool:
     return False
 
 
-def read_matlab(path: Path, choose: Choose) -> RawTable:
-    """Read the chosen series of a MATLAB file; raise MissingExtra where mat-io is absent."""
-    place = str(path)
-    if (table := _streamed(path, choose, place)) is not None:
-        return table
+def read_matlab(path: Path, wanted: Wanted) -> RecordingFields:
+    """Read the wanted series of a MATLAB file; raise MissingExtra where mat-io is absent."""
+    import h5py
+
+    size = path.stat().st_size
+    if h5py.is_hdf5(path):  # version 7.3
+        with h5py.File(path, "r") as file:
+            _refuse_elsewhere(file)
+            if _STREAMS in file:
+                return table_of(list(_streamed_series(file)), wanted, "MATLAB", size=size)
     matio = library("matio", "a MATLAB file", "mat-io")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # on classes that have no meaning here
         for name, (shape, *_) in matio.whosmat(path).items():
             if np.prod([float(length) for length in shape]) > MAX_VALUES:
-                raise UnreadableFile(f"{name} must have at most {MAX_VALUES} values, got the shape {shape} ({place})")
-        _refuse_elsewhere(path, place)
+                raise InputError(f"{name} must have at most {MAX_VALUES} values, got the shape {shape}")
         held = matio.load_from_mat(path, add_table_attrs=True)
     values = {name: value for name, value in held.items() if not name.startswith("__")}
-    series = list(series_in(values))
     scalars = {name: repr(number) for name, value in values.items() if (number := number_of(value)) is not None}
-    return table_of(series, choose, "MATLAB", place, rate=stated_rate(scalars))
+    return table_of(list(series_in(values)), wanted, "MATLAB", rate=stated_rate(scalars), size=size)
 
 
-def _streamed(path: Path, choose: Choose, place: str) -> RawTable | None:
-    """Return the table of a file whose signals Simulink has streamed; None for any other file."""
+def _refuse_elsewhere(file: Any) -> None:
+    """Raise InputError where an HDF5 file refers to other files."""
     import h5py
 
-    if not h5py.is_hdf5(path):
-        return None
-    with h5py.File(path, "r") as file:
-        if _STREAMS not in file:
-            return None
-        _refuse_elsewhere(path, place)
-        return table_of(list(_streamed_series(file)), choose, "MATLAB", place)
-
-
-def _refuse_elsewhere(path: Path, place: str) -> None:
-    """Raise UnreadableFile where a version 7.3 file, which is HDF5, refers to other files."""
-    import h5py
-
-    if not h5py.is_hdf5(path):
-        return
-    with h5py.File(path, "r") as file:
-        folders = [file]
-        while folders:
-            folder = folders.pop()
-            for name in folder:
-                if isinstance(folder.get(name, getlink=True), h5py.ExternalLink):
-                    raise UnreadableFile(f"{name} must be in the file itself, got a link to another file ({place})")
-                if isinstance(folder.get(name, getlink=True), h5py.HardLink):
-                    item = folder[name]
-                    if isinstance(item, h5py.Group):
-                        folders.append(item)
-                    elif isinstance(item, h5py.Dataset):
-                        refuse_elsewhere(name, item, place)
+    folders = [file]
+    while folders:
+        folder = folders.pop()
+        for name in folder:
+            link = folder.get(name, getlink=True)
+            if isinstance(link, h5py.ExternalLink):
+                raise InputError(f"{name} must be in the file itself, got a link to another file")
+            item = folder[name] if isinstance(link, h5py.HardLink) else None
+            if isinstance(item, h5py.Group):
+                folders.append(item)
+            elif isinstance(item, h5py.Dataset):
+                refuse_elsewhere(name, item)
 
 
 def _streamed_series(file: Any) -> Iterator[Series]:
-    """Yield the signals of doubles of an open HDF5 file that has `_STREAMS`.
-
-    `Values/DataR2` of a signal is the number of its stream, `Values/CompressedTime` first time, step and count.
-    """
+    """Yield the signals of doubles; `CompressedTime` holds first time, step and count, `DataR2` the stream's number."""
     import h5py
 
     for item in file.get(_REFERENCES, {}).values():

@@ -11,26 +11,29 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.recordings.channels import Array
+from sealscope.recordings.formats.cells import MOST_WORDS
+from sealscope.recordings.formats.columns import Wanted
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.preamble import entries
 from sealscope.recordings.formats.libraries import library
-from sealscope.recordings.formats.table import MOST_WORDS, Choose, Clock, RawTable, Series, table_of
+from sealscope.recordings.formats.table import Clock, RecordingFields, Series, table_of
 
 
-def read_mdf(path: Path, choose: Choose) -> RawTable:
-    """Read the chosen channels of an MDF file in physical values; raise MissingExtra where asammdf is absent.
-
-    Frames of a bus that nobody has decoded are no channels.
-    """
+def read_mdf(path: Path, wanted: Wanted) -> RecordingFields:
+    """Read the wanted channels in physical values; frames of a bus that nobody has decoded are no channels."""
     with _opened(library("asammdf", "MDF", "asammdf").MDF, path) as file:
-        start = _start(file)
+        moment = np.datetime64(file.header.start_time.astimezone(UTC).replace(tzinfo=None), "us")
+        start = moment if moment > np.datetime64("1980-01-02") else None  # a file without a date has 1980 or before
         series = []
         groups: list[Any] = file.groups
         for number, group in enumerate(groups):
             count = int(group.channel_group.cycles_nr)
             master = file.masters_db.get(number)
-            clock = None if master is None else Clock(number, partial(_seconds, file, number, start))
+
+            def seconds(number: int = number) -> Any:
+                return np.asarray(file.get_master(number), dtype=np.float64), start
+
+            clock = None if master is None else Clock(number, seconds)
             name = str(getattr(group.channel_group, "comment", "") or "").strip() or f"group {number + 1}"
             for index, channel in enumerate(group.channels):
                 if index != master:
@@ -38,7 +41,7 @@ def read_mdf(path: Path, choose: Choose) -> RawTable:
                     series.append(Series(name, label, count, partial(_values, file, number, index), clock))
         header = ("author", "department", "project", "subject", "comment")
         about = entries((name, getattr(file.header, name, "")) for name in header)
-        return table_of(series, choose, f"MDF {file.version}", str(path), about)
+        return table_of(series, wanted, f"MDF {file.version}", about, size=path.stat().st_size)
 
 
 def _opened(MDF: Any, path: Path) -> Any:
@@ -57,20 +60,9 @@ def _values(file: Any, group: int, index: int) -> NDArray[Any]:
     if values.dtype.kind not in "OSU":
         return values
     # a conversion has texts for some values (`SNA`): these are missing, and the others numbers
-    numbers = np.asarray(
-        file.get(group=group, index=index, raw=True).physical(ignore_value2text_conversions=True).samples
-    )
+    raw = file.get(group=group, index=index, raw=True)
+    numbers = np.asarray(raw.physical(ignore_value2text_conversions=True).samples)
     named = np.array([isinstance(cell, bytes | str) and bool(cell) for cell in values.tolist()])
     if numbers.dtype.kind not in "fiu" or np.count_nonzero(named) > MOST_WORDS * named.size:
         return values
     return np.where(named, np.nan, numbers)
-
-
-def _seconds(file: Any, group: int, start: np.datetime64 | None) -> tuple[Array, np.datetime64 | None]:
-    return np.asarray(file.get_master(group), dtype=np.float64), start
-
-
-def _start(file: Any) -> np.datetime64 | None:
-    """Return the moment of the measurement's beginning in UTC; None where the file has none (1980 and before)."""
-    moment = np.datetime64(file.header.start_time.astimezone(UTC).replace(tzinfo=None), "us")
-    return moment if moment > np.datetime64("1980-01-02") else None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import partial
 from io import BytesIO
 from pathlib import Path
@@ -13,16 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.errors import UnreadableFile
+from sealscope.errors import InputError
 from sealscope.recordings.channels import LONG_NAMES, Array
+from sealscope.recordings.formats.columns import Wanted
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.preamble import entries, stated_rate
 from sealscope.recordings.formats.table import (
     FORMAT_VERSION,
-    Choose,
-    RawTable,
+    RecordingFields,
     Series,
-    check_size,
     check_texts,
     parse_description,
     table_of,
@@ -37,11 +35,11 @@ OWN = "sealscope_format"
 _ORDER = {name: place for place, name in enumerate(LONG_NAMES)}
 
 
-def read_netcdf(path: Path, choose: Choose) -> RawTable:
-    """Read the chosen one-dimensional data sets, and fields of tables, of all groups of a NetCDF-4 or HDF5 file."""
+def read_netcdf(path: Path, wanted: Wanted) -> RecordingFields:
+    """Read the wanted one-dimensional data sets, and fields of tables, of all groups of a NetCDF-4 or HDF5 file."""
     import h5py
 
-    place = str(path)
+    size = path.stat().st_size
     with h5py.File(path, "r") as file:
         names: list[str] = []
         file.visititems(lambda name, item: names.append(name) if _is_series(item) else None)
@@ -51,23 +49,22 @@ def read_netcdf(path: Path, choose: Choose) -> RawTable:
             data = file[name]
             group, _, leaf = name.rpartition("/")
             if not data.dtype.names:
-                series.append(Series(group, _label(leaf, data), data.size, partial(_values, data, name, place)))
+                series.append(Series(group, _label(leaf, data), data.size, partial(_values, data, name, size)))
                 continue
             series += [
-                Series(name, Label.parse(field), data.size, partial(_field, data, name, field, place))
+                Series(name, Label.parse(field), data.size, partial(_field, data, name, field))
                 for field in data.dtype.names
                 if data.dtype[field].kind in "fiub"
             ]
-        pairs = () if OWN in file.attrs else file.attrs.items()
+        own = _description(file) if OWN in file.attrs else None
+        pairs = () if own else file.attrs.items()
         about = entries((name, text) for name, value in pairs if (text := _text(value)) is not None)
         kind = "NetCDF" if "_NCProperties" in file.attrs else "HDF5"
-        table = table_of(series, choose, kind, place, rate=stated_rate(about))
-        return replace(table, description=_description(file, place))
+        return table_of(series, wanted, kind, rate=stated_rate(about), own=own, size=size)
 
 
-def _field(data: Any, name: str, field: str, place: str) -> NDArray[Any]:
-    refuse_elsewhere(name, data, place)
-    check_size(data.size, len(data.dtype.names), place)
+def _field(data: Any, name: str, field: str) -> NDArray[Any]:
+    refuse_elsewhere(name, data)
     return np.asarray(data[field], dtype=np.float64)
 
 
@@ -80,11 +77,11 @@ def _is_series(item: Any) -> bool:
     return not (isinstance(remark, bytes) and remark.startswith(b"This is a netCDF dimension but not"))
 
 
-def refuse_elsewhere(name: str, data: Any, place: str) -> None:
-    """Raise UnreadableFile for a data set whose samples are in other files, which nobody has given to be read."""
+def refuse_elsewhere(name: str, data: Any) -> None:
+    """Raise InputError for a data set whose samples are in other files, which nobody has given to be read."""
     if data.external or data.is_virtual:
         what = "external storage" if data.external else "a virtual data set"
-        raise UnreadableFile(f"{name} must have its samples in the file itself, got {what} ({place})")
+        raise InputError(f"{name} must have its samples in the file itself, got {what}")
 
 
 def _text(value: Any) -> str | None:
@@ -105,69 +102,57 @@ def _label(name: str, data: Any) -> Label:
     return Label(name, label.name, label.unit)
 
 
-def _values(data: Any, name: str, place: str) -> NDArray[Any]:
+def _values(data: Any, name: str, size: int) -> NDArray[Any]:
     """Read a data set as doubles, with scale, offset and fill value of the CF conventions, or as texts."""
-    refuse_elsewhere(name, data, place)
+    refuse_elsewhere(name, data)
     if data.dtype.kind in "OSU":
-        return np.array(_texts(data, name, place), dtype=object)
+        return np.array(_texts(data, name, size), dtype=object)
     if data.dtype.kind not in "fiub":
-        raise UnreadableFile(f"{name} must hold numbers, got the type {data.dtype} ({place})")
+        raise InputError(f"{name} must hold numbers, got the type {data.dtype}")
     raw = data[...]
-    values = np.asarray(raw, dtype=np.float64)
+    values = np.array(raw, dtype=np.float64)
     missing = np.zeros(raw.shape, dtype=bool)
     for key in ("_FillValue", "missing_value"):
         if key in data.attrs:
             fills = np.asarray(data.attrs[key]).reshape(-1).astype(raw.dtype)
-            for fill in np.unique(fills[:_MOST_FILLS]):
-                missing |= raw == fill
+            missing |= np.isin(raw, fills[:_MOST_FILLS])
     for key, change in (("scale_factor", np.multiply), ("add_offset", np.add)):
         if key in data.attrs:
             values = change(values, _number(data.attrs[key]))
-    if missing.any():
-        values = values.copy() if values is raw else values
-        values[missing] = np.nan
+    values[missing] = np.nan
     return values
 
 
-def _texts(data: Any, name: str, place: str) -> list[str]:
-    """Return the cells of a data set of texts; those of any length are read a few at a time, and none may be long.
-
-    Any number of cells may refer to one text, which is at most as long as the file.
-    """
+def _texts(data: Any, name: str, size: int) -> list[str]:
+    """Return the cells of texts, a few at a time: any number of them may refer to one text as long as the file."""
     import h5py
 
-    check_texts(data.size, data.dtype.itemsize, name, place)
+    check_texts(data.size, data.dtype.itemsize, name)
     if data.dtype.kind == "O" and h5py.check_string_dtype(data.dtype) is None:
-        raise UnreadableFile(f"{name} must hold numbers, got lists or references ({place})")
+        raise InputError(f"{name} must hold numbers, got lists or references")
     if data.dtype.kind != "O":
         return [_text(cell) or "" for cell in data[...]]
-    at_once = min(max(_READ_AT_ONCE // Path(place).stat().st_size, 1), _MOST_AT_ONCE)
+    at_once = min(max(_READ_AT_ONCE // size, 1), _MOST_AT_ONCE)
     cells: list[str] = []
     for start in range(0, data.size, at_once):
         part = data[start : start + at_once]
-        check_texts(data.size, max(len(cell) if isinstance(cell, bytes | str) else 0 for cell in part), name, place)
+        check_texts(data.size, max(len(cell) if isinstance(cell, bytes | str) else 0 for cell in part), name)
         cells += [_text(cell) or "" for cell in part]
     return cells
 
 
-def _description(file: Any, place: str) -> dict[str, Any] | None:
-    if OWN not in file.attrs:
-        return None
+def _description(file: Any) -> dict[str, Any]:
     try:
-        history = _text(file.attrs["history"]) or "[]"
+        history, provenance = (_text(file.attrs[name]) for name in ("history", "provenance"))
+        description: dict[str, Any] = {"format": int(_number(file.attrs[OWN])), "rate": _number(file.attrs["rate"])}
+        description["provenance"] = json.loads(provenance or "{}")
         try:
-            lines = json.loads(history)
+            description["history"] = json.loads(history or "[]")
         except ValueError:  # another tool has added its own line, as the CF conventions ask
-            lines = history.splitlines()
-        description = {
-            "format": int(_number(file.attrs[OWN])),
-            "rate": _number(file.attrs["rate"]),
-            "provenance": json.loads(_text(file.attrs["provenance"]) or "{}"),
-            "history": lines,
-        }
+            description["history"] = (history or "").splitlines()
     except (KeyError, IndexError, ValueError, TypeError, OverflowError) as error:
-        raise UnreadableFile(f"the recording's description must be whole, got damaged attributes ({place})") from error
-    return parse_description(json.dumps(description), place)
+        raise InputError("the recording's description must be whole, got damaged attributes") from error
+    return parse_description(json.dumps(description))
 
 
 def attributes(description: Mapping[str, Any]) -> dict[str, Any]:
@@ -185,10 +170,7 @@ def attributes(description: Mapping[str, Any]) -> dict[str, Any]:
 def write_netcdf(
     path: Path, values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]
 ) -> None:
-    """Write NetCDF-4 (an HDF5 file): dimension `t`, one variable a channel with `units`; doubles, to the bit.
-
-    The file is made in memory first: libhdf5 ends the process where a disk is full.
-    """
+    """Write NetCDF-4, to the bit; made in memory first, as libhdf5 ends the process where a disk is full."""
     import h5netcdf
 
     content = BytesIO()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,87 +11,76 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.errors import UnreadableFile
+from sealscope.errors import InputError
 from sealscope.recordings.channels import Array
+from sealscope.recordings.formats.columns import Wanted
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.libraries import library
-from sealscope.recordings.formats.table import (
-    Choose,
-    RawTable,
-    Series,
-    check_size,
-    check_texts,
-    parse_description,
-    table_of,
-)
+from sealscope.recordings.formats.table import RecordingFields, Series, check_texts, parse_description, table_of
 
 _OWN = b"sealscope"
 
 
-def read_parquet(path: Path, choose: Choose) -> RawTable:
-    """Read the chosen columns of a Parquet or Feather table; raise MissingExtra where pyarrow is absent."""
+def read_parquet(path: Path, wanted: Wanted) -> RecordingFields:
+    """Read the wanted columns of a Parquet or Feather table; raise MissingExtra where pyarrow is absent."""
     library("pyarrow", "Parquet", "pyarrow")
-    place = str(path)
     with path.open("rb") as opened:
         feather = opened.read(6) == b"ARROW1"
     if feather:
         table = library("pyarrow.feather", "Feather", "pyarrow").read_table(path)
-        series = [
-            _series(table.column, number, field, table.num_rows, place) for number, field in enumerate(table.schema)
-        ]
-        return table_of(series, choose, "Feather", place)
+        return table_of(_series(table.schema, table.column, len(table)), wanted, "Feather")
     parquet = library("pyarrow.parquet", "Parquet", "pyarrow")
     with parquet.ParquetFile(path) as file:
         schema, rows = file.schema_arrow, file.metadata.num_rows
 
     def column(number: int) -> Any:
         name = schema.field(number).name
-        check_size(rows, 1, place)
         texts = [name] if _is_text(schema.field(number)) else []
         with parquet.ParquetFile(path, read_dictionary=texts) as file:  # a text that repeats is held but once
             return file.read(columns=[name]).column(name)
 
     own = (schema.metadata or {}).get(_OWN)
-    series = [_series(column, number, field, rows, place) for number, field in enumerate(schema)]
-    description = parse_description(own, place) if own else None
-    return table_of(series, choose, "Parquet", place, own=description)
+    description = parse_description(own) if own else None
+    return table_of(_series(schema, column, rows), wanted, "Parquet", own=description, size=path.stat().st_size)
 
 
-def _series(column: Any, number: int, field: Any, rows: int, place: str) -> Series:
-    metadata = field.metadata or {}
-    unit = next((metadata[key].decode("utf-8", "replace") for key in (b"units", b"unit") if key in metadata), None)
-    moment = str(field.type).startswith(("timestamp", "duration"))
-    label = Label.parse(field.name, "s" if moment else unit)
-    if field.name.startswith("__index_level_") and moment:  # the index of a data frame, without a name
-        label = Label(field.name, "time", "s")
-    return Series("", label, rows, partial(_values, column, number, field, rows, place))
+def _series(schema: Any, column: Callable[[int], Any], rows: int) -> list[Series]:
+    """Return the series of a table; `column`: reads one by its number."""
+    series = []
+    for number, field in enumerate(schema):
+        metadata = field.metadata or {}
+        unit = next((metadata[key].decode("utf-8", "replace") for key in (b"units", b"unit") if key in metadata), None)
+        moment = str(field.type).startswith(("timestamp", "duration"))
+        label = Label.parse(field.name, "s" if moment else unit)
+        if field.name.startswith("__index_level_") and moment:  # the index of a data frame, without a name
+            label = Label(field.name, "time", "s")
+        series.append(Series("", label, rows, partial(_values, partial(column, number), field, rows)))
+    return series
 
 
 def _is_text(field: Any) -> bool:
     return str(field.type) in ("string", "large_string")
 
 
-def _values(column: Any, number: int, field: Any, rows: int, place: str) -> NDArray[Any]:
+def _values(column: Callable[[], Any], field: Any, rows: int) -> NDArray[Any]:
     import pyarrow
-    from pyarrow import compute
+    from pyarrow import compute, types
 
-    types = pyarrow.types
     if _is_text(field):
-        check_texts(rows, 1, field.name, place)
-        cells = column(number)
+        check_texts(rows, 1, field.name)
+        cells = column()
         chunks = [chunk.dictionary if isinstance(chunk, pyarrow.DictionaryArray) else chunk for chunk in cells.chunks]
         widest = max((compute.max(compute.binary_length(chunk)).as_py() or 0 for chunk in chunks), default=0)
-        check_texts(rows, widest, field.name, place)
+        check_texts(rows, widest, field.name)
         return np.array([cell or "" for cell in cells.to_pylist()], dtype=object)
     if types.is_timestamp(field.type):
-        return np.asarray(
-            column(number).cast(pyarrow.timestamp("ns", field.type.tz)).to_numpy().astype("datetime64[ns]")
-        )
+        moments = column().cast(pyarrow.timestamp("ns", field.type.tz)).to_numpy()
+        return np.asarray(moments.astype("datetime64[ns]"))
     if types.is_duration(field.type):
-        return np.asarray(column(number).cast(pyarrow.duration("ns")).to_numpy())
+        return np.asarray(column().cast(pyarrow.duration("ns")).to_numpy())
     if types.is_integer(field.type) or types.is_floating(field.type) or types.is_decimal(field.type):
-        return np.asarray(column(number).cast(pyarrow.float64(), safe=False).to_numpy(), dtype=np.float64)
-    raise UnreadableFile(f"{field.name} must hold numbers, got the type {field.type} ({place})")
+        return np.asarray(column().cast(pyarrow.float64(), safe=False).to_numpy(), dtype=np.float64)
+    raise InputError(f"{field.name} must hold numbers, got the type {field.type}")
 
 
 def write_parquet(

@@ -9,51 +9,43 @@ from __future__ import annotations
 import datetime as dt
 import tempfile
 import zipfile
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from sealscope.errors import UnreadableFile
-from sealscope.recordings.formats.columns import listed
+from sealscope.errors import InputError
+from sealscope.recordings.formats.columns import Wanted, listed
 from sealscope.recordings.formats.libraries import library
-from sealscope.recordings.formats.table import Choose, RawTable, check_size
+from sealscope.recordings.formats.table import RecordingFields, check_size
 from sealscope.recordings.formats.text import read_text
 from sealscope.storage.unpacking import check_unpacked, most_unpacked
 
 _CHUNK = 2**20
 
 
-def read_spreadsheet(path: Path, choose: Choose) -> RawTable:
-    """Read the chosen columns of the first sheet that holds them: hidden sheets last, those with most rows first.
-
-    Raises MissingExtra where python-calamine is absent, and what the largest sheet lacks where no sheet holds a log.
-    """
-    place = str(path)
+def read_spreadsheet(path: Path, wanted: Wanted) -> RecordingFields:
+    """Read the wanted columns of the first sheet that holds them: hidden sheets last, those with most rows first."""
     _check_members(path)
     workbook = library("python_calamine", "a spreadsheet", "python-calamine").CalamineWorkbook.from_path(str(path))
     sheets = [workbook.get_sheet_by_name(name) for name in workbook.sheet_names]
     hidden = {member.name for member in workbook.sheets_metadata if not str(member.visible).endswith(".Visible")}
     sheets = [sheet for sheet in sheets if sheet.total_height]
     sheets.sort(key=lambda sheet: (sheet.name in hidden, -sheet.total_height))
-    reason = UnreadableFile(f"a workbook must have a sheet with rows, got none ({place})")
+    reason = InputError("a workbook must have a sheet with rows, got none")
     for number, sheet in enumerate(sheets):
-        check_size(sheet.total_height, sheet.total_width, place)
+        check_size(sheet.total_height, sheet.total_width)
         try:
-            table = _read_sheet(sheet, choose, place)
-        except UnreadableFile as error:
+            table = _read_sheet(sheet, wanted, str(path))
+        except InputError as error:
             reason = reason if number else error
             continue
+        table = table._replace(kind="spreadsheet", provenance=table.provenance | {"format": "spreadsheet"})
         others = [name for name in workbook.sheet_names if name != sheet.name]
-        notes = (f"sheet {sheet.name} read, not {listed(others, 4)}",) if others else ()
-        return replace(table, kind="spreadsheet", notes=(*notes, *table.notes))
+        return table.with_note(f"sheet {sheet.name} read, not {listed(others, 4)}") if others else table
     raise reason
 
 
 def _check_members(path: Path) -> None:
-    """Raise UnreadableFile where the members of a workbook that is a ZIP archive unpack to more than it may hold.
-
-    What they are said to unpack to may be a lie: they are unpacked, and zipfile refuses what is more.
-    """
+    """Unpack a workbook's members, and refuse more than it may hold: the sizes that they state may be a lie."""
     if not zipfile.is_zipfile(path):
         return
     with zipfile.ZipFile(path) as archive:
@@ -65,16 +57,18 @@ def _check_members(path: Path) -> None:
                     pass
 
 
-def _read_sheet(sheet: Any, choose: Choose, place: str) -> RawTable:
+def _read_sheet(sheet: Any, wanted: Wanted, place: str) -> RecordingFields:
     with tempfile.TemporaryDirectory(prefix="sealscope-") as folder:
         text = Path(folder) / "sheet.tsv"
         with text.open("w", encoding="utf-8", newline="\n") as file:
             for row in sheet.iter_rows():
                 file.write("\t".join(map(_cell, row)) + "\n")
         try:
-            return read_text(text, choose)
-        except UnreadableFile as error:
-            raise UnreadableFile(str(error).replace(str(text), f"sheet {sheet.name}, {place}")) from None
+            return read_text(text, wanted)
+        except InputError as error:
+            line, sheet_place = str(error), f"sheet {sheet.name}, {place}"
+            shown = line.replace(str(text), sheet_place) if str(text) in line else f"{line} ({sheet_place})"
+            raise InputError(shown) from None
 
 
 def _cell(value: Any) -> str:

@@ -9,52 +9,59 @@ from __future__ import annotations
 import csv
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.util import find_spec
+from itertools import accumulate, chain
 from math import isnan
+from os import SEEK_CUR
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.errors import InputError, UnreadableFile
+from sealscope.errors import InputError
 from sealscope.recordings.channels import Array
-from sealscope.recordings.formats.columns import counted
+from sealscope.recordings.formats.cells import (
+    MISSING,
+    MOST_WORDS,
+    is_missing,
+    is_number,
+    is_value,
+    numbers,
+    plain_cells,
+)
+from sealscope.recordings.formats.columns import Wanted, choose_columns, counted
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.preamble import exported_from
 from sealscope.recordings.formats.headings.proposal import is_time
-from sealscope.recordings.formats.headings.quantities import plain_cells
 from sealscope.recordings.formats.table import (
-    MOST_WORDS,
-    Choose,
     Clock,
-    RawTable,
+    RecordingFields,
     Series,
     check_size,
     check_texts,
+    converted,
     parse_description,
     seconds_of_series,
     table_of,
 )
 from sealscope.recordings.formats.text_layout import (
     COMMENTS,
-    MISSING,
     OWN_MARK,
     SNIFF,
     Layout,
     blank_cells,
     encoding_of,
-    is_number,
     layout_of,
-    ungrouped,
 )
 from sealscope.recordings.formats.timebase import is_stamp, stamps
 
-#: Bytes that are read at a time, which fit a processor's cache, and of the longest line.
-_CHUNK, _LONGEST_LINE = 2**19, 2**23
+#: Bytes that are read at a time, so many times more by pyarrow, and bytes of the longest line.
+_CHUNK, _FAST, _LONGEST_LINE = 2**19, 4, 2**23
 #: Logs of so many bytes are worth the import of pyarrow.
 _LARGE = 2**20
 #: Signs that begin quoted cells and comments.
@@ -67,25 +74,21 @@ _STAMP_RULE = "time must be a stamp such as 2024-05-31T12:00:00.002"
 _HALF_A_NUMBER = re.compile(r"[\s+\-\d.,:TeE]{0,40}")
 #: The number of a column of times: `t.1` of pandas, `Time 2 - slow` of catman.
 _NUMBER = re.compile(r"[\s._(-]{0,4}\d{1,4}\b.{0,60}")
-#: Rows as cells, or as numbers (n, k) of the columns asked for.
-_Rows = list[list[str]] | NDArray[np.float64]
 
 
-def read_text(path: Path, choose: Choose) -> RawTable:
-    """Read the chosen columns of a text log: a table with one time, or a time for each channel, or a long table."""
-    place, layout = str(path), look_at(path)
-    own = None if layout.own is None else parse_description(layout.own, place)
+def read_text(path: Path, wanted: Wanted) -> RecordingFields:
+    """Read the wanted columns of a text log: a table with one time, or a time for each channel, or a long table."""
+    layout = look_at(path)
+    own = None if layout.own is None else parse_description(layout.own)
     held: dict[int, NDArray[Any]] = {}
     times = _times_of_channels(layout.labels)
-    table = partial(table_of, choose=choose, kind=layout.kind, place=place, about=layout.about, rate=layout.rate)
+    table = partial(table_of, wanted=wanted, kind=layout.kind, about=layout.about, rate=layout.rate)
 
-    def prepare(wanted: Sequence[tuple[int, str]], date: int | None) -> Sequence[str]:
-        log = _Log(path, layout, wanted, date)
-        for rows, numbers, cut in log.blocks():
-            log.take(rows, numbers, cut)
-        columns, notes = log.finish()
-        held.update(zip((column for column, _ in wanted), columns, strict=True))
-        return [*layout.notes, *notes, *log.remarks_and_headings(len(columns[0]))]
+    def prepare(kinds: Mapping[int, str], date: int | None) -> Sequence[str]:
+        log = _Log(path, layout, kinds, date)
+        columns, notes = log.joined([*log.blocks()])
+        held.update(columns)
+        return [*layout.notes, *notes, *log.remarks_and_headings()]
 
     def series(column: int, clock: Clock | None = None) -> Series:
         return Series("", layout.labels[column], 0, partial(held.__getitem__, column), clock)
@@ -95,22 +98,17 @@ def read_text(path: Path, choose: Choose) -> RawTable:
         owner = {column: max(time for time in times if time < column) for column in values}
         start = exported_from(layout.about)
 
-        def prepare_each(wanted: Sequence[tuple[int, str]], date: int | None) -> Sequence[str]:
-            columns = {values[column]: kind for column, kind in wanted}
+        def prepare_each(kinds: Mapping[int, str], date: int | None) -> Sequence[str]:
+            columns = {values[column]: kind for column, kind in kinds.items()}
             read = {owner[column]: "time" for column in columns}
-            notes = prepare([*columns.items(), *read.items()], None)
-            return [*notes, f"{len(read)} columns of times, one for each channel"]
+            return [*prepare(columns | read, None), f"{len(read)} columns of times, one for each channel"]
 
         clocks = {time: Clock(time, partial(seconds_of_series, series(time), start)) for time in times}
-        each = [series(column, clocks[owner[column]]) for column in values]
         try:
-            return table(each, prepare=prepare_each)
+            return table([series(column, clocks[owner[column]]) for column in values], prepare=prepare_each)
         except InputError:
-            try:
-                choose(layout.labels, layout.rate)
-            except InputError:
-                pass
-            else:
+            with suppress(InputError):
+                choose_columns(layout.labels, wanted, layout.rate)
                 times = []
             if times:
                 raise
@@ -118,10 +116,7 @@ def read_text(path: Path, choose: Choose) -> RawTable:
 
 
 def _times_of_channels(labels: Sequence[Label]) -> list[int]:
-    """Return the columns of times of a table in which each channel, or group of channels, follows its own; else none.
-
-    They bear one name, but for a number at its end.
-    """
+    """Return the columns of times, of one name but for a number, which each channel or group of channels follows."""
     names = [_NUMBER.sub("", label.name.casefold()) for label in labels]
     if names.count(names[0]) < 2 or not is_time(labels[0]):
         return []
@@ -130,167 +125,169 @@ def _times_of_channels(labels: Sequence[Label]) -> list[int]:
     return times if len({names[column] for column in times}) == 1 and len(times) > 1 and apart else []
 
 
-def read_text_parts(path: Path, choose: Choose, rows_of: Callable[[RawTable], int]) -> Iterator[RawTable]:
-    """Yield the chosen columns of a text log part by part, in bounded memory.
+def read_text_parts(path: Path, wanted: Wanted, rows_of: Callable[[RecordingFields], int]) -> Iterator[RecordingFields]:
+    """Yield the wanted columns of a text log part by part, in bounded memory.
 
     `rows_of`: returns how many rows a part shall have, from the beginning of the log. Where the log has several clocks
     or is a long table, the whole of it is the only part.
     """
     layout = look_at(path)
     try:
-        choice = choose(layout.labels, layout.rate)
+        choice = choose_columns(layout.labels, wanted, layout.rate)
     except InputError:
         choice = None
     if choice is None or _times_of_channels(layout.labels):
-        yield read_text(path, choose)
+        yield read_text(path, wanted)
         return
-    wanted = [(column, "time" if time else "numbers") for column, time in choice.columns]
-    own = None if layout.own is None else parse_description(layout.own, str(path))
-    log, size, total = _Log(path, layout, wanted, choice.date), 0, 0
+    own = None if layout.own is None else parse_description(layout.own)
+    log = _Log(path, layout, choice.columns, choice.date)
 
-    def part(source: _Log, more: Sequence[str] = ()) -> RawTable:
-        columns, notes = source.finish()
-        return RawTable(layout.kind, choice, columns, own, (*layout.notes, *notes, *more), layout.about)
+    def part(blocks: list[_Block], more: Sequence[str] = ()) -> RecordingFields:
+        columns, notes = log.joined(blocks)
+        return converted(choice, columns, layout.kind, wanted, [*layout.notes, *notes, *more], layout.about, own)
 
-    for block, numbers, cut in log.blocks():
-        if not size:
-            beginning = _Log(path, layout, wanted, choice.date)
-            beginning.take(block, numbers, cut)
-            size = rows_of(part(beginning))
-        first = 0
-        while first < len(block):
-            last = min(len(block), first + size - log.total)
-            log.take(block[first:last], numbers[first:last], cut and last == len(block))
-            total, first = total + last - first, last
-            if log.total == size:
-                yield part(log)
-    notes = log.remarks_and_headings(total)
-    if log.total or not total:
-        yield part(log, notes)
+    blocks = log.blocks()
+    first = next(blocks, None)
+    size = 1 if first is None else rows_of(part([first[:]]))
+    before: list[_Block] = []
+    for blocks_of_part in _cut([] if first is None else chain([first], blocks), size):
+        if before:
+            yield part(before)
+        before = blocks_of_part
+    yield part(before, log.remarks_and_headings())
+
+
+def _cut(blocks: Iterable[_Block], size: int) -> Iterator[list[_Block]]:
+    """Yield blocks that together have `size` rows, the last ones fewer."""
+    held: list[_Block] = []
+    room = size
+    for block in blocks:
+        rest = block
+        while len(rest) >= room:
+            yield [*held, rest[:room]]
+            held, room, rest = [], size, rest[room:]
+        if len(rest):
+            held.append(rest)
+            room -= len(rest)
+    if held:
+        yield held
 
 
 def look_at(path: Path) -> Layout:
-    """Return the layout of a text log, by its beginning; raise UnreadableFile where it is none."""
-    place = str(path)
+    """Return the layout of a text log, by its beginning; raise InputError where it is none."""
     with path.open("rb") as file:
         head = file.read(SNIFF)
-        if not head:
-            raise UnreadableFile(f"a recording must have samples, got an empty file ({place})")
         encoding = encoding_of(head)
         if encoding is None:
-            raise UnreadableFile(f"a recording must be text, NetCDF, HDF5 or Parquet, got other binary data ({place})")
+            raise InputError("a recording must be text, NetCDF, HDF5 or Parquet, got other binary data")
         while head.startswith(OWN_MARK.encode()) and b"\n" not in head[:-SNIFF] and len(head) < _LONGEST_OWN_LINE:
             if not (data := file.read(SNIFF)):  # our first line may be long
                 break
             head += data
-        return layout_of(head, encoding, len(file.read(1)) == 0, place)
+        return layout_of(head, encoding, len(file.read(1)) == 0, str(path))
 
 
 @dataclass
-class _Words:
-    """Cells that hold a word in place of a number (`OVERLOAD`), or lines of words.
+class _Block:
+    """Rows of a log: its columns (n,); of the cells that hold a word in place of a number, the rows and the first."""
 
-    `count`, `first`, `where`: how many, the first and its place; `at`: their rows.
-    """
+    columns: dict[int, NDArray[Any]] = field(default_factory=dict)
+    words: dict[int, NDArray[np.intp]] = field(default_factory=dict)
+    first: dict[int, str] = field(default_factory=dict)
 
-    rule: str = "a sample must be a number"
-    count: int = 0
-    first: str = ""
-    where: str = ""
-    at: list[int] = field(default_factory=list)
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values())))
 
-    def add(self, text: str, where: str, row: int = 0) -> None:
-        if not self.count:
-            self.first, self.where = text[:40], where
-        self.count += 1
-        self.at.append(row)
-
-    def note(self, what: str, most: float) -> list[str]:
-        """Return a line for the history, where there are any; raise UnreadableFile where there are more than `most`."""
-        if self.count > most:
-            raise UnreadableFile(f"{self.rule}, got {self.first!r} {self.where}")
-        return [f"{what}, first {self.first!r} {self.where}"] if self.count else []
+    def __getitem__(self, rows: slice) -> _Block:
+        first, stop, _ = rows.indices(len(self))
+        words = {column: at[(at >= first) & (at < stop)] - first for column, at in self.words.items()}
+        return _Block({column: cells[rows] for column, cells in self.columns.items()}, words, self.first)
 
 
 class _Log:
-    """The rows of a text log, and the columns of those taken so far.
+    """The rows of a text log in blocks; `kinds` and `date` are those of `Prepare`."""
 
-    `columns`: (column, kind) as `Prepare` has them; `date`: the column of the date beside a time of the day.
-    """
-
-    def __init__(self, path: Path, layout: Layout, columns: Sequence[tuple[int, str]], date: int | None) -> None:
-        self.path, self.layout, self.columns, self.date, self.place = path, layout, columns, date, str(path)
-        self.least = max(column for column, _ in columns) + 1
-        self.remarks, self.repeated = _Words(), 0
+    def __init__(self, path: Path, layout: Layout, kinds: Mapping[int, str], date: int | None) -> None:
+        self.path, self.layout, self.kinds, self.date, self.place = path, layout, kinds, date, str(path)
+        self.least = max(kinds) + 1
+        self.total = self.repeated = self.remarks = 0
+        self.remark = ""
         plain = layout.encoding in ("utf-8", "utf-8-sig", "cp1252") and layout.delimiter != " "
-        numbers = not layout.cell_units and all(kind != "texts" for _, kind in columns)
-        self.fast = plain and numbers and path.stat().st_size >= _LARGE and find_spec("pyarrow") is not None
+        numeric = not layout.cell_units and "texts" not in kinds.values()
+        self.fast = plain and numeric and path.stat().st_size >= _LARGE and find_spec("pyarrow") is not None
         self.stamped: bool | None = None
         self.dated = False
-        self._begin()
+        self.nulls, self.width = ["", "NaN"], 0
 
-    def _begin(self) -> None:
-        self.total = 0
-        self.parts: list[list[NDArray[Any]]] = [[] for _ in self.columns]
-        self.words = [_Words() for _ in self.columns]
-
-    def blocks(self) -> Iterator[tuple[_Rows, Sequence[int], bool]]:
-        """Yield blocks of rows, their lines' numbers, and whether the last one was not written whole."""
+    def blocks(self) -> Iterator[_Block]:
+        """Yield the rows in blocks that are read one after the other."""
         layout, usual, first = self.layout, 0, True
         with self.path.open("rb") as file:
-            for number, block, cut in _blocks(file, layout.encoding, self.place):
+            for number, block, end, cut in _blocks(
+                file, layout.encoding, self.place, lambda: _CHUNK * (_FAST if self.fast and self.width else 1)
+            ):
                 if self.fast and not cut:
-                    values = self._plain(number, block)
-                    self.fast, first = values is not None or not first, False
-                    if values is not None:
-                        usual = self.width
-                        yield values, range(number, number + len(values)), False
+                    plain = self._plain(number, block, end)
+                    self.fast, first = plain is not None or not first, False
+                    if plain is not None:
+                        self.stamped, usual = False, self.width
+                        self._count(len(plain))
+                        yield plain
                         continue
-                lines = _lines(block, layout)
+                lines = _lines(block[:end], layout)
                 kept = self._samples(lines, max(0, layout.first_row + 1 - number))
                 if not kept:
                     continue
-                numbers: Sequence[int] = [number + i for i in kept]
-                rows = self._cells([lines[i] for i in kept], numbers, cut)
+                where: Sequence[int] = [number + i for i in kept]
+                rows = self._cells([lines[i] for i in kept], where, cut)
                 if cut and len(rows[-1]) < usual and _HALF_A_NUMBER.fullmatch(rows[-1][-1]):
                     # a last line without an end was not written whole: half a number and what follows it are missing
                     rows[-1] = [*rows[-1][:-1], *[""] * (self.least - len(rows[-1]) + 1)]
                 usual = len(rows[-1])
-                rows, numbers = self._checked(rows, numbers)
+                rows, where = self._checked(rows, where)
                 if rows:
-                    yield rows, numbers, cut
+                    self._count(len(rows))
+                    yield self._read(rows, where, cut)
 
-    def _plain(self, number: int, block: bytes) -> NDArray[np.float64] | None:
-        """Return the columns (n, k) of a block from line `number` on; None where a row is no row of plain numbers."""
+    def _count(self, rows: int) -> None:
+        self.total += rows
+        check_size(self.total, len(self.kinds))
+
+    def _plain(self, number: int, block: bytes, end: int) -> _Block | None:
+        """Read a block from line `number` on, up to `end`; None where a row is no row of plain numbers."""
         from pyarrow import ArrowInvalid, csv, float64, py_buffer
 
-        layout, columns, start = self.layout, [column for column, _ in self.columns], 0
+        layout, start = self.layout, 0
         for _ in range(max(0, layout.first_row + 1 - number)):
             start = block.find(b"\n", start) + 1
         self.width = width = block.count(layout.delimiter.encode(), start, block.find(b"\n", start)) + 1
-        if any(block.find(mark, start) >= 0 for mark in _MARKS) or not self.least <= width <= len(layout.labels):
+        if any(block.find(mark, start, end) >= 0 for mark in _MARKS) or not self.least <= width <= len(layout.labels):
             return None
-        if b"\r" in block and block.count(b"\r") != block.count(b"\r\n"):
+        if block.find(b"\r", 0, end) >= 0 and block.count(b"\r", 0, end) != block.count(b"\r\n", 0, end):
             return None
-        names = [str(column) for column in range(width)]
-        try:
-            table = csv.read_csv(
-                py_buffer(block).slice(start),
-                csv.ReadOptions(column_names=names, block_size=len(block)),
-                csv.ParseOptions(delimiter=layout.delimiter, quote_char=False),
-                csv.ConvertOptions(
-                    include_columns=[names[column] for column in columns],
-                    column_types={names[column]: float64() for column in columns},
-                    null_values=["NaN", *MISSING],
-                    decimal_point=layout.decimal,
-                ),
-            )
-        except ArrowInvalid:
+        wanted = [str(column) for column in self.kinds]
+        for nulls in (self.nulls, ["NaN", *MISSING]):
+            try:
+                table = csv.read_csv(
+                    py_buffer(block).slice(start, end - start),
+                    csv.ReadOptions(column_names=[*map(str, range(width))], block_size=end, use_threads=False),
+                    csv.ParseOptions(delimiter=layout.delimiter, quote_char=False),
+                    csv.ConvertOptions(
+                        include_columns=wanted,
+                        column_types=dict.fromkeys(wanted, float64()),
+                        null_values=nulls,
+                        decimal_point=layout.decimal,
+                    ),
+                )
+            except ArrowInvalid:
+                table = None
+            else:
+                self.nulls = nulls
+                break
+        if table is None:
             return None
-        values = np.empty((table.num_rows, len(columns)), order="F")
-        for index, column in enumerate(table.columns):
-            values[:, index] = column.to_numpy()
-        return None if np.isinf(values).any() else values
+        columns = {column: cells.to_numpy() for column, cells in zip(self.kinds, table.columns, strict=True)}
+        return None if any(np.isinf(cells).any() for cells in columns.values()) else _Block(columns)
 
     def _samples(self, lines: Sequence[str], first: int) -> list[int]:
         """Return the indices of the lines from `first` on that are no comments, blank or repeated headings."""
@@ -315,164 +312,158 @@ class _Log:
             if reader.line_num > line + 1:  # the line goes on in the next
                 if cut and line == len(lines) - 1:
                     return [*rows, [*row[:-1], ""]]
-                raise UnreadableFile(
+                raise InputError(
                     f"a quotation mark must be closed on its line, got an open one (line {numbers[line]}, {self.place})"
                 )
             rows.append(row)
         return rows[:-1]
 
     def _checked(self, rows: list[list[str]], numbers: Sequence[int]) -> tuple[list[list[str]], Sequence[int]]:
-        """Return rows and their numbers without short ones of words, which are counted.
-
-        Raises UnreadableFile for rows with too few cells, and with more than the header and not empty.
-        """
+        """Return rows and their numbers without short ones of words, which are counted; refuse any other width."""
         layout, most, kept = self.layout, len(self.layout.labels), []
         if min(map(len, rows)) >= self.least and max(map(len, rows)) <= most:
             return rows, numbers
         for i, row in enumerate(rows):
             short = len(row) < self.least
-            valued = sum(map(len, row)) > _LONGEST_REMARK or any(
-                is_number(cell, layout.decimal) or is_stamp(cell) for cell in (row if short else ())
+            valued = sum(map(len, row)) > _LONGEST_REMARK or (
+                short and any(is_value(cell, layout.decimal) for cell in row)
             )
             if short and not valued:
-                self.remarks.add(layout.delimiter.join(row), f"(line {numbers[i]}, {self.place})")
+                where = f"(line {numbers[i]}, {self.place})"
+                self.remark = self.remark or f"{layout.delimiter.join(row).strip()[:40]!r} {where}"
+                self.remarks += 1
             elif short or any(cell.strip() for cell in row[most:]):
-                raise UnreadableFile(
+                raise InputError(
                     f"a row must have {counted(most, 'cell')}, got {len(row)} (line {numbers[i]}, {self.place})"
                 )
             else:
                 kept.append(i)
         return [rows[i] for i in kept], [numbers[i] for i in kept]
 
-    def take(self, rows: _Rows, numbers: Sequence[int], cut: bool) -> None:
-        """Read more rows; `cut`: whether the last one was not written whole."""
-        before, self.total = self.total, self.total + len(rows)
-        check_size(self.total, len(self.columns), self.place)
-        if isinstance(rows, np.ndarray):
-            self.stamped = False
-            for part, values in zip(self.parts, rows.T, strict=True):
-                part.append(values)
-            return
-        for part, words, (column, kind) in zip(self.parts, self.words, self.columns, strict=True):
+    def _read(self, rows: Sequence[Sequence[str]], lines: Sequence[int], cut: bool) -> _Block:
+        """Read rows of cells; `cut`: whether the last one was not written whole."""
+        block = _Block()
+        for column, kind in self.kinds.items():
             cells = [row[column] for row in rows]
-            where = partial(self._place_of, numbers=numbers, column=column)
+            where, words = partial(self._place_of, lines=lines, column=column), list[int]()
             if unit := self.layout.cell_units.get(column):
                 cells = plain_cells(cells, unit, cut, where)
             if kind == "texts":
-                check_texts(self.total, max(map(len, cells)), self.layout.labels[column].whole, self.place)
-                part.append(np.array(cells, dtype=object))
+                check_texts(self.total, max(map(len, cells)), self.layout.labels[column].whole)
+                block.columns[column] = np.array(cells, dtype=object)
             elif kind == "time" and self._is_stamped(cells, rows):
                 if self.dated and self.date is not None:
                     days = [row[self.date].strip() for row in rows]
                     cells = [f"{day} {cell.strip()}" if cell.strip() else "" for day, cell in zip(days, cells)]  # noqa: B905
-                part.append(self._dates(cells, where, words, before))
+                block.columns[column], words = self._dates(cells, where)
             else:
-                part.append(self._numbers(cells, where, None if kind == "any" else words, before))
+                block.columns[column], words = numbers(cells, self.layout.decimal, where)
+                if kind == "any":
+                    block.columns[column][words] = np.inf  # no number is, that may stand in a log
+                    continue
+            if words:
+                block.words[column] = np.array(words)
+                block.first[column] = f"{cells[words[0]].strip()[:40]!r} {where(words[0])}"
+        return block
 
     def _is_stamped(self, cells: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
         """Return whether the time holds stamps, by its first cell; it may be a time of the day beside a date."""
         if self.stamped is None:
-            index = next((i for i, cell in enumerate(cells) if cell.strip().lower() not in MISSING), 0)
+            index = next((i for i, cell in enumerate(cells) if not is_missing(cell)), 0)
             self.stamped = not is_number(cells[index], self.layout.decimal) and is_stamp(cells[index])
             day = rows[index][self.date] if self.date is not None and self.date < len(rows[index]) else ""
             self.dated = self.stamped and ":" in cells[index][:3] and is_stamp(day) and ":" not in day
         return self.stamped
 
-    def _place_of(self, index: int, numbers: Sequence[int], column: int) -> str:
-        return f"(line {numbers[index]}, column {self.layout.labels[column].whole}, {self.place})"
+    def _place_of(self, index: int, lines: Sequence[int], column: int) -> str:
+        return f"(line {lines[index]}, column {self.layout.labels[column].whole}, {self.place})"
 
-    def _dates(
-        self, cells: list[str], where: Callable[[int], str], words: _Words, before: int
-    ) -> NDArray[np.datetime64]:
+    def _dates(self, cells: list[str], where: Callable[[int], str]) -> tuple[NDArray[np.datetime64], list[int]]:
+        """Return cells as moments (n,), missing ones and words as NaT, and the indices of the words."""
         texts = ["" if cell.strip().lower() in MISSING else cell for cell in cells]
+        with suppress(ValueError):
+            return stamps(texts), []
+        words = [
+            index
+            for index, text in enumerate(texts)
+            if text.strip() and not is_stamp(text) and not any(sign.isdigit() for sign in text)
+        ]
+        for index in words:
+            texts[index] = ""
         try:
-            return stamps(texts)
-        except ValueError:
-            for index, text in enumerate(texts):
-                if text.strip() and not is_stamp(text) and not any(sign.isdigit() for sign in text):
-                    words.rule = _STAMP_RULE
-                    words.add(text.strip(), where(index), before + index)
-                    texts[index] = ""
-        try:
-            return stamps(texts)
+            return stamps(texts), words
         except ValueError as error:
             bad = int(error.args[0])
-            raise UnreadableFile(f"{_STAMP_RULE}, got {cells[bad]!r} {where(bad)}") from None
+            raise InputError(f"{_STAMP_RULE}, got {cells[bad]!r} {where(bad)}") from None
 
-    def _numbers(self, cells: list[str], where: Callable[[int], str], words: _Words | None, before: int) -> Array:
-        """Read cells as doubles, missing ones as NaN; an infinite one is refused, words are counted and missing."""
-        decimal = self.layout.decimal
-        texts = [cell.replace(".", "?").replace(",", ".") for cell in cells] if decimal == "," else cells
-        try:
-            if any("_" in text for text in texts):  # Python takes 1_000 for a number
-                raise ValueError
-            values = np.fromiter(map(float, texts), np.float64, len(texts))
-        except ValueError:
-            values = np.fromiter((_number(cell, decimal) for cell in cells), np.float64, len(cells))
-        for index in np.flatnonzero(~np.isfinite(values)).tolist():
-            shown = cells[index].strip()
-            if shown.lower() not in MISSING:
-                if is_number(shown, decimal):
-                    raise UnreadableFile(f"a sample must be a finite number, got {shown[:40]!r} {where(index)}")
-                if words is None:
-                    values[index] = np.inf  # no number is, that may stand in a log
-                else:
-                    words.add(shown, where(index), before + index)
-        return values
+    def joined(self, blocks: list[_Block]) -> tuple[dict[int, NDArray[Any]], list[str]]:
+        """Return the columns of blocks, which let go of them, and lines for the history; refuse many words."""
+        labels, notes, columns = self.layout.labels, list[str](), dict[int, NDArray[Any]]()
+        starts, last = [0, *accumulate(map(len, blocks))], [*self.kinds][-1]
+        words = {
+            column: [start + at for start, own in zip(starts, blocks, strict=False) for at in own.words.get(column, ())]
+            for column in self.kinds
+        }
+        for column, at in words.items():  # each column's blocks are let go before the next is joined
+            first = next((own.first[column] for own in blocks if len(own.words.get(column, ()))), "")
+            if len(at) > MOST_WORDS * starts[-1]:
+                stamped = self.stamped and self.kinds[column] == "time"
+                raise InputError(f"{_STAMP_RULE if stamped else 'a sample must be a number'}, got {first}")
+            if at:
+                many = f"{counted(len(at), 'cell')} without a number read as missing"
+                notes.append(f"column {labels[column].whole}: {many}, first {first}")
+            cells = np.concatenate([own.columns.pop(column) for own in blocks]) if blocks else np.empty(0)
+            # the rows of a summary, where a word stands in place of the time
+            cells = np.delete(cells, words[last]) if words[last] and self.kinds[last] == "time" else cells
+            cells.setflags(write=False)  # made here: a recording takes it as it is
+            columns[column] = cells
+        if self.dated and self.date is not None:
+            notes.append(f"date and time joined from columns {labels[self.date].whole} and {labels[last].whole}")
+        return columns, notes
 
-    def finish(self) -> tuple[list[NDArray[Any]], list[str]]:
-        """Return the columns taken, and lines for the history; what is taken from now on begins anew."""
-        labels, dates, notes = self.layout.labels, self.date, list[str]()
-        no_time = self.words[-1].at if self.columns[-1][1] == "time" else []
-        joined: list[NDArray[Any]] = []
-        for part in self.parts:  # each column's blocks are let go before the next is joined
-            joined.append(np.concatenate(part) if part else np.empty(0))
-            part.clear()
-            if no_time:  # the rows of a summary, where a word stands in place of the time
-                joined[-1] = np.delete(joined[-1], no_time)
-            joined[-1].setflags(write=False)  # made here: a recording takes it as it is
-        for words, (column, _) in zip(self.words, self.columns, strict=True):
-            what = f"column {labels[column].whole}: {counted(words.count, 'cell')} without a number read as missing"
-            notes += words.note(what, MOST_WORDS * self.total)
-        if self.dated and dates is not None:
-            time = next(column for column, kind in self.columns if kind == "time")
-            notes.append(f"date and time joined from columns {labels[dates].whole} and {labels[time].whole}")
-        self._begin()
-        return joined, notes
-
-    def remarks_and_headings(self, rows: int) -> list[str]:
-        """Return lines for the history on what stands among the `rows`; raise UnreadableFile for many remarks."""
-        most = max(MOST_WORDS * rows, _MOST_REMARKS)
-        lines = f"{counted(self.remarks.count, 'line')} of text among the samples left out"
+    def remarks_and_headings(self) -> list[str]:
+        """Return lines for the history on what stands among the rows; raise InputError for many remarks."""
+        if self.remarks > max(MOST_WORDS * self.total, _MOST_REMARKS):
+            raise InputError(f"a sample must be a number, got {self.remark}")
+        remarks = f"{counted(self.remarks, 'line')} of text among the samples left out, first {self.remark}"
         repeated = f"{counted(self.repeated, 'line')} of the heading repeated among the samples left out"
-        return [*self.remarks.note(lines, most), *([repeated] if self.repeated else [])]
+        return [*([remarks] if self.remarks else []), *([repeated] if self.repeated else [])]
 
 
-def _blocks(file: BinaryIO, encoding: str, place: str) -> Iterator[tuple[int, bytes, bool]]:
-    """Yield (number of the first line, whole lines, False) in bounded blocks; True for a last line without an end."""
+def _blocks(
+    file: BinaryIO, encoding: str, place: str, chunk: Callable[[], int]
+) -> Iterator[tuple[int, bytes, int, bool]]:
+    """Yield (number of the first line, bytes, where their whole lines end, whether the last one has no end)."""
     width = 2 if encoding.startswith("utf-16") else 1
     newline = "\n".encode(encoding if width == 2 else "ascii")
-    rest, number = b"", 1
-    while data := file.read(_CHUNK):
-        block = rest + data
-        if width == 1 and b"\0" in data:
+    number = 1
+    while block := file.read(chunk()):
+        while (end := _end(block, newline)) < 0 and len(block) < _LONGEST_LINE and (more := file.read(chunk())):
+            block += more
+        if width == 1 and b"\0" in block:
             line = number + block[: block.index(b"\0")].count(b"\n")
-            raise UnreadableFile(f"a text log must be text throughout, got binary data (line {line}, {place})")
-        end = block.rfind(newline)
-        while width == 2 and end >= 0 and end % 2:  # a newline's bytes across two characters
-            end = block.rfind(newline, 0, end + 1)
+            raise InputError(f"a text log must be text throughout, got binary data (line {line}, {place})")
         if end < 0 and len(block) >= _LONGEST_LINE:
             if b"\r" not in block or width == 2:
-                raise UnreadableFile(f"a text log must have lines, got {len(block)} bytes without ({place})")
+                raise InputError(f"a text log must have lines, got {len(block)} bytes without")
             end = block.rfind(b"\r")
-        if end >= 0:
-            block, rest = block[: end + width], block[end + width :]
-            yield number, block, False
-            number += block.count(newline) or block.count(b"\r")
-        else:
-            rest = block
-    if rest:
-        yield number, rest, not rest.endswith(b"\r")
+        if end < 0:
+            yield number, block, len(block), not block.endswith(b"\r")
+            return
+        end += width
+        file.seek(end - len(block), SEEK_CUR)  # what is read again costs less than a copy of the block
+        yield number, block, end, False
+        signs = np.frombuffer(block, f"<u{width}", end // width)  # numpy counts them faster than bytes do
+        lines = int(np.count_nonzero(signs == int.from_bytes(newline, "little")))
+        number += lines or block.count(b"\r", 0, end)
+
+
+def _end(block: bytes, newline: bytes) -> int:
+    """Return where the last newline begins, not across two characters of UTF-16; -1 where there is none."""
+    end = block.rfind(newline)
+    while end >= 0 and end % len(newline):
+        end = block.rfind(newline, 0, end + 1)
+    return end
 
 
 def _lines(block: bytes, layout: Layout) -> list[str]:
@@ -483,14 +474,6 @@ def _lines(block: bytes, layout: Layout) -> list[str]:
     return text.removesuffix("\n").split("\n")
 
 
-def _number(cell: str, decimal: str) -> float:
-    text = ungrouped(cell.strip().replace("\u2212", "-"), decimal)
-    if not is_number(text, decimal):
-        return np.nan
-    # a Fortran exponent, 1.5D+03
-    return float(text.replace(",", ".").lower().replace("d", "e"))
-
-
 def write_text(
     path: Path,
     values: Mapping[str, Array],
@@ -498,10 +481,7 @@ def write_text(
     description: Mapping[str, Any],
     delimiter: str,
 ) -> None:
-    """Write `# sealscope: {...}`, the header `t [s],p_A [Pa],...` and one row a sample.
-
-    Numbers read back to the same bits; a missing sample is an empty cell. Raises InputError where a value is infinite.
-    """
+    """Write `# sealscope: {...}`, the header `t [s],p_A [Pa],...` and one row a sample, to the bit."""
     for name, series in values.items():
         if np.isinf(series).any():
             what = name if name == "t" else f"channel {name}"

@@ -9,33 +9,20 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate, chain, islice, repeat
 
-from sealscope.errors import UnreadableFile
+from sealscope.errors import InputError
 from sealscope.recordings.channels import CHANNEL_UNITS
+from sealscope.recordings.formats.cells import is_grouped, is_missing, is_value, units_behind, with_units, without_units
 from sealscope.recordings.formats.columns import counted
 from sealscope.recordings.formats.headings.described import described, scope_heading
-from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.labels import Label, is_unit
 from sealscope.recordings.formats.headings.preamble import of_lines, stated_rate
 from sealscope.recordings.formats.headings.proposal import knows, measures
-from sealscope.recordings.formats.headings.quantities import is_unit, units_in, with_units, without_units
 from sealscope.recordings.formats.headings.words import WORDS
-from sealscope.recordings.formats.timebase import is_stamp
 
 SNIFF = 64 * 1024
 OWN_MARK = "# sealscope: "
 COMMENTS = ("#", "%", "//", '"#', "!")
-#: What loggers write where a sample is missing, in lower case.
-MISSING = frozenset({"", *WORDS["missing"]})
 _SAMPLE_ROWS = 100
-_LONGEST_NUMBER = 400
-_NUMBER = {
-    ".": re.compile(r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eEdD][+-]?\d+)?|[+-]?inf(?:inity)?", re.IGNORECASE),
-    ",": re.compile(r"[+-]?(?:\d+(?:,\d+)?|,\d+)(?:[eEdD][+-]?\d+)?|[+-]?inf(?:inity)?", re.IGNORECASE),
-}
-#: Numbers with a sign between their thousands, the same all through.
-_GROUPED = {
-    ".": re.compile(r"[+-]?[1-9]\d{0,2}(?P<sign>[,'\u2019 \u00a0\u202f])\d{3}(?:(?P=sign)\d{3})*(?:\.\d*)?"),
-    ",": re.compile(r"[+-]?[1-9]\d{0,2}(?P<sign>[.'\u2019 \u00a0\u202f])\d{3}(?:(?P=sign)\d{3})*(?:,\d*)?"),
-}
 _LOOKS = (
     ("\t", "."), ("\t", ","), (";", "."), (";", ","), (",", "."), ("|", "."), ("|", ","), (",", ","), (" ", "."),
     (" ", ","),
@@ -119,25 +106,6 @@ def cells_of(line: str, delimiter: str) -> list[str]:
     return line.split(delimiter)
 
 
-def is_number(cell: str, decimal: str) -> bool:
-    """Return whether the cell is a number with this decimal sign."""
-    cell = cell.strip()
-    return (
-        len(cell) <= _LONGEST_NUMBER
-        and (_NUMBER[decimal].fullmatch(cell) or _GROUPED[decimal].fullmatch(cell)) is not None
-    )
-
-
-def ungrouped(cell: str, decimal: str) -> str:
-    """Return a number's text without the signs between its thousands; any other text as it is."""
-    match = _GROUPED[decimal].fullmatch(cell)
-    return cell if match is None else cell.replace(match["sign"], "")
-
-
-def _is_value(cell: str, decimal: str) -> bool:
-    return is_number(cell, decimal) or is_stamp(cell)
-
-
 def _width(row: Sequence[str]) -> int:
     """Count the cells but the empty ones at the end."""
     width = len(row)
@@ -148,30 +116,26 @@ def _width(row: Sequence[str]) -> int:
 
 def _look(body: Sequence[str]) -> tuple[str, str, int]:
     """Return (delimiter, decimal sign, cells a row) with which most cells of the body are values."""
-    best: tuple[tuple[float, float, bool, int], tuple[str, str, int]] | None = None
+    ranks: dict[tuple[str, str, int], tuple[float, float, bool, int]] = {}
     text = "\n".join(body)
-    blank = any(sign in text for sign in " \t\v\f")
     for delimiter, decimal in _LOOKS:
-        if delimiter not in text and not (delimiter == " " and blank):
+        if delimiter not in text and not (delimiter == " " and any(sign in text for sign in "\t\v\f")):
             continue
-        rows = [cells_of(line, delimiter) for line in body]
-        values = [sum(_is_value(cell, decimal) for cell in row) for row in rows]
-        valued = [(row, many) for row, many in zip(rows, values, strict=True) if many and len(row) > 1]
-        if not valued:
-            continue
+        valued = [
+            (row, many)
+            for row in (cells_of(line, delimiter) for line in body)
+            if len(row) > 1 and (many := sum(is_value(cell, decimal) for cell in row))
+        ]
         held = Counter[int]()  # values by the width of their row
         for row, many in valued:
             held[len(row)] += many
-        width = max(held, key=lambda w: (held[w], w))
-        if 2 * held[width] < held.total():
-            continue
-        present = sum(cell.strip().lower() not in MISSING for row, _ in valued for cell in row)
-        share = sum(many for row, many in valued if len(row) == width) / present
-        grouped = sum(_GROUPED[decimal].fullmatch(cell.strip()) is not None for row, _ in valued for cell in row)
-        rank = share, -grouped / present, delimiter != " ", width  # thousands where nothing plainer fits
-        if share > 0 and (best is None or rank > best[0]):
-            best = rank, (delimiter, decimal, width)
-    return best[1] if best else (",", ".", 1)
+        width = max(held, key=lambda w: (held[w], w), default=0)
+        if valued and 2 * held[width] >= held.total():
+            cells = [cell for row, _ in valued for cell in row]
+            present = sum(not is_missing(cell) for cell in cells)
+            grouped = sum(is_grouped(cell, decimal) for cell in cells)  # thousands where nothing plainer fits
+            ranks[delimiter, decimal, width] = held[width] / present, -grouped / present, delimiter != " ", width
+    return max(ranks, key=ranks.__getitem__, default=(",", ".", 1))
 
 
 def _header_labels(line: str, delimiter: str, width: int = 0) -> list[str]:
@@ -198,7 +162,7 @@ def _heading(lines: Sequence[str], first: int, delimiter: str, width: int, decim
         if cells and not cells[-1]:
             cells = cells[: max(_width(cells), min(width, len(cells)))]
         enough = abs(len(cells) - width) <= 1 or (len(cells) >= width > 1)
-        return cells if enough and any(cells) and not all(_is_value(c, decimal) for c in cells if c) else None
+        return cells if enough and any(cells) and not all(is_value(c, decimal) for c in cells if c) else None
 
     above = [line.strip("\r\n ") for line in lines[first - 1 :: -1] if line.strip()] if first else []
     if not above:
@@ -224,10 +188,7 @@ def _heading(lines: Sequence[str], first: int, delimiter: str, width: int, decim
 
 
 def _keyed(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int] | None:
-    """Return (labels, rows taken) of a heading whose rows say what they hold: `Name`, `Unit`; None for any other.
-
-    `rows`: the lowest first.
-    """
+    """Return (labels, rows taken) where rows, lowest first, say what they hold: `Name`, `Unit`; else None."""
     keys = [row[0].strip().rstrip(":").casefold() for row in rows]
     at = next((i for i, key in enumerate(keys) if key in WORDS["row"]["name"] and _width(rows[i]) > 1), None)
     unit = next((i for i, key in enumerate(keys) if key in WORDS["row"]["unit"]), None)
@@ -239,10 +200,7 @@ def _keyed(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int] | None:
 
 
 def _stacked(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int]:
-    """Return (labels, rows taken) of a heading of names, with units below or above them, and groups over them.
-
-    Rows that say the same of every column (`REAL`, a ruler) are passed over. `rows`: the lowest first.
-    """
+    """Return (labels, rows taken) of rows, lowest first: names, units below or above, groups over them, rulers."""
     skipped = next((i for i, row in enumerate(rows[:-1]) if not _tells_nothing(row)), len(rows) - 1)
     row, *over = rows[skipped:]
     texts, taken = list(row), skipped + 1
@@ -275,44 +233,34 @@ def _tells_nothing(row: Sequence[str]) -> bool:
     return same or all(_RULER.fullmatch(cell) for cell in cells)
 
 
-def _own_layout(lines: Sequence[str], encoding: str) -> Layout | None:
-    """Return the layout of a file that Sealscope wrote, whose second line is the header; None for any other."""
-    if len(lines) < 2 or not lines[0].startswith(OWN_MARK) or not lines[1].startswith("t [s]"):
-        return None
-    delimiter = "\t" if "\t" in lines[1] else ","
-    labels = tuple(Label.parse(cell) for cell in lines[1].split(delimiter))
-    return Layout(encoding, delimiter, ".", labels, 2, lines[0][len(OWN_MARK) :])
-
-
 def layout_of(head: bytes, encoding: str, whole: bool, place: str) -> Layout:
-    """Return the layout of a log that begins with `head`; raise UnreadableFile where it has no row of numbers.
-
-    `whole`: the head is all of the log.
-    """
+    """Return the layout of a log that begins with `head`, or is it as a `whole`; refuse one without numbers."""
     text = head.decode(encoding, errors="replace").lstrip("\ufeff")
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     if not whole:
         if len(lines) < 2:
-            raise UnreadableFile(f"a text log must have lines, got none that ends within {SNIFF} bytes ({place})")
+            raise InputError(f"a text log must have lines, got none that ends within {SNIFF} bytes")
         lines.pop()
-    if (own := _own_layout(lines, encoding)) is not None:
-        return own
+    if len(lines) > 1 and lines[0].startswith(OWN_MARK) and lines[1].startswith("t [s]"):
+        delimiter = "\t" if "\t" in lines[1] else ","
+        own_labels = tuple(Label.parse(cell) for cell in lines[1].split(delimiter))
+        return Layout(encoding, delimiter, ".", own_labels, 2, lines[0][len(OWN_MARK) :])
     content = [line for line in lines if _is_content(line)]
     if not content:
-        raise UnreadableFile(f"a recording must have samples, got an empty file ({place})")
+        raise InputError("a recording must have samples, got an empty file")
     body = content[max(1, min(len(content) // 2, len(content) - 20)) :][-_SAMPLE_ROWS:] or content
     written, cell_units = lines, _units_in_cells(body)
     if cell_units:
-        spelt = list(cell_units.values())
-        lines, body = ([without_units(line, spelt) for line in part] for part in (lines, body))
+        lines, body = ([without_units(line, cell_units.values()) for line in part] for part in (lines, body))
     delimiter, decimal, width = _look(body)
     first = _first_row(lines, body, delimiter, decimal, width)
     if first is None:
-        _refuse_markup(content[0], place)
-        names = _header_labels(content[0], delimiter if width > 1 else _likely(content[0]))
-        raise UnreadableFile(
-            f"a recording must have samples, got no row of numbers after {', '.join(names)[:80]} ({place})"
-        )
+        kind = {"{": "JSON", "[": "JSON", "<": "XML or HTML"}.get(content[0].lstrip()[:1])
+        if kind is not None:
+            raise InputError(f"a recording must be a table, got {kind}: export it as CSV")
+        likely = max("\t;,|", key=content[0].count) if any(sign in content[0] for sign in "\t;,|") else " "
+        names = _header_labels(content[0], delimiter if width > 1 else likely)
+        raise InputError(f"a recording must have samples, got no row of numbers after {', '.join(names)[:80]}")
     labels, taken = _heading(lines, first, delimiter, width, decimal)
     notes: list[str] = []
     if not labels:
@@ -332,12 +280,11 @@ def layout_of(head: bytes, encoding: str, whole: bool, place: str) -> Layout:
         decimal,
         tuple(labels),
         first,
-        None,
-        tuple(notes),
-        of_lines(remarks, delimiter),
-        frozenset(line.strip() for line in above),
-        stated_rate(of_lines(above, delimiter)),
-        cell_units,
+        notes=tuple(notes),
+        about=of_lines(remarks, delimiter),
+        above=frozenset(line.strip() for line in above),
+        rate=stated_rate(of_lines(above, delimiter)),
+        cell_units=cell_units,
     )
 
 
@@ -347,25 +294,22 @@ def _is_content(line: str) -> bool:
 
 def _first_row(lines: Sequence[str], body: Sequence[str], delimiter: str, decimal: str, width: int) -> int | None:
     """Return the index of the first line of samples, by the columns of the `body` that hold numbers."""
-
-    def missing(cell: str) -> bool:
-        return cell.strip().lower() in MISSING
-
     rows = [row for row in (cells_of(line, delimiter) for line in body) if len(row) == width]
-    values = [[_is_value(cell, decimal) for cell in row] for row in rows]
+    values = [[is_value(cell, decimal) for cell in row] for row in rows]
     most = max(map(sum, values), default=0)
     full = [k for k, row in enumerate(values) if 0 < most <= 2 * sum(row)]  # no preamble
     rows, values = [rows[k] for k in full], [values[k] for k in full]
-    numeric = [i for i in range(width) if 2 * sum(row[i] for row in values) > sum(not missing(row[i]) for row in rows)]
-    worded = any(not own[0] and not missing(row[0]) for row, own in zip(rows, values, strict=True))
+    numeric = [
+        i for i in range(width) if 2 * sum(row[i] for row in values) > sum(not is_missing(row[i]) for row in rows)
+    ]
+    worded = any(not own[0] and not is_missing(row[0]) for row, own in zip(rows, values, strict=True))
+    least = max(1, min(width, (numeric or [0])[-1] + 1))
     for index, line in enumerate(lines):
         cells = cells_of(line, delimiter) if _is_content(line) else []
-        if len(cells) < max(1, min(width, (numeric or [0])[-1] + 1)):
-            continue
-        if not worded and not (_is_value(cells[0], decimal) or missing(cells[0])):
-            continue  # a row that says what it holds, such as `SampleRate,500,500`
-        good = sum(i < len(cells) and _is_value(cells[i], decimal) for i in numeric)
-        empty = sum(i < len(cells) and missing(cells[i]) for i in numeric)
+        if len(cells) < least or not (worded or is_value(cells[0], decimal) or is_missing(cells[0])):
+            continue  # also a row that says what it holds, such as `SampleRate,500,500`
+        good = sum(i < len(cells) and is_value(cells[i], decimal) for i in numeric)
+        empty = sum(i < len(cells) and is_missing(cells[i]) for i in numeric)
         if good and 2 * (good + empty) > len(numeric):
             return index
     return None
@@ -375,21 +319,4 @@ def _units_in_cells(body: Sequence[str]) -> dict[int, str]:
     """Return column -> unit of the columns whose cells hold it beside their number, by the delimiter with most such."""
     if not any(map(_QUANTITY.search, body)):
         return {}
-    tried = [
-        units_in(
-            [cells_of(line, delimiter) for line in body], lambda cell: _is_value(cell, ".") or _is_value(cell, ",")
-        )
-        for delimiter in ("\t", ";", "|", ",")
-    ]
-    return max(tried, key=len)
-
-
-def _refuse_markup(line: str, place: str) -> None:
-    """Raise UnreadableFile for texts that are no tables."""
-    kind = {"{": "JSON", "[": "JSON", "<": "XML or HTML"}.get(line.lstrip()[:1])
-    if kind is not None:
-        raise UnreadableFile(f"a recording must be a table, got {kind}: export it as CSV ({place})")
-
-
-def _likely(line: str) -> str:
-    return max("\t;,|", key=line.count) if any(sign in line for sign in "\t;,|") else " "
+    return max((units_behind([cells_of(line, sign) for line in body]) for sign in "\t;|,"), key=len)

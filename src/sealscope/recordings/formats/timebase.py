@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,15 +48,8 @@ _OFFSET_OF_DATENUM = 693_960
 #: Seconds since 1904 begin here, in 2008: those since 1970 would be in 2074.
 _SINCE_1904, _FROM_1904_TO_1970 = 3.28e9, 2_082_844_800.0
 _EARLIEST_EPOCH = 1e8  # [s]: March 1973, and no recording lasts three years
-
-
-class TimeBase(NamedTuple):
-    """`t`: (n,) [s], `rate` [Hz], `start`: what is known of the moment t = 0, `notes`: lines for the history."""
-
-    t: Array
-    rate: float
-    start: dict[str, Any]
-    notes: tuple[str, ...]
+#: Times (n,) [s], what is known of the moment 0, and lines for the history.
+_Seconds = tuple[Array, dict[str, Any], list[str]]
 
 
 def _parsed_stamp(text: str) -> re.Match[str] | None:
@@ -84,8 +77,8 @@ def stamps(cells: Sequence[str]) -> NDArray[np.datetime64]:
     """Read stamps (ISO, day.month.year, month/day/year) and times of a day as datetime64[ns]; an empty cell is NaT.
 
     Dates with strokes begin with the month, but where the first number of any of them is over 12; dates with hyphens
-    begin with the day, but where the second number is over 12. Raises ValueError
-    with the index of the first cell that is no stamp.
+    begin with the day, but where the second number is over 12. Raises ValueError with the index of the first cell that
+    is no stamp.
     """
     matches = [_parsed_stamp(cell) for cell in cells]
     day_first = any(match is not None and match["first"] and int(match["first"]) > 12 for match in matches)
@@ -103,12 +96,14 @@ def stamps(cells: Sequence[str]) -> NDArray[np.datetime64]:
     try:
         return np.array(plain, dtype="datetime64[ns]")
     except ValueError:  # the 30th of February
-        for index, cell in enumerate(plain):
-            try:
-                np.datetime64(cell, "ns")
-            except ValueError:
-                raise ValueError(index) from None
-        raise
+        raise ValueError(next(index for index, text in enumerate(plain) if not _is_moment(text))) from None
+
+
+def _is_moment(text: str) -> bool:
+    try:
+        return bool(np.datetime64(text, "ns")) or True
+    except ValueError:
+        return False
 
 
 def seconds_of(stamp: str) -> float | None:
@@ -132,12 +127,12 @@ def _clock(text: str) -> str:
 
 def _date_of(match: re.Match[str], day_first: bool) -> str:
     """Return the date of a stamp as ISO writes it; 1970-01-01 for the time of a day alone."""
+    if match["days"]:  # a length of time, as pandas writes it
+        return str(np.datetime64(_NO_DATE) + int(match["days"]))
     if match["first"]:
         first, second = match["first"], match["second"]
         day_first = day_first or (match["stroke"] == "-" and int(second) <= 12)
         year, month, day = match["year_last"], second if day_first else first, first if day_first else second
-    elif match["days"]:  # a length of time, as pandas writes it
-        return str(np.datetime64(_NO_DATE) + int(match["days"]))
     elif match["basic"]:
         year, month, day = match["basic"][:4], match["basic"][4:6], match["basic"][6:]
     elif name := match["name"] or match["name_first"]:
@@ -158,19 +153,16 @@ def nominal_rate(t: Array) -> float:
     positive.
     """
     steps = np.diff(t)
+    span = float(t[-1] - t[0])
+    if steps.size and np.isfinite(span) and steps.min() > 0:
+        mean = span / steps.size
+        off_line = float(np.abs(t - t[0] - mean * np.arange(t.size)).max())
+        if off_line < 0.6 * mean:
+            return _shortest(1.0 / mean, max(1e-9, min(2 * off_line / span, 1e-3)))
     steps = steps[np.isfinite(steps) & (steps > 0)]
     if not steps.size:
         raise InputError("time must increase between some samples")
-    step = float(np.median(steps))
-    span = float(t[-1] - t[0])
-    slack = 1e-9
-    if np.isfinite(span) and steps.size == t.size - 1:
-        mean = span / (t.size - 1)
-        off_line = float(np.max(np.abs(t - t[0] - mean * np.arange(t.size))))
-        if off_line < 0.6 * mean:
-            step = mean
-            slack = max(slack, min(2 * off_line / span, 1e-3))
-    return _shortest(1.0 / step, slack)
+    return _shortest(1.0 / float(np.median(steps)), 1e-9)
 
 
 def _shortest(value: float, slack: float) -> float:
@@ -184,7 +176,7 @@ def falling(times: NDArray[Any]) -> bool:
     return len(times) > 1 and bool(np.all(times[1:] < times[:-1]))
 
 
-def _from_stamps(values: NDArray[np.datetime64], name: str) -> tuple[Array, dict[str, Any], list[str]]:
+def _from_stamps(values: NDArray[np.datetime64], name: str) -> _Seconds:
     nanoseconds = values.astype("datetime64[ns]")
     known = ~np.isnat(nanoseconds)
     if not known.any():
@@ -193,17 +185,19 @@ def _from_stamps(values: NDArray[np.datetime64], name: str) -> tuple[Array, dict
     t = (nanoseconds - start).astype(np.int64).astype(np.float64) / 1e9
     t[~known] = np.nan
     undated = bool((nanoseconds[known] < np.datetime64(_NO_DATE, "ns") + np.timedelta64(1, "D")).all())
+    hour = int((nanoseconds[known] - nanoseconds[known].astype("datetime64[D]")).min() / np.timedelta64(1, "h"))
+    steps = {
+        -_DAY: "has no date: begins again with the next day",
+        -_HOUR: "has no date: begins again with the next hour",
+    }
+    if not undated:
+        changed = "steps by an hour: taken for daylight saving time, the hour left out"
+        steps = dict.fromkeys((-_HOUR, _HOUR), changed) if hour < _LATEST_CHANGE else {}
     notes = []
-    for step, what in ((-_DAY, "day"), (-_HOUR, "hour")) if undated else ():
+    for step, what in steps.items():
         if (wrapped := _unwrapped(t, step)) is not None:
             t = wrapped
-            notes.append(f"column {name} has no date: begins again with the next {what}")
-    hour = int((nanoseconds[known] - nanoseconds[known].astype("datetime64[D]")).min() / np.timedelta64(1, "h"))
-    if not undated and hour < _LATEST_CHANGE:
-        for step in (-_HOUR, _HOUR):
-            if (wrapped := _unwrapped(t, step)) is not None:
-                t = wrapped
-                notes.append(f"column {name} steps by an hour: taken for daylight saving time, the hour left out")
+            notes.append(f"column {name} {what}")
     return t, {} if undated else {"start": str(start)}, notes
 
 
@@ -222,106 +216,97 @@ def _unwrapped(t: Array, step: float) -> Array | None:
     return result
 
 
-def from_numbers(values: Array, unit: str | None, name: str) -> tuple[Array, dict[str, Any], list[str]]:
-    """Return (seconds (n,), what is known of the moment 0, lines for the history) of the numbers of a time column.
-
-    Without a unit they are seconds, or since 1970 in the unit that their size tells, or days. Raises InputError.
-    """
+def _from_numbers(values: Array, unit: str | None, name: str) -> _Seconds:
+    """Read numbers in a unit, or without: seconds, a time since 1970 in the unit that their size tells, or days."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         raise InputError("time must have a number in some row, got none")
     first = float(finite[0])
-    since = _SINCE.fullmatch(unit.strip()) if unit else None
-    if since:
-        word = since["unit"].lower()
-        origin = since["start"]
-        seconds = to_si(values - first, _LONG_UNITS.get(word, word), "s", name="time")
+    if unit is None:
+        return _without_unit(values, finite, name)
+    if since := _SINCE.fullmatch(unit.strip()):
+        word = _LONG_UNITS.get(since["unit"].lower(), since["unit"].lower())
+        seconds = to_si(values - first, word, "s", name="time")
         try:
-            base = stamps([origin])[0]
-            begin = base + np.timedelta64(round(to_si(first, _LONG_UNITS.get(word, word), "s") * 1e9), "ns")
+            elapsed = np.timedelta64(round(to_si(first, word, "s") * 1e9), "ns")
+            return seconds, {"start": str(stamps([since["start"]])[0] + elapsed)}, []
         except (ValueError, OverflowError):
             return seconds, {"start": f"{first:g} {unit}"}, []
-        return seconds, {"start": str(begin)}, []
-    if unit is None:
-        size = abs(first)
-        if (days := _days_since(finite)) is not None:
-            origin, what = days
-            seconds = (values - first) * _DAY
-            begin = {} if origin is None else {"start": str(origin + np.timedelta64(round(first * _DAY * 1e6), "us"))}
-            return seconds, begin, [f"column {name} read as {what}"]
-        if np.all(np.diff(finite) == 1) and finite.size == values.size and size < _EARLIEST_EPOCH:
-            raise InputError(
-                f"time must be in seconds, got a count of rows {first:g}, {first + 1:g}, ... in column {name}: "
-                f"give the rate, or the unit of its column (t={name} ms)"
-            )
-        for least, epoch_unit in _EPOCH:
-            if size >= least:
-                seconds = to_si(values - first, epoch_unit, "s")
-                epoch = to_si(first, epoch_unit, "s")
-                if _SINCE_1904 <= epoch < _SINCE_1904 + 1e9:
-                    epoch -= _FROM_1904_TO_1970
-                    return seconds, {"start_epoch_s": epoch}, [f"column {name} read as {epoch_unit} since 1904"]
-                return seconds, {"start_epoch_s": epoch}, [f"column {name} read as {epoch_unit} since 1970"]
-        return values, {}, [f"column {name} has no unit: taken as s"]
     seconds = to_si(values, unit, "s", name="time")
-    first = float(seconds[np.isfinite(values)][0])
-    if first >= _EARLIEST_EPOCH:
-        return to_si(values - float(finite[0]), unit, "s"), {"start_epoch_s": first}, []
+    begin = float(seconds[np.isfinite(values)][0])
+    if begin >= _EARLIEST_EPOCH:
+        return to_si(values - first, unit, "s"), {"start_epoch_s": begin}, []
     return seconds, {}, []
 
 
-def _days_since(values: Array) -> tuple[np.datetime64 | None, str] | None:
-    """Return the moment and the words for numbers that are days, as spreadsheets and MATLAB count; None for seconds.
+def _without_unit(values: Array, finite: Array, name: str) -> _Seconds:
+    first = float(finite[0])
+    if (days := _days_since(finite)) is not None:
+        origin, what = days
+        begin = {} if origin is None else {"start": str(origin + np.timedelta64(round(first * _DAY * 1e6), "us"))}
+        return (values - first) * _DAY, begin, [f"column {name} read as {what}"]
+    if np.all(np.diff(finite) == 1) and finite.size == values.size and abs(first) < _EARLIEST_EPOCH:
+        raise InputError(
+            f"time must be in seconds, got a count of rows {first:g}, {first + 1:g}, ... in column {name}: "
+            f"give the rate, or the unit of its column (t={name} ms)"
+        )
+    unit = next((unit for least, unit in _EPOCH if abs(first) >= least), None)
+    if unit is None:
+        return values, {}, [f"column {name} has no unit: taken as s"]
+    epoch, year = to_si(first, unit, "s"), 1970
+    if _SINCE_1904 <= epoch < _SINCE_1904 + 1e9:
+        epoch, year = epoch - _FROM_1904_TO_1970, 1904
+    return to_si(values - first, unit, "s"), {"start_epoch_s": epoch}, [f"column {name} read as {unit} since {year}"]
 
-    They are days where as seconds they would be sampled faster than any logger of hydraulics does.
-    """
+
+def _days_since(values: Array) -> tuple[np.datetime64 | None, str] | None:
+    """Return the origin of numbers that are days, as seconds sampled faster than any logger does; None for seconds."""
     steps = np.diff(values)
     steps = steps[steps > 0]
     if not steps.size:
         return None
-    step, first = float(np.median(steps)), float(values[0])
+    step, first, origin = float(np.median(steps)), float(values[0]), np.datetime64("1899-12-30", "us")
     if step <= _LARGEST_STEP_OF_DAYS:
         if _EXCEL[0] <= first <= _EXCEL[1]:
-            return np.datetime64("1899-12-30", "us"), "days since 1899-12-30, as spreadsheets count"
+            return origin, "days since 1899-12-30, as spreadsheets count"
         if _EXCEL[0] <= first - _OFFSET_OF_DATENUM <= _EXCEL[1]:
-            return np.datetime64("1899-12-30", "us") - np.timedelta64(_OFFSET_OF_DATENUM, "D"), "days, as MATLAB counts"
+            return origin - np.timedelta64(_OFFSET_OF_DATENUM, "D"), "days, as MATLAB counts"
     if step <= _LARGEST_STEP and values.min() >= 0.0 and values.max() <= 1.0:
         return None, "a share of the day"
     return None
 
 
-def time_base(values: NDArray[Any], unit: str | None, name: str, stated_rate: float | None = None) -> TimeBase:
+def time_base(
+    values: NDArray[Any], unit: str | None, name: str, stated_rate: float | None = None
+) -> tuple[Array, float, dict[str, Any], list[str]]:
     """Convert a time column's `values` (n,), numbers in `unit` or datetime64, to seconds and a rate.
 
-    Stamps and epoch times are based at their first sample, whose moment is kept in `start`; other times are left where
-    they are. The `stated_rate` of a file [Hz] places samples that share their stamps. Raises InputError.
+    Returns the times (n,) [s], the rate [Hz], what is known of the moment 0, and lines for the history. Stamps and
+    epoch times are based at their first sample; other times are left where they are. The `stated_rate` of a file [Hz]
+    places samples that share their stamps. Raises InputError.
     """
-    notes: list[str] = []
     if values.dtype.kind == "M":
         t, start, notes = _from_stamps(values, name)
     else:
-        t, start, notes = from_numbers(np.asarray(values, dtype=np.float64), unit, name)
+        t, start, notes = _from_numbers(np.asarray(values, dtype=np.float64), unit, name)
     with np.errstate(invalid="ignore", over="ignore"):  # infinite times are findings, not warnings
         if stated_rate is not None and t.size > 1 and 2 * np.count_nonzero(np.diff(t)) < t.size - 1:
             notes.append(f"column {name}: samples share their stamps, taken at {stated_rate:g} Hz, as the file says")
-            return TimeBase(t[0] + np.arange(t.size) / stated_rate, stated_rate, start, tuple(notes))
+            return t[0] + np.arange(t.size) / stated_rate, stated_rate, start, notes
         resolved = _finer(t)
         if resolved is not None:
             resolution, t = resolved
             notes.append(f"column {name} in steps of {resolution:g} s: samples in between taken as uniform")
-        return TimeBase(t, nominal_rate(t), start, tuple(notes))
+        return t, nominal_rate(t), start, notes
 
 
 def _finer(t: Array) -> tuple[float, Array] | None:
-    """Return the resolution [s] of times (n,) that several samples each share, and uniform times; None for others.
-
-    Every stamp but the first and the last must stand on as many samples, to one, as its distance asks for.
-    """
-    if t.size < _FEWEST_SHARED or not np.isfinite(t).all():
-        return None
+    """Return the resolution [s] of times (n,) that samples share as their distances ask for, and uniform times."""
     steps = np.diff(t)
+    if t.size < _FEWEST_SHARED or 2 * np.count_nonzero(steps) > steps.size:
+        return None
     changes = np.flatnonzero(steps)
-    if (steps < 0).any() or changes.size < 3 or 2 * changes.size > steps.size:
+    if not np.isfinite(t).all() or (steps < 0).any() or changes.size < 3:
         return None
     resolution = float(steps[changes].min())
     counts = np.diff(changes) / np.round(steps[changes][1:] / resolution)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import isfinite
 from typing import Generic, TypeVar
@@ -20,7 +20,7 @@ _LONGEST = 400
 _NAME, _COLUMN = re.compile(r"`([^`]+)`|(#\d+|(?<![\w.])[^\W\d][\w.]*)"), "column{}"
 #: Where a formula may end and its unit begin.
 _END = re.compile(r"\s+(?=\S)|(?=\[)|$")
-K = TypeVar("K", bound=Hashable)
+K = TypeVar("K")
 
 
 @dataclass(frozen=True)
@@ -31,42 +31,10 @@ class Formula(Generic[K]):
     constant: float = 0.0
     unit: str | None = None
 
-    @staticmethod
-    def parse(text: str) -> Formula[str]:
-        """Parse sums, products with numbers, quotients by numbers and brackets; the rest of the text is the unit.
-
-        Only the syntax is Python's: nothing is evaluated. The longest beginning of the text that is a formula is taken.
-        Raises InputError for any other text, such as a product of two columns.
-        """
-        if len(text) > _LONGEST:
-            raise InputError(f"{_RULE}, got {len(text)} signs")
-        for end in sorted({match.start() for match in _END.finditer(text)}, reverse=True):
-            names: list[str] = []
-
-            def column(match: re.Match[str], names: list[str] = names) -> str:
-                names.append(match[1] or match[2])
-                return _COLUMN.format(len(names) - 1)
-
-            try:
-                tree = ast.parse(_NAME.sub(column, text[:end].strip()), mode="eval").body
-                value = _linear(tree, names)
-            except (SyntaxError, ValueError, ArithmeticError, RecursionError, MemoryError):
-                continue
-            unit = text[end:].strip()
-            unit = unit[1:-1].strip() if unit.startswith("[") and unit.endswith("]") else unit
-            if value.factors and all(map(isfinite, (value.constant, *value.factors.values()))):
-                return Formula(value.factors, value.constant, unit or None)
-        raise InputError(f"{_RULE}, got {text[:80]!r}")
-
     @property
-    def column(self) -> K:
-        """The first column."""
-        return next(iter(self.factors))
-
-    @property
-    def is_column(self) -> bool:
-        """Whether it is a column as it stands."""
-        return self.constant == 0.0 and [*self.factors.values()] == [1.0]
+    def column(self) -> K | None:
+        """The column that it is, as it stands; None for a sum or a product."""
+        return next(iter(self.factors)) if self.constant == 0.0 and [*self.factors.values()] == [1.0] else None
 
     def plus(self, other: Formula[K], times: float = 1.0) -> Formula[K]:
         """Return the sum of this formula and `times` another."""
@@ -77,11 +45,38 @@ class Formula(Generic[K]):
 
     def values(self, columns: Mapping[K, Array]) -> Array:
         """Return the samples (n,) in `unit`: those of the only column itself, where it is one."""
-        if self.is_column:
+        if self.column is not None:
             return columns[self.column]
         with np.errstate(over="ignore", invalid="ignore"):
             terms = [factor * columns[column] for column, factor in self.factors.items()]
             return np.asarray(self.constant + np.sum(terms, axis=0))
+
+
+def parse_formula(text: str) -> Formula[str]:
+    """Parse sums, products with numbers, quotients by numbers and brackets; the rest of the text is the unit.
+
+    Only the syntax is Python's: nothing is evaluated. The longest beginning of the text that is a formula is taken.
+    Raises InputError for any other text, such as a product of two columns.
+    """
+    if len(text) > _LONGEST:
+        raise InputError(f"{_RULE}, got {len(text)} signs")
+    for end in sorted({match.start() for match in _END.finditer(text)}, reverse=True):
+        names: list[str] = []
+
+        def column(match: re.Match[str], names: list[str] = names) -> str:
+            names.append(match[1] or match[2])
+            return _COLUMN.format(len(names) - 1)
+
+        try:
+            tree = ast.parse(_NAME.sub(column, text[:end].strip()), mode="eval").body
+            value = _linear(tree, names)
+        except (SyntaxError, ValueError, ArithmeticError, RecursionError, MemoryError):
+            continue
+        unit = text[end:].strip()
+        unit = unit[1:-1].strip() if unit.startswith("[") and unit.endswith("]") else unit
+        if value.factors and all(map(isfinite, (value.constant, *value.factors.values()))):
+            return Formula(value.factors, value.constant, unit or None)
+    raise InputError(f"{_RULE}, got {text[:80]!r}")
 
 
 def _linear(tree: ast.expr, names: list[str]) -> Formula[str]:

@@ -38,7 +38,18 @@ class Label:
         behind = _BEHIND.fullmatch(whole) if unit is None and remark is None else None
         if behind and any(same_dimension(behind["unit"], known) for known in (*CHANNEL_UNITS.values(), "s")):
             return cls(whole, behind["name"].rstrip(), behind["unit"])
-        return cls(whole, name, _unit_or_none(remark) if unit is None else unit)
+        if unit is None and remark and is_unit(remark):  # round brackets may hold a remark: `pressure (port A)`
+            unit = remark
+        return cls(whole, name, unit)
+
+
+def is_unit(text: str) -> bool:
+    """Return whether a text is a known unit."""
+    try:
+        parse_unit(text)
+    except InputError:
+        return False
+    return True
 
 
 def square_brackets(text: str) -> tuple[str, str | None]:
@@ -50,10 +61,7 @@ def square_brackets(text: str) -> tuple[str, str | None]:
 
 
 def _round_brackets_or_stroke(text: str) -> tuple[str, str | None]:
-    """Split `name (unit)`, the unit with one pair of brackets at most, or `name / unit`, where this is possible first.
-
-    Returns (text, None) for any other text.
-    """
+    """Split `name (unit)`, or `name / unit`, where this is possible first; (text, None) for any other text."""
     ends: list[tuple[int, int]] = []  # where the name ends, and the unit begins
     parts = text.split("/")
     for count in (2, 1):  # `name / m/s`, `name / s`
@@ -73,14 +81,3 @@ def _round_brackets_or_stroke(text: str) -> tuple[str, str | None]:
     if not end:
         return text, None
     return text[:end].rstrip(), (text[begin + 1 : -1] if text[begin] == "(" else text[begin:]).strip()
-
-
-def _unit_or_none(text: str | None) -> str | None:
-    """Return None for the remark that round brackets may hold as well (`pressure (port A)`)."""
-    if not text:
-        return None
-    try:
-        parse_unit(text)
-    except InputError:
-        return None
-    return text

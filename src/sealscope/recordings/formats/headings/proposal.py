@@ -99,10 +99,7 @@ def measures(text: str) -> bool:
 
 
 def split_unit(name: str) -> tuple[str, str | None]:
-    """Split `PA_bar`, `flow_l_min` or `MainPaBar` into name and unit.
-
-    (name, None) where the last words are no unit of what a channel measures.
-    """
+    """Split `PA_bar`, `flow_l_min` or `MainPaBar` into name and unit; (name, None) without a channel's unit."""
     parts = name.replace(" ", "_").split("_")
     endings = [("_".join(parts[:-2]), "/".join(parts[-2:])), ("_".join(parts[:-1]), parts[-1])]
     humped = _HUMPED.search(name)

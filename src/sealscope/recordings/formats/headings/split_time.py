@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,33 +21,27 @@ _END = {"month": 13.0, "day": 32.0, "hour": 24.0, "minute": 60.0, "second": 60.0
 _MOST = 0.9
 
 
-def parts_of_time(labels: Sequence[Label], used: Sequence[int]) -> dict[str, int]:
+def parts_of_time(labels: Sequence[Label], used: Container[int], below: bool = False) -> dict[str, int]:
     """Return part -> column of the time that several columns hold together: hours, minutes, seconds, and what is below.
 
-    Year, month and day are added where all three are there. Empty without hours, minutes and seconds, each once.
+    Year, month and day are added where all three are there; empty without hours, minutes and seconds, each once.
+    `below`: only what stands beside a time of whole seconds: ms, us or ns.
     """
-    columns = {part: _columns(labels, part, used) for part in WORDS["part"]}
-    if not all(len(columns[part]) == 1 for part in _CLOCK):
+    held: dict[str, int] = {}
+    for part, words in WORDS["part"].items():
+        columns = [
+            column
+            for column, label in enumerate(labels)
+            if label.name.strip().casefold() in words
+            and column not in used
+            and (label.unit is None or same_dimension(label.unit, "s"))
+        ]
+        if len(columns) == 1:
+            held[part] = columns[0]
+    if not below and not held.keys() >= {*_CLOCK}:
         return {}
-    dated = _DATE if all(len(columns[part]) == 1 for part in _DATE) else ()
-    below = [part for part in _BELOW if len(columns[part]) == 1]
-    return {part: columns[part][0] for part in (*dated, *_CLOCK, *below)}
-
-
-def below_seconds(labels: Sequence[Label], used: Sequence[int]) -> dict[str, int]:
-    """Return part -> column of what stands beside a time of whole seconds: ms, us or ns."""
-    columns = {part: _columns(labels, part, used) for part in _BELOW}
-    return {part: held[0] for part, held in columns.items() if len(held) == 1}
-
-
-def _columns(labels: Sequence[Label], part: str, used: Sequence[int]) -> list[int]:
-    return [
-        column
-        for column, label in enumerate(labels)
-        if label.name.strip().casefold() in WORDS["part"][part]
-        and column not in used
-        and (label.unit is None or same_dimension(label.unit, "s"))
-    ]
+    dated = _DATE if held.keys() >= {*_DATE} else ()
+    return {part: held[part] for part in (() if below else (*dated, *_CLOCK)) + _BELOW if part in held}
 
 
 def joined_time(base: NDArray[Any], parts: Mapping[str, Array], unit: str | None) -> NDArray[Any] | None:

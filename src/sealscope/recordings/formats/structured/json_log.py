@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,13 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.errors import UnreadableFile
+from sealscope.errors import InputError
+from sealscope.recordings.formats.cells import is_missing
+from sealscope.recordings.formats.columns import Wanted
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.preamble import entries, stated_rate
 from sealscope.recordings.formats.headings.proposal import is_time
 from sealscope.recordings.formats.structured.tree import series_in
-from sealscope.recordings.formats.table import Choose, RawTable, Series, check_size, check_texts, table_of
-from sealscope.recordings.formats.text_layout import MISSING, SNIFF, encoding_of
+from sealscope.recordings.formats.table import RecordingFields, Series, check_size, check_texts, table_of
+from sealscope.recordings.formats.text_layout import SNIFF, encoding_of
 
 #: Most names that records may have, deepest nesting of a record, and longest vector in one.
 _MOST_NAMES, _DEEPEST, _LONGEST_VECTOR = 1024, 4, 256
@@ -39,22 +40,23 @@ def is_json(head: bytes) -> bool:
     first, newline, _ = text.partition("\n")
     if text.startswith("{") or not first.strip("[ \t\r") or (not newline and len(head) >= SNIFF):
         return True
+    first = first.strip().rstrip(",")
     try:
-        json.loads(first.strip().rstrip(","))
+        json.loads(first)
     except json.JSONDecodeError as error:
-        return error.pos >= len(first.strip().rstrip(",")) - 1  # `[2024-05-31 12:00] started` is a remark
+        return error.pos >= len(first) - 1  # `[2024-05-31 12:00] started` is a remark
     except (ValueError, RecursionError):
         return False
     return True
 
 
-def read_json(path: Path, choose: Choose) -> RawTable:
-    """Read the chosen columns of a JSON file."""
+def read_json(path: Path, wanted: Wanted) -> RecordingFields:
+    """Read the wanted columns of a JSON file."""
     place = str(path)
     with path.open("rb") as head:
         encoding = encoding_of(head.read(SNIFF))
     if encoding is None:
-        raise UnreadableFile(f"JSON must be text, got binary data ({place})")
+        raise InputError("JSON must be text, got binary data")
     text = path.read_text(encoding, errors="replace").lstrip("\ufeff")
     members, cut = list[Any](), False
     try:
@@ -64,11 +66,11 @@ def read_json(path: Path, choose: Choose) -> RawTable:
         cut = bool(members) and (error.msg.startswith("Unterminated") or error.pos >= len(text.rstrip()) - 16)
         if not cut:
             line = 1 + text.count("\n", 0, error.pos)
-            raise UnreadableFile(f"JSON must be whole, got: {error.msg} (line {line}, {place})") from None
+            raise InputError(f"JSON must be whole, got: {error.msg} (line {line}, {place})") from None
     except (ValueError, RecursionError) as error:
-        raise UnreadableFile(f"JSON must be plain, got: {str(error)[:80]} ({place})") from None
+        raise InputError(f"JSON must be plain, got: {str(error)[:80]}") from None
     if not members:
-        raise UnreadableFile(f"a recording must have samples, got empty JSON ({place})")
+        raise InputError("a recording must have samples, got empty JSON")
     first, about = members[0], dict[str, str]()
     if len(members) == 1 and isinstance(first, Mapping) and not all(map(_is_cell, first.values())):
         about = entries((name, value) for name, value in first.items() if isinstance(value, str | int | float))
@@ -76,10 +78,10 @@ def read_json(path: Path, choose: Choose) -> RawTable:
     else:
         series = _records(members, place)
     if not series:
-        raise UnreadableFile(f"JSON must hold records or columns of samples, got none ({place})")
-    table = table_of(series, choose, "JSON", place, about, stated_rate(about))
+        raise InputError("JSON must hold records or columns of samples, got none")
+    table = table_of(series, wanted, "JSON", about, stated_rate(about))
     note = f"the last value is cut short and left out, after {len(members)} rows"
-    return replace(table, notes=(note, *table.notes)) if cut else table
+    return table.with_note(note) if cut else table
 
 
 def _members(text: str) -> Iterator[Any]:
@@ -111,11 +113,9 @@ def _records(members: Sequence[Any], place: str) -> list[Series]:
         key = (group, name)
         if isinstance(value, Mapping) and depth < _DEEPEST:
             if name and set(value) == {"value", "unit"} and _is_cell(value["value"]) and isinstance(value["unit"], str):
-                if units.setdefault(key, value["unit"]) != value["unit"]:
-                    raise UnreadableFile(
-                        f"{name} must have one unit, got {units[key][:40]} and {value['unit'][:40]} "
-                        f"(row {rows + 1}, {place})"
-                    )
+                unit = value["unit"]
+                if units.setdefault(key, unit) != unit:
+                    raise refusal(f"{name} must have one unit, got {units[key][:40]} and {unit[:40]}")
                 columns.setdefault(key, {})[rows] = value["value"]
                 return
             for inner, cell in value.items():
@@ -126,9 +126,12 @@ def _records(members: Sequence[Any], place: str) -> list[Series]:
         elif _is_cell(value):
             columns.setdefault(key, {})[rows] = value
             if len(columns) > _MOST_NAMES:
-                raise UnreadableFile(f"records must have at most {_MOST_NAMES} names, got more ({place})")
+                raise InputError(f"records must have at most {_MOST_NAMES} names, got more")
         else:
-            raise UnreadableFile(f"{name} must be a number or a text, got {type(value).__name__} ({place})")
+            raise InputError(f"{name} must be a number or a text, got {type(value).__name__}")
+
+    def refusal(rule: str) -> InputError:
+        return InputError(f"{rule} (row {rows + 1}, {place})")
 
     for member in members:
         if isinstance(member, Mapping) and (length := _block_length(member)) is not None:
@@ -145,46 +148,40 @@ def _records(members: Sequence[Any], place: str) -> list[Series]:
                 if texts:
                     continue
             if len(member) > len(heads):
-                raise UnreadableFile(
-                    f"a row must have {len(heads)} values, got {len(member)} (row {rows + 1}, {place})"
-                )
+                raise refusal(f"a row must have {len(heads)} values, got {len(member)}")
             for name, value in zip(heads, member, strict=False):
                 add("", name, value, 1)
         else:
-            raise UnreadableFile(
-                f"JSON must hold objects or arrays, got {str(member)[:40]!r} (row {rows + 1}, {place})"
-            )
+            raise refusal(f"JSON must hold objects or arrays, got {str(member)[:40]!r}")
         rows += 1
-    check_size(rows, len(columns), place)
+    check_size(rows, len(columns))
 
     def values(key: tuple[str, str]) -> NDArray[Any]:
-        return _array([columns[key].get(row) for row in range(rows)], key[1], place)
+        return _array([columns[key].get(row) for row in range(rows)], key[1])
 
     return [Series(key[0], Label.parse(key[1], units.get(key)), rows, partial(values, key)) for key in columns]
 
 
 def _block_length(member: Mapping[str, Any]) -> int | None:
     """Return how many samples a block of columns holds: arrays of one length, one of which is the time."""
-    if not all(isinstance(value, list) for value in member.values()) or not any(
-        is_time(Label.parse(name)) for name in member
-    ):
+    if not all(isinstance(value, list) for value in member.values()):
         return None
     lengths = set(map(len, member.values()))
-    return lengths.pop() if len(lengths) == 1 else None
+    return lengths.pop() if len(lengths) == 1 and any(is_time(Label.parse(name)) for name in member) else None
 
 
-def _array(cells: Sequence[Any], name: str, place: str) -> NDArray[Any]:
+def _array(cells: Sequence[Any], name: str) -> NDArray[Any]:
     """Return cells as doubles (n,), missing ones as NaN; as texts where some are texts."""
     if any(isinstance(cell, str) for cell in cells):
-        texts = ["" if cell is None or str(cell).strip().casefold() in MISSING else str(cell) for cell in cells]
-        check_texts(len(texts), max(map(len, texts)), name, place)
+        texts = ["" if cell is None or is_missing(str(cell)) else str(cell) for cell in cells]
+        check_texts(len(texts), max(map(len, texts)), name)
         return np.array(texts)
     try:
         values = np.array([np.nan if cell is None else cell for cell in cells], dtype=np.float64)
     except OverflowError:
         values = np.full(1, np.inf)
     if np.isinf(values).any():
-        raise UnreadableFile(f"a sample must be a finite number, got an infinite one for {name} ({place})")
+        raise InputError(f"a sample must be a finite number, got an infinite one for {name}")
     return values
 
 
@@ -195,11 +192,11 @@ def _arrays(value: Any, place: str, depth: int = 0) -> Any:
     if not isinstance(value, list) or not value:
         return value
     if all(map(_is_cell, value)):
-        return _array(value, "an array", place)
+        return _array(value, "an array")
     if all(isinstance(member, Mapping) and all(map(_is_cell, member.values())) for member in value):
         return {series.label.whole: series.values() for series in _records(value, place)}
     if all(isinstance(member, list) and len(member) == len(value[0]) for member in value):
-        return np.column_stack([_array(column, "an array", place) for column in zip(*value, strict=True)])
+        return np.column_stack([_array(column, "an array") for column in zip(*value, strict=True)])
     if all(isinstance(member, Mapping) for member in value):
         return {f"({number})": _arrays(member, place, depth + 1) for number, member in enumerate(value, start=1)}
     return None

@@ -10,15 +10,18 @@ from pathlib import Path
 
 import numpy as np
 
-from sealscope.errors import UnreadableFile
+from sealscope.errors import InputError
 from sealscope.recordings.channels import Array
+from sealscope.recordings.formats.cells import numbers
+from sealscope.recordings.formats.columns import Wanted
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.preamble import entries
-from sealscope.recordings.formats.table import Choose, Clock, RawTable, Series, check_size, table_of
-from sealscope.recordings.formats.text_layout import MISSING, SNIFF, encoding_of
+from sealscope.recordings.formats.table import Clock, RecordingFields, Series, check_size, table_of
+from sealscope.recordings.formats.text_layout import SNIFF, encoding_of
+from sealscope.recordings.formats.timebase import stamps
 
 #: What ends each header of the format.
-END = "***End_of_Header***"
+_END = "***End_of_Header***"
 
 
 @dataclass
@@ -28,7 +31,7 @@ class _Packet:
     head: Mapping[str, list[str]]
     names: list[str]
     line: int
-    rows: list[list[float]] = field(default_factory=list)
+    rows: list[Array] = field(default_factory=list)
 
     def column(self, index: int, whole: bool) -> Array:
         """Return a column (n,); one that is not `whole` ends in blanks where others go on."""
@@ -46,48 +49,49 @@ class _Packet:
     def moment(self, index: int) -> np.datetime64 | None:
         """Return when a channel's first sample was taken; None where the header does not say."""
         try:
-            day, clock = self.head["date"][index].replace("/", "-"), self.head["time"][index].replace(",", ".")
-            seconds, _, fraction = clock.partition(".")
-            return np.datetime64(f"{day}T{seconds}.{fraction[:9] or '0'}", "ns")
+            day, (seconds, _, fraction) = (
+                self.head["date"][index],
+                self.head["time"][index].replace(",", ".").partition("."),
+            )
+            return stamps([f"{day} {seconds}.{fraction[:9] or '0'}"])[0] if day else None
         except (KeyError, IndexError, ValueError):
             return None
 
 
 def is_lvm(head: bytes) -> bool:
     """Return whether a file that begins with `head` is a LabVIEW measurement file: the mark begins a line."""
-    return any(f"{end}{END}".encode(encoding) in head for end in "\n\r" for encoding in ("ascii", "utf-16-le"))
+    return any(f"{end}{_END}".encode(encoding) in head for end in "\n\r" for encoding in ("ascii", "utf-16-le"))
 
 
-def read_lvm(path: Path, choose: Choose) -> RawTable:
-    """Read the chosen channels of a LabVIEW measurement file; packets of the same channels follow each other."""
-    place = str(path)
+def read_lvm(path: Path, wanted: Wanted) -> RecordingFields:
+    """Read the wanted channels of a LabVIEW measurement file; packets of the same channels follow each other."""
     with path.open("rb") as file:
         encoding = encoding_of(file.read(SNIFF)) or "cp1252"
     with path.open(encoding=encoding, errors="replace") as text:
         lines = enumerate((line.rstrip("\r\n").lstrip("\ufeff") for line in text), start=1)
         header: dict[str, str] = {}
         for _, line in lines:
-            if line.startswith(END):
+            if line.startswith(_END):
                 break
             name, _, value = line.partition("\t" if "\t" in line else ",")
             header[name.strip().casefold()] = "," if value.strip("\t ") == "," else value.strip("\t, ")
         delimiter = "," if header.get("separator", "").casefold() == "comma" else "\t"
-        comma = header.get("decimal_separator", ".") == ","
-        packets = list(_packets(lines, delimiter, comma, place))
+        decimal = "," if header.get("decimal_separator") == "," else "."
+        packets = list(_packets(lines, delimiter, decimal, str(path)))
     if not packets:
-        raise UnreadableFile(f"a LabVIEW measurement file must have samples, got a header and no rows ({place})")
-    series = _series(packets, header.get("x_columns", "one").casefold(), place)
+        raise InputError("a LabVIEW measurement file must have samples, got a header and no rows")
+    series = _series(packets, header.get("x_columns", "one").casefold())
     about = entries((name, header[name]) for name in ("operator", "project", "description") if name in header)
-    return table_of(series, choose, "LabVIEW measurement", place, about)
+    return table_of(series, wanted, "LabVIEW measurement", about)
 
 
-def _packets(lines: Iterator[tuple[int, str]], delimiter: str, comma: bool, place: str) -> Iterator[_Packet]:
+def _packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str, place: str) -> Iterator[_Packet]:
     head: dict[str, list[str]] = {}
     packet: _Packet | None = None
     in_head = True
     for number, line in lines:
         cells = [cell.strip() for cell in line.split(delimiter)]
-        if line.startswith(END):
+        if line.startswith(_END):
             in_head, packet = False, None
         elif not any(cells):
             continue
@@ -95,48 +99,41 @@ def _packets(lines: Iterator[tuple[int, str]], delimiter: str, comma: bool, plac
             yield packet
             head, packet, in_head = {}, None, True
         elif packet is not None:
-            packet.rows.append(_numbers(cells, packet.names, comma, f"line {number}", place))
+            names = packet.names
+
+            def where(index: int, number: int = number, names: Sequence[str] = names) -> str:
+                return f"(line {number}, column {names[index]}, {place})"
+
+            values, words = numbers(cells[: len(names)], decimal, where)
+            if words:
+                raise InputError(f"a sample must be a number, got {cells[words[0]][:40]!r} {where(words[0])}")
+            packet.rows.append(values)
             if len(packet.rows) % 2**16 == 0:
-                check_size(len(packet.rows), len(packet.names), place)
+                check_size(len(packet.rows), len(names))
         elif in_head:
             own = cells[1:]  # every second cell is empty where each channel has a time
             head[cells[0].casefold()] = own[::2] if len(own) > 2 and own[2] and not any(own[1::2]) else own
         else:
-            names = cells[:-1] if cells[-1].casefold() == "comment" else cells
-            packet = _Packet(head, names, number + 1)
+            packet = _Packet(head, cells[:-1] if cells[-1].casefold() == "comment" else cells, number + 1)
     if packet is not None:
         yield packet
 
 
-def _numbers(cells: Sequence[str], names: Sequence[str], comma: bool, line: str, place: str) -> list[float]:
-    values = []
-    for cell, name in zip(cells, names, strict=False):
-        try:
-            missing = cell.casefold() in MISSING
-            values.append(np.nan if missing else float(cell.replace(",", ".") if comma else cell))
-        except ValueError:
-            raise UnreadableFile(
-                f"a sample must be a number, got {cell[:40]!r} ({line}, column {name}, {place})"
-            ) from None
-    return values
-
-
-def _series(packets: Sequence[_Packet], x_columns: str, place: str) -> list[Series]:
+def _series(packets: Sequence[_Packet], x_columns: str) -> list[Series]:
     """Return a series a channel, of all packets that have its columns; `x_columns`: one, multi or no."""
     names = packets[0].names
     times = [column for column, name in enumerate(names) if name.casefold().startswith("x_value")]
     if not times:
-        raise UnreadableFile(f"a LabVIEW measurement file must have a column X_Value, got {', '.join(names)} ({place})")
-    columns = [column for column in range(len(names)) if column not in times]
+        raise InputError(f"a LabVIEW measurement file must have a column X_Value, got {', '.join(names)}")
     same = [packet for packet in packets if packet.names == names]
-    check_size(sum(len(packet.rows) for packet in same), len(names), place)
+    check_size(sum(len(packet.rows) for packet in same), len(names))
     moments, firsts = [packet.moment(0) for packet in same], [packet.number("x0", 0) for packet in same]
     begins = [0.0] * len(same)  # added to the times of each packet, where its own do not go on
     known = [moment for moment in moments if moment is not None]
     if len(known) == len(same) and not all(after > before for before, after in pairwise(firsts)):
         begins = [float((moment - known[0]) / np.timedelta64(1, "ns")) / 1e9 for moment in known]
     multiple, series = x_columns == "multi", []
-    for index, column in enumerate(columns):
+    for index, column in enumerate(column for column in range(len(names)) if column not in times):
         time = max((before for before in times if before < column), default=times[0]) if multiple else times[0]
         values, seconds = [], []
         for packet, begin in zip(same, begins, strict=True):
@@ -145,7 +142,7 @@ def _series(packets: Sequence[_Packet], x_columns: str, place: str) -> list[Seri
             if x_columns == "no":
                 step, first = packet.number("delta_x", index), packet.number("x0", index)
                 if not step > 0:
-                    raise UnreadableFile(f"Delta_X must be > 0 s, got {packet.head.get('delta_x')} ({place})")
+                    raise InputError(f"Delta_X must be > 0 s, got {packet.head.get('delta_x')}")
                 seconds.append(begin + np.nan_to_num(first) + step * np.arange(count))
             else:
                 seconds.append(begin + packet.column(time, True)[:count])

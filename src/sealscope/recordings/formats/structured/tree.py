@@ -17,23 +17,12 @@ from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.table import MAX_VALUES, Clock, Series, uniform
 
 #: Deepest nesting that is walked, and most columns of a matrix that are taken for series.
-_DEEPEST = 8
-_MOST_COLUMNS = 256
-#: Fields of a struct that name a signal, its unit and the columns of a matrix.
+_DEEPEST, _MOST_COLUMNS = 8, 256
+#: Fields of a struct that name a signal, its samples, its unit, and the columns of a matrix.
 _NAME_FIELDS = ("name", "signalname", "label", "title")
+_SAMPLE_FIELDS = ("data", "value", "values", "samples", "y")
 _UNIT_FIELDS = ("unit", "units", "einheit", "einheiten")
-_HEADS = (
-    "colheaders",
-    "names",
-    "name",
-    "header",
-    "headers",
-    "labels",
-    "channels",
-    "channelnames",
-    "columns",
-    "varnames",
-)
+_NAME_OF_COLUMNS = ("colheaders", "header", "headers", "labels", "channels", "channelnames", "columns", "varnames")
 
 
 def series_in(fields: Mapping[str, Any]) -> Iterator[Series]:
@@ -43,90 +32,81 @@ def series_in(fields: Mapping[str, Any]) -> Iterator[Series]:
 
 def _walk(group: str, name: str, value: Any, clock: Clock | None, depth: int = 0) -> Iterator[Series]:
     """Yield the series in a value called `name`, of the group `group`."""
-    inner = f"{group}/{name}" if group else name
     if depth > _DEEPEST:
         return
     if (fields := _fields(value)) is not None:
         yield from _group(group, name, fields, clock, depth)
     elif hasattr(value, "columns") and hasattr(value, "index"):
-        yield from _frame(inner, value)
+        yield from _frame(f"{group}/{name}" if group else name, value)
     elif isinstance(value, np.ndarray) and value.dtype == object:
         for number, member in enumerate(value.reshape(-1), start=1):
             yield from _walk(group, name if value.size == 1 else f"{name}({number})", member, clock, depth + 1)
-    elif isinstance(value, np.ndarray) and value.dtype.kind in "fiubmMU":
+    elif isinstance(value, np.ndarray):
         yield from _columns(group, name, value, None, clock)
 
 
 def _fields(value: Any) -> Mapping[str, Any] | None:
     """Return the fields of a struct or the properties of an object; None for anything else."""
-    properties = getattr(value, "properties", None)
+    properties = getattr(value, "properties", value)
     if isinstance(properties, Mapping):
         return properties
-    if isinstance(value, Mapping):
-        return value
-    if isinstance(value, np.ndarray) and value.dtype.names and value.size == 1:
-        only = value.reshape(-1)[0]
-        return {name: only[name] for name in value.dtype.names}
-    if isinstance(value, np.ndarray) and value.dtype.names and 1 < value.size <= _MOST_COLUMNS:
+    if isinstance(value, np.ndarray) and value.dtype.names and 1 <= value.size <= _MOST_COLUMNS:
         members = value.reshape(-1)
+        if value.size == 1:
+            return {name: members[0][name] for name in value.dtype.names}
         return {f"({number})": members[number - 1 : number] for number in range(1, value.size + 1)}
     return None
 
 
 def _group(group: str, name: str, fields: Mapping[str, Any], clock: Clock | None, depth: int) -> Iterator[Series]:
     by_name = {key.rstrip("_").casefold(): value for key, value in fields.items()}
-    time = _times(by_name)
-    if time is not None:
+    data, unit = by_name.get("data"), _first_text(by_name, _UNIT_FIELDS)
+    samples = next((own for key in _SAMPLE_FIELDS if _is_vector(own := by_name.get(key))), None)
+    if (time := _times(by_name)) is not None:
         clock = _clock((group, name, depth), time)
         if "signals" in by_name:  # a structure with time, as Simulink's scopes write
             for number, signal in enumerate(_members(by_name["signals"]), start=1):
                 label = _text(signal.get("label")) or f"{name}({number})"
                 yield from _columns("", label, np.asarray(signal.get("values")), None, clock)
             return
-        if isinstance(by_name.get("data"), np.ndarray):
-            label = _text(by_name.get("name")) or name
-            unit = _text((_fields(by_name.get("datainfo")) or {}).get("Units")) or _first_text(by_name, _UNIT_FIELDS)
-            unit = unit or None
-            yield from _columns(group, label, np.asarray(by_name["data"]), unit, clock)
+        if isinstance(data, np.ndarray):
+            unit = _text((_fields(by_name.get("datainfo")) or {}).get("Units")) or unit
+            yield from _columns(group, _text(by_name.get("name")) or name, data, unit or None, clock)
             return
         if "data" in by_name:  # a struct of vectors that share the time beside it
-            yield from _walk(group, "data", by_name["data"], clock, depth + 1)
+            yield from _walk(group, "data", data, clock, depth + 1)
             return
         clock = None  # a struct of vectors beside a vector called time: that is a column like the others
-    elif (held := _vector_of(by_name)) is not None and _first_text(by_name, _UNIT_FIELDS) is not None:
-        # a signal with its name and unit beside its samples
+    elif samples is not None and unit is not None:  # a signal with its name and unit beside its samples
         own = by_name.get("time", by_name.get("t"))
-        if isinstance(own, np.ndarray) and own.dtype.kind in "fiu" and own.size == held.size:
+        if isinstance(own, np.ndarray) and own.dtype.kind in "fiu" and own.size == samples.size:
             clock = _clock((group, name, depth), own.reshape(-1).astype(np.float64))
-        yield from _columns(
-            group, _first_text(by_name, _NAME_FIELDS) or name, held, _first_text(by_name, _UNIT_FIELDS) or None, clock
-        )
+        yield from _columns(group, _first_text(by_name, _NAME_FIELDS) or name, samples, unit or None, clock)
         return
     elif "values" in by_name and _text(by_name.get("name")):  # a signal of a Simulink log, named by the log
         yield from _walk(group, _text(by_name["name"]), by_name["values"], clock, depth + 1)
         return
     inner = f"{group}/{name}" if group else name
-    units = _texts_of(fields, _UNIT_FIELDS)
-    names = _column_names(fields)
+    units, names = _units_beside(fields), _column_names(fields)
     for key, value in fields.items():
-        if _catman(key, fields) is not None:
-            yield from _catman_channel(inner, key, fields)
+        head, _, last = key.rpartition("_")
+        header = _fields(fields.get(f"{head}_Header")) if last == "Data" else None
+        if header is not None:  # `Channel_3_Data`, as catman exports it
+            step, values = number_of(header.get("dt")), np.asarray(value)
+            own_clock = uniform("catman", values.size, step) if step and step > 0.0 else None
+            label = _text(header.get("SignalName")) or key
+            yield from _columns(inner, label, values, _text(header.get("Unit")) or None, own_clock)
         elif names and isinstance(value, np.ndarray) and value.ndim == 2 and value.shape[1] == len(names):
             for number, label in enumerate(names):
-                yield from _columns(inner, label, np.asarray(value[:, number]), None, clock)
+                yield from _columns(inner, label, value[:, number], None, clock)
         elif key in units and isinstance(value, np.ndarray):
             yield from _columns(inner, key, value, units[key], clock)
         else:
             yield from _walk(inner, key, value, clock, depth + 1)
 
 
-def _vector_of(by_name: Mapping[str, Any]) -> NDArray[Any] | None:
-    """Return the samples that a signal's fields hold under one of the usual names."""
-    for name in ("data", "value", "values", "samples", "y"):
-        value = by_name.get(name)
-        if isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.size > 1:
-            return value
-    return None
+def _is_vector(value: Any) -> bool:
+    return isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.size > 1
 
 
 def _first_text(by_name: Mapping[str, Any], names: tuple[str, ...]) -> str | None:
@@ -134,11 +114,10 @@ def _first_text(by_name: Mapping[str, Any], names: tuple[str, ...]) -> str | Non
     return next((_text(by_name[name]) for name in names if name in by_name), None)
 
 
-def _texts_of(fields: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, str]:
-    """Return the texts of a struct called `units` beside the vectors: name of each -> unit."""
+def _units_beside(fields: Mapping[str, Any]) -> dict[str, str]:
+    """Return name -> unit of a struct called `units` beside the vectors."""
     for key, value in fields.items():
-        held = _fields(value) if key.casefold() in names else None
-        if held is not None:
+        if key.casefold() in _UNIT_FIELDS and (held := _fields(value)) is not None:
             return {name: text for name, member in held.items() if (text := _text(member))}
     return {}
 
@@ -146,26 +125,16 @@ def _texts_of(fields: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, st
 def _column_names(fields: Mapping[str, Any]) -> list[str]:
     """Return the names of a matrix's columns, which a cell array of texts beside it holds."""
     for key, value in fields.items():
-        if key.casefold() in _HEADS and isinstance(value, np.ndarray) and value.dtype.kind in "OU" and value.size > 1:
+        if (
+            key.casefold() in ("name", "names", *_NAME_OF_COLUMNS)
+            and isinstance(value, np.ndarray)
+            and value.dtype.kind in "OU"
+            and value.size > 1
+        ):
             texts = [_text(cell) or str(cell) for cell in value.reshape(-1)]
             if all(texts):
                 return texts
     return []
-
-
-def _catman(key: str, fields: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """Return the header of `Channel_3_Data`, as catman exports it; None for any other name."""
-    head, _, last = key.rpartition("_")
-    return _fields(fields.get(f"{head}_Header")) if last == "Data" else None
-
-
-def _catman_channel(group: str, key: str, fields: Mapping[str, Any]) -> Iterator[Series]:
-    header = _catman(key, fields) or {}
-    value = np.asarray(fields[key])
-    step = number_of(header.get("dt"))
-    clock = None if not step or step <= 0.0 else uniform("catman", value.size, step)
-    label = _text(header.get("SignalName")) or key
-    yield from _columns(group, label, value, _text(header.get("Unit")) or None, clock)
 
 
 def _times(by_name: Mapping[str, Any]) -> NDArray[np.float64] | None:
@@ -184,9 +153,9 @@ def _times(by_name: Mapping[str, Any]) -> NDArray[np.float64] | None:
 
 
 def _members(value: Any) -> list[Mapping[str, Any]]:
+    """Return the structs of an array of them, or the only one."""
     fields = _fields(value) or {}
-    members = [_fields(member) for member in fields.values()]
-    whole = [member for member in members if member is not None]
+    whole = [member for own in fields.values() if (member := _fields(own)) is not None]
     return whole if whole and all(key.startswith("(") for key in fields) else [fields]
 
 
@@ -199,9 +168,9 @@ def _columns(group: str, name: str, value: NDArray[Any], unit: str | None, clock
         yield Series(group, Label.parse(name, unit), flat.size, partial(np.asarray, flat), clock)
     elif flat.ndim == 2 and min(flat.shape) <= _MOST_COLUMNS:
         upright = flat if flat.shape[0] >= flat.shape[1] else flat.T
-        for number in range(upright.shape[1]):
-            label = Label(f"{name}(:,{number + 1})", f"{name}(:,{number + 1})", unit)
-            yield Series(group, label, upright.shape[0], partial(np.asarray, upright[:, number]), clock)
+        for number, column in enumerate(upright.T, start=1):
+            label = Label(f"{name}(:,{number})", f"{name}(:,{number})", unit)
+            yield Series(group, label, column.size, partial(np.asarray, column), clock)
 
 
 def _frame(group: str, frame: Any) -> Iterator[Series]:
@@ -213,9 +182,9 @@ def _frame(group: str, frame: Any) -> Iterator[Series]:
         elapsed = index if start is None else index - index[0]
         clock = _clock((group, "row times"), elapsed / np.timedelta64(1, "ns") / 1e9, start)
     for number, name in enumerate(frame.columns):
-        unit = units[number] if number < len(units) and units[number] else None
+        label = Label.parse(str(name), (units[number] or None) if number < len(units) else None)
         values = np.asarray(frame[name])
-        yield Series(group, Label.parse(str(name), unit), len(values), partial(np.asarray, values), clock)
+        yield Series(group, label, len(values), partial(np.asarray, values), clock)
 
 
 def _clock(key: tuple[Any, ...], t: NDArray[np.float64], start: np.datetime64 | None = None) -> Clock:
@@ -231,6 +200,4 @@ def _text(value: Any) -> str:
 def number_of(value: Any) -> float | None:
     """Return the only number that a value holds; None where it holds none or several."""
     flat = np.asarray(value).reshape(-1) if value is not None else np.empty(0)
-    if flat.size != 1 or flat.dtype.kind not in "fiu" or not np.isfinite(flat[0]):
-        return None
-    return float(flat[0])
+    return float(flat[0]) if flat.size == 1 and flat.dtype.kind in "fiu" and np.isfinite(flat[0]) else None

@@ -12,16 +12,15 @@ from numpy.typing import NDArray
 
 from sealscope.errors import InputError
 from sealscope.recordings.channels import LONG_NAMES, Array
+from sealscope.recordings.formats.columns import Wanted
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.libraries import library
 from sealscope.recordings.formats.netcdf import attributes
-from sealscope.recordings.formats.table import FORMAT_VERSION, Choose, RawTable, Series, parse_description, table_of
+from sealscope.recordings.formats.table import FORMAT_VERSION, RecordingFields, Series, parse_description, table_of
 
 if TYPE_CHECKING:
     import pandas
     import xarray
-
-_PLACE = "data frame"
 
 
 def to_pandas(
@@ -36,8 +35,8 @@ def to_pandas(
     return frame  # type: ignore[no-any-return]
 
 
-def read_pandas(frame: pandas.DataFrame, choose: Choose) -> RawTable:
-    """Read the chosen columns of a data frame; an index other than row numbers is a column, too."""
+def read_pandas(frame: pandas.DataFrame, wanted: Wanted) -> RecordingFields:
+    """Read the wanted columns of a data frame; an index other than row numbers is a column, too."""
     pandas = library("pandas", "a data frame", "pandas")
     if not isinstance(frame, pandas.DataFrame):
         raise InputError(f"frame must be a pandas.DataFrame, got a {type(frame).__name__}")
@@ -52,16 +51,15 @@ def read_pandas(frame: pandas.DataFrame, choose: Choose) -> RawTable:
         unit = units.get(name, column.attrs.get("units"))
         elapsed = "s" if pandas.api.types.is_timedelta64_dtype(column.dtype) else None
         label = Label.parse(name, unit if isinstance(unit, str) else elapsed)
-        series.append(Series("", label, len(frame), partial(_values, pandas, column, name)))
+        series.append(Series("", label, len(frame), partial(_values, pandas.api.types, column, name)))
     try:
-        own = parse_description(json.dumps({"format": FORMAT_VERSION, **frame.attrs}), _PLACE)
+        own = parse_description(json.dumps({"format": FORMAT_VERSION, **frame.attrs}))
     except (InputError, ValueError, TypeError, RecursionError):  # it is not of our making
         own = None
-    return table_of(series, choose, "pandas", _PLACE, own=own)
+    return table_of(series, wanted, "pandas", own=own)
 
 
-def _values(pandas: Any, series: Any, name: str) -> NDArray[Any]:
-    types = pandas.api.types
+def _values(types: Any, series: Any, name: str) -> NDArray[Any]:
     if types.is_datetime64_any_dtype(series.dtype):
         if getattr(series.dtype, "tz", None) is not None:
             series = series.dt.tz_convert("UTC").dt.tz_localize(None)
@@ -73,7 +71,7 @@ def _values(pandas: Any, series: Any, name: str) -> NDArray[Any]:
     if types.is_string_dtype(series.dtype) or types.is_object_dtype(series.dtype):
         cells = ["" if missing else str(cell) for cell, missing in zip(series, series.isna(), strict=True)]
         return np.array(cells, dtype=object)
-    raise InputError(f"{name} must hold numbers, got the type {series.dtype} ({_PLACE})")
+    raise InputError(f"{name} must hold numbers, got the type {series.dtype}")
 
 
 def to_xarray(values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]) -> xarray.Dataset:
