@@ -38,7 +38,7 @@ class Kept:
 
     def run(self, spec: RunSpec) -> SimulatedRun:
         if spec not in self.runs:
-            self.runs[spec] = simulated_run(spec.experiment(), spec.prove)
+            self.runs[spec] = simulated_run(spec)
         return self.runs[spec]
 
     def product(self, item: str) -> tuple[Product | Claim, ...]:

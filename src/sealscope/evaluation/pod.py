@@ -237,7 +237,7 @@ def fit_hit_miss(leaks: npt.ArrayLike, hits: npt.ArrayLike) -> HitMiss:
     values, where = np.unique(x, return_inverse=True)
     if values.size < 2:
         raise InputError(f"a curve needs leaks of at least 2 sizes, got {hit.size} of one size")
-    n, k = np.bincount(where).astype(np.float64), np.bincount(where, weights=hit.astype(np.float64))
+    n, k = (np.asarray(np.bincount(where, of), dtype=np.float64) for of in (None, hit.astype(np.float64)))
     firth = _is_separated(n, k)
     # centred and scaled while fitting, so that the size's unit does not matter
     centre, spread = float(values.mean()), float(np.ptp(values)) / 2.0
