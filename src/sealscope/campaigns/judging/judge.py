@@ -15,9 +15,17 @@ import numpy as np
 
 from sealscope.campaigns.cases.bound import smallest_detectable
 from sealscope.campaigns.cases.case import FAMILY
-from sealscope.campaigns.cases.row import NO_CAUSE, PISTON_LEAK, CaseRow, cause_of, covers, duty_of, named_cause
+from sealscope.campaigns.cases.row import (
+    NO_CAUSE,
+    PISTON_LEAK,
+    CaseRow,
+    Statement,
+    cause_of,
+    covers,
+    duty_of,
+    named_cause,
+)
 from sealscope.campaigns.plans.detectors import plan_detector
-from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.errors import InputError
 from sealscope.evaluation.binomial import IntervalEstimate, Proportion, proportion
 from sealscope.evaluation.confusion import CANNOT_TELL, Confusion, confusion_matrix
@@ -253,7 +261,7 @@ def _verdict(row: CaseRow, detector: str, own: float | None, thresholds: Thresho
     return "leak" if value > limit else "no leak"
 
 
-def _statement(row: CaseRow, detector: str) -> Evidence | None:
+def _statement(row: CaseRow, detector: str) -> Statement | None:
     """Return what a detector stated on a row; None where it states nothing, or the record failed."""
     return row.statements.get(detector) if row.error is None else None
 

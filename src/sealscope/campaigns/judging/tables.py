@@ -8,9 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sealscope.campaigns.cases.row import CaseRow
+from sealscope.campaigns.cases.row import CaseRow, Statement
 from sealscope.campaigns.judging.judge import ALLOWED_DETECTION, Judgement
-from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.evaluation.binomial import IntervalEstimate, Proportion
 from sealscope.storage.atomic import atomic_write
 
@@ -163,8 +162,8 @@ def tables_of(
     }  # fmt: skip
 
 
-def _stated(name: str, statement: Evidence | None) -> TableRow:
-    own = statement or Evidence("cannot tell", "")
+def _stated(name: str, statement: Statement | None) -> TableRow:
+    own = statement or Statement("cannot tell")
     onset, flow = own.onset_interval_s or (None, None), own.leak_interval_lpm or (None, None)
     return {
         f"{name}: verdict": statement.verdict if statement else None, f"{name}: threshold": own.threshold,
