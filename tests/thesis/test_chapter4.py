@@ -218,7 +218,7 @@ def test_a_run_that_diverged_leaves_its_reason_and_no_curve(kept: Kept) -> None:
     assert [len(panel.curves) for panel in figure.panels] == [1, 1]
     (table,) = make(failing, ALL["table-4.3-a"])
     assert table.rows[0][1:4] == (None, None, None)
-    assert math.isnan(numbers_of(failing.run(spec("3 sin(4t)", 25.0, solver="literal"))).p_1_less_p_A)
+    assert math.isnan(numbers_of(failing.run(spec("3 sin(4t)", 25.0, solver="literal")))["mean of p_1 - p_A"])
     (openings,) = make(failing, ALL["fig-4.33"])
     assert len(openings.panels[0].curves) == 3
     assert len(openings.panels[1].curves) == 0
