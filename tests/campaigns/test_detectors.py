@@ -43,7 +43,7 @@ pressures = ["u", "p_A", "p_B"]
 
 [[records]]
 use = "calibrate"
-count = 6
+count = 4
 
 [[records]]
 count = 2

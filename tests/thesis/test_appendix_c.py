@@ -24,7 +24,8 @@ TWO = (APPENDIX_C[10], APPENDIX_C[11], APPENDIX_C[39])
 def tables() -> dict[str, tuple[ThesisTable, ...]]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulation, "APPENDIX_C", TWO)
-        patch.setattr(simulation, "QUICK_HALF", 20.0)
+        patch.setattr(simulation, "QUICK_HALF", 15.0)
+        patch.setattr(simulation, "_SIZING", 10.0)
         context = Kept()
         return {item.id: simulation.runs_table(context, item) for item in simulation.ITEMS}  # type: ignore[arg-type]
 

@@ -81,9 +81,9 @@ def log_rms(squares: Array, sigma: float) -> Array:
 
 def noise_of(rig: Rig, chamber: str) -> float:
     """Return the deviation of a sample [psi] in a chamber's channel by own noise, common noise and conversion."""
-    sensor, daq = getattr(rig.sensors, chamber), rig.daq
-    step = daq.step / (daq.sensor_volts_hi - daq.sensor_volts_lo) * (sensor.range_hi - sensor.range_lo)
-    return float(np.sqrt(sensor.noise**2 + rig.sensors.common_noise**2 + step**2 / 12.0)) / PSI
+    from sealscope.campaigns.cases.bound import noise_covariance
+
+    return float(np.sqrt(noise_covariance(rig, [chamber])[0, 0])) / PSI
 
 
 def log_residuals(rig: Rig, sheet: DataSheet) -> Array:
