@@ -10,21 +10,21 @@ from sealscope.errors import InputError
 
 @pytest.fixture(scope="module")
 def recording():
-    return ss.simulate(command="3 sin(4t)", duration="45 s", leak="0.02 L/min from 30 s", seed=1)
+    return ss.simulate(command="3 sin(4t)", duration="90 s", leak="0.0042 L/min from 60 s", seed=1)
 
 
 def test_a_stream_that_is_watched_raises_the_alarm_of_the_record(recording):
     said = online(recording, "thesis", 0.01)
     assert said.verdict == "leak"
-    assert said.onset_s == pytest.approx(30.0, abs=1.0)
+    assert said.onset_s == pytest.approx(60.0, abs=1.0)
     low, high = said.leak_interval_lpm
-    assert low < 0.02 < high
-    watched = ss.SequentialBalance("thesis", alarms_per_hour=0.01 * 3600 / 45)
+    assert low < 0.0042 < high
+    watched = ss.SequentialBalance("thesis", alarms_per_hour=0.01 * 3600 / 90)
     assert watched.update(recording).alarm == said  # however the samples are cut
 
 
 def test_before_the_leak_nothing_is_raised(recording):
-    assert online(recording.between(0.0, 30.0), "thesis", 0.01).verdict == "no leak"
+    assert online(recording.between(0.0, 60.0), "thesis", 0.01).verdict == "no leak"
 
 
 def test_a_stream_without_its_channels_cannot_tell(recording):

@@ -13,7 +13,7 @@ import pytest
 
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.thesis.engine.context import RunSpec, SimulatedRun, simulated_run
-from sealscope.thesis.engine.products import Claim, Product
+from sealscope.thesis.engine.products import Claim, Figure, Product
 from sealscope.thesis.sheet import APPENDIX_C, FILES, QUANTITIES, DataSheet, read_sheet
 
 #: The folder of the measured sheet beside this checkout.
@@ -43,6 +43,11 @@ class Kept:
 
     def product(self, item: str) -> tuple[Product | Claim, ...]:
         return self.products[item]
+
+
+def numbers(figure: Figure) -> dict[str, float]:
+    """The numbers behind a figure by name."""
+    return {number.name: float(number.value) for number in figure.numbers}
 
 
 def made_sheet(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import fields, replace
 
 import numpy as np
@@ -36,12 +37,20 @@ from sealscope.thesis.engine.context import RunSpec, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Claim, Figure, ThesisTable
 
-from .conftest import Kept
+from .conftest import Kept, numbers
 
 
 @pytest.fixture(scope="module")
 def kept() -> Kept:
     return Kept()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shorter_drifts() -> Iterator[None]:
+    """Half a minute shows a drift, too."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sealscope.thesis.chapters.chapter4.cases._DRIFT_DURATION", 30.0)
+        yield
 
 
 ALL = {item.id: item for item in (*chapter4.ITEMS, *chapter4_claims.ITEMS)}
@@ -58,10 +67,6 @@ def claims(kept: Kept) -> dict[str, Claim]:
 
 def of_case(context: Kept, name: str) -> SolverPair:
     return run_pair(context, CASES[name].command, CASES[name].closed_pct)
-
-
-def numbers(product: Figure) -> dict[str, float]:
-    return {one.name: float(one.value) for one in product.numbers}
 
 
 def test_cases_are_those_of_tables_4_2_and_4_3() -> None:

@@ -48,13 +48,12 @@ _SINGULAR = 1e-12
 class LeakBound:
     """Standard deviation of the best unbiased estimate of a small leak over one run, as conductance G [m^3/(s Pa)].
 
-    `known`: all else known; `unknown`: the parameters `unknown_parameters` estimated from the same run, None where
-    there are none; `duration` [s]; `nonlinearity`: of the worst derivative.
+    `known`: all else known; `unknown`: other parameters estimated from the same run, None where there are none;
+    `duration` [s]; `nonlinearity`: of the worst derivative.
     """
 
     known: float
     unknown: float | None
-    unknown_parameters: tuple[str, ...]
     duration: float
     nonlinearity: float
 
@@ -142,7 +141,6 @@ def leak_bound(
     return LeakBound(
         known=1.0 / math.sqrt(fisher[0, 0]),
         unknown=math.sqrt(cramer_rao(fisher)[0, 0]) if unknown else None,
-        unknown_parameters=tuple(unknown),
         duration=experiment.duration,
         nonlinearity=max(sensitivity.nonlinearity for sensitivity in sensitivities),
     )

@@ -8,6 +8,7 @@ from sealscope.recordings.recording import Array
 from sealscope.thesis.engine.context import Context, RunSpec
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Figure, FigureCurve, Image, Number, Panel, Role
+from sealscope.thesis.notes import note
 
 #: Sampling rate [Hz] of the signals of this chapter; the thesis gives none.
 RATE = 1000.0
@@ -142,11 +143,8 @@ def two_tones(context: Context, item: Item) -> tuple[Figure, ...]:
         Panel("t [s]", "x(t) [1]", (signal,), "(a) Signal"),
         Panel("frequency [Hz]", "amplitude [1]", (spectrum,), "(b) Amplitude spectrum", x_range=shown),
     )
-    notes = (
-        "1 s sampled at 1000 Hz; the thesis gives neither. Its text names two cosines, eq. (3.3) has a sine at 30 Hz: "
-        "the amplitudes are the same, the phase at 30 Hz is -90 degrees."
-    )
-    return (Figure(item.id, item.title, panels, tuple(numbers), ("claim-3.1", "claim-3.2"), None, notes),)
+    claims = ("claim-3.1", "claim-3.2")
+    return (Figure(item.id, item.title, panels, tuple(numbers), claims, None, note("two-tones")),)
 
 
 def db8(context: Context, item: Item) -> tuple[Figure, ...]:
@@ -168,8 +166,7 @@ def db8(context: Context, item: Item) -> tuple[Figure, ...]:
         Number("vanishing moments", float(vanishing_moments(psi, t))),
         Number("frequency of the largest response", wavelet_centre()[1], "1/sample"),
     )
-    notes = "The wavelet is asymmetric and of finite length: 15 sampling intervals at scale 1."
-    return (Figure(item.id, item.title, panels, numbers, ("claim-3.3",), None, notes),)
+    return (Figure(item.id, item.title, panels, numbers, ("claim-3.3",), None, note("db8")),)
 
 
 def vanishing_moments(psi: Array, t: Array) -> int:
@@ -214,12 +211,7 @@ def four_views(context: Context, item: Item) -> tuple[Figure, ...]:
         Number("width of the pulse at 300 Hz in (c)", _width(times, short[nearest(bins, 300.0)]), "s"),
         Number("width of the pulse at 300 Hz in (d)", _width(t[pulse], wavelet[high][pulse]), "s"),
     )
-    notes = (
-        "A signal of our own choice, for the thesis's figure is a sketch: the tones of eq. (3.3) in turn and one "
-        "sample of height 8 at 0.75 s. Only (c) and (d) tell when a tone sounds; (d) places the pulse more sharply at "
-        "high frequencies and less at low ones."
-    )
-    return (Figure(item.id, item.title, panels, numbers, (), None, notes),)
+    return (Figure(item.id, item.title, panels, numbers, notes=note("four-views")),)
 
 
 def _width(t: Array, values: Array) -> float:
@@ -258,11 +250,7 @@ def pressure_scalogram(context: Context, item: Item) -> tuple[Figure, ...]:
         Number("rms at the ringing, leak / no leak", float(strength["leak"][ring] / strength["no leak"][ring])),
         Number("mean leak", run.mean_leak_lpm, "L/min"),
     )
-    notes = (
-        f"Simulated at {RECORD.command}, a leak from {_ONSET:g} s. The vertical axis is the frequency at which the "
-        f"wavelet of scale a responds most, b the middle of the wavelet; grey is the rms over {_BLOCK:g} s. The "
-        "ringing of the oil columns stands between the reversals, and the leak damps it."
-    )
+    notes = note("scalogram", command=RECORD.command, onset=_ONSET, block=_BLOCK)
     return (Figure(item.id, item.title, tuple(panels), numbers, ("claim-3.5",), run.resolved, notes),)
 
 

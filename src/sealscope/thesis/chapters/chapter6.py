@@ -14,6 +14,7 @@ from sealscope.recordings.recording import Array
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, Figure, FigureCurve, Panel, Role, ThesisTable
+from sealscope.thesis.notes import note
 from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
@@ -186,10 +187,7 @@ def controllers_table(context: Context, item: Item) -> tuple[ThesisTable | Figur
         for lpm in _leaks(context):
             error, energy, flow = tracking(*on_duty(name, lpm))
             rows.append((name, lpm, error, bandwidth(name, lpm), energy, stiffness(name, lpm), flow))
-    notes = (
-        f"{RIG}, friction +20 % and bulk modulus -20 % against what the controllers assume, {LOAD:g} N, leak sized at "
-        f"it; {1e3 * AMPLITUDE:g} mm at {1 / CYCLE:g} Hz. `ideal` knows the leak, nobody else does."
-    )
+    notes = note("controllers", rig=RIG, load=LOAD, mm=1e3 * AMPLITUDE, f=1 / CYCLE)
     table = ThesisTable(item.id, item.title, COLUMNS, tuple(rows), notes=notes)
     return table, _against_the_leak(table, "Error and stiffness against the leak", _ROLES, (_ERROR, _STIFF))
 
@@ -236,7 +234,7 @@ def open_loop_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
         *("leak [L/min]", "open: amplitude [mm]", "open: drift [mm/min]", "open: drift by the leak [mm/min]"),
         *("pi: drift [mm/min]", "fault-tolerant: drift [mm/min]"),
     )
-    notes = f"{RIG} under {LOAD:g} N, friction and stiffness off by 20 %. At 0.25 Hz; open: {u:g} V, closed: 40 mm."
+    notes = note("open-loop", rig=RIG, load=LOAD, u=u)
     return (ThesisTable(item.id, item.title, heads, tuple(rows), notes=notes),)
 
 
@@ -254,8 +252,7 @@ def load_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     for force in (0.0, 2000.0) if context.quick else (0.0, 500.0, 1000.0, 2000.0):
         pairs = (tracking(*on_duty(name, lpm, f"{force - LOAD!r} N"))[:2] for name, lpm in cases)
         rows.append((force, *itertools.chain.from_iterable(pairs)))
-    notes = "The leak is a conductance: 0.05 L/min under 2 kN, in proportion less under a smaller load."
-    return (ThesisTable(item.id, item.title, tuple(heads), tuple(rows), notes=notes),)
+    return (ThesisTable(item.id, item.title, tuple(heads), tuple(rows), notes=note("load")),)
 
 
 def outside_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
@@ -271,10 +268,7 @@ def outside_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
         third, fifth = (1e-3 * float(np.mean(lower[_cycle_of(run.t, k)])) for k in (2, 4))
         error, _, flow = tracking(run, late)
         rows.append((side, name, lpm, error, stiffness(name, 0.0, values=values), flow, fifth - third))
-    notes = (
-        f"{RIG} under {LOAD:g} N, which side A carries ({1e-6 * pressure['A']:.2g} MPa on average, B "
-        f"{1e-6 * pressure['B']:.2g}); the leak has its size at that pressure. Friction and stiffness off by 20 %."
-    )
+    notes = note("outside", rig=RIG, load=LOAD, A=1e-6 * pressure["A"], B=1e-6 * pressure["B"])
     return (ThesisTable(item.id, item.title, OUTSIDE_COLUMNS, tuple(rows), notes=notes),)
 
 
@@ -287,12 +281,7 @@ def valve_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...
         given, efficiency, taken = energies(name, lpm, rig)
         loop = bandwidth(name, lpm, rig), stiffness(name, lpm, rig)
         rows.append((source, name, lpm, error, *loop, energy, given, 100 * efficiency, 100 * taken))
-    notes = (
-        f"{RIG} and {VALVE_RIG}: one cylinder, oil, motor and pump, one controller with the same gains, friction and "
-        f"stiffness off by 20 %; {1e3 * AMPLITUDE:g} mm at {1 / CYCLE:g} Hz under {LOAD:g} N, efficiencies against a "
-        f"damper of {DAMPER:g} N s/m instead. The valve's supply turns at a constant speed; the last column leaves its "
-        "losses, motor and pump out. A pump takes energy back on the way down where the load drives it."
-    )
+    notes = note("valve", rig=RIG, other=VALVE_RIG, mm=1e3 * AMPLITUDE, f=1 / CYCLE, load=LOAD, damper=DAMPER)
     table = ThesisTable(item.id, item.title, VALVE_COLUMNS, tuple(rows), notes=notes)
     shown = ("electrical energy a cycle [J]", _STIFF)
     return table, _against_the_leak(table, "Energy and stiffness, pump and valve", _VALVE_ROLES, shown, log_y=True)

@@ -34,6 +34,7 @@ from sealscope.thesis.claims.judged import judged
 from sealscope.thesis.engine.context import Context, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, Claim, ThesisTable
+from sealscope.thesis.notes import note
 
 #: Share of the drift without orifices that a change of drift must reach to count.
 DRIFT_SHARE = 0.01
@@ -297,11 +298,7 @@ def claims(context: Context, item: Item) -> tuple[ThesisTable | Claim, ...]:
         tested = {True: "passed", False: "not passed", None: "not made"}[run.resolved]
         cells = (value if math.isfinite(value) else None for value in values)
         rows.append((reading.title, closed, cases.SOLVER_TEXT[solver], *cells, tested))
-    notes = (
-        f"Numbers {cases.WINDOW}. Q_A unlike Q_B: rms of their difference over the rms of Q_A. Rows that did not pass "
-        "the halving test show the step, not the rig."
-    )
-    ids = tuple(claim.id for claim in ordered)
+    ids, notes = tuple(claim.id for claim in ordered), note("readings", window=cases.WINDOW)
     return (ThesisTable(item.id, item.title, _COLUMNS, tuple(rows), ids, None, notes), *ordered)
 
 

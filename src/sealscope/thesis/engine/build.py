@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -12,8 +10,9 @@ from dataclasses import astuple, dataclass, replace
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
+from sealscope.campaigns.cases.case import digest, files_digest
 from sealscope.campaigns.execution.workers import carried_out, process_count
 from sealscope.errors import InputError, SealscopeError
 from sealscope.thesis.engine.context import Context, Products, RunSpec, SimulatedRun, simulated_run
@@ -101,7 +100,7 @@ class Reproduction:
         sheet = self._sheet_key if item.needs_sheet or item.uses_sheet else ""
         needs = [self._key(self.items[needed]) for needed in item.needs]
         own = [item.id, item.title, item.make.__module__, item.make.__qualname__, item.inputs]
-        return _digest([own, needs, sheet, self.publish is not None, self.quick, sources_key()])
+        return digest([own, needs, sheet, self.publish is not None, self.quick, sources_key()])
 
     def _context(self, item: Item) -> Context:
         def product(name: str) -> Products:
@@ -113,7 +112,7 @@ class Reproduction:
             return products
 
         def run(spec: RunSpec) -> SimulatedRun:
-            return self.folder.run(_digest([astuple(spec), sources_key()]), lambda: simulated_run(spec))
+            return self.folder.run(digest([astuple(spec), sources_key()]), lambda: simulated_run(spec))
 
         return Context(self.quick, self.sheet if item.needs_sheet or item.uses_sheet else None, run, product)
 
@@ -184,12 +183,6 @@ def sources_key() -> str:
     """Digest of the sources of this package and the versions of the libraries under it: what every result rests on."""
     package = Path(__file__).parents[2]
     kinds = (".py", ".toml", ".csv", ".j2", ".css", ".js")
-    files = {str(path.relative_to(package)): path for path in package.rglob("*") if path.suffix in kinds}
-    sources = {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in sorted(files.items())}
+    sources = files_digest(path for path in sorted(package.rglob("*")) if path.suffix in kinds)
     versions = {of.name.lower(): of.version for of in metadata.distributions()}
-    return _digest([sources, [versions.get(name.lower()) for name in _LIBRARIES]])
-
-
-def _digest(value: Any) -> str:
-    """SHA-256 of plain values."""
-    return hashlib.sha256(json.dumps(value).encode()).hexdigest()[:32]
+    return digest([sources, [versions.get(name.lower()) for name in _LIBRARIES]])
