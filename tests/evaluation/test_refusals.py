@@ -8,11 +8,10 @@ import pytest
 
 from sealscope.errors import InputError
 from sealscope.evaluation.binomial import at_least, clopper_pearson, holm, sign_test
-from sealscope.evaluation.confusion import CANNOT_TELL, confusion_matrix
 from sealscope.evaluation.estimates import estimate_error, onset_errors, quantile_of
 from sealscope.evaluation.pod import fit_hit_miss
 from sealscope.evaluation.roc import auc, roc_curve
-from sealscope.evaluation.table import events_per_hour, poisson_interval
+from sealscope.evaluation.table import CANNOT_TELL, confusion_matrix, events_per_hour, poisson_interval
 from sealscope.evaluation.thresholds import quantile_threshold, records_needed
 
 

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sealscope.evaluation.confusion import CANNOT_TELL, confusion_matrix
-from sealscope.evaluation.table import ALWAYS, NEVER, events_per_hour, summary
+from sealscope.evaluation.table import ALWAYS, CANNOT_TELL, NEVER, confusion_matrix, events_per_hour, summary
 
 FAULTS = ["none", "piston leak", "pump leak"]
 names = st.lists(st.tuples(st.sampled_from(FAULTS), st.sampled_from([*FAULTS, CANNOT_TELL])), min_size=1, max_size=60)

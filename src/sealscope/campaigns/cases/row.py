@@ -11,7 +11,7 @@ from sealscope.campaigns.cases.case import CampaignCase
 from sealscope.campaigns.plans.duty import COMMAND
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause, Evidence, Verdict
 from sealscope.errors import SealscopeError
-from sealscope.evaluation.confusion import CANNOT_TELL
+from sealscope.evaluation.table import CANNOT_TELL
 from sealscope.storage.plain_values import as_type
 
 PISTON_LEAK, NO_CAUSE = "piston leak", "none"

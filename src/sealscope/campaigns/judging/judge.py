@@ -28,11 +28,10 @@ from sealscope.campaigns.cases.row import (
 from sealscope.campaigns.plans.detectors import plan_detector
 from sealscope.errors import InputError
 from sealscope.evaluation.binomial import IntervalEstimate, Proportion, proportion
-from sealscope.evaluation.confusion import CANNOT_TELL, Confusion, confusion_matrix
 from sealscope.evaluation.estimates import EstimateError, OnsetErrors, estimate_error, onset_errors, quantile_of
 from sealscope.evaluation.pod import HitMiss, SizeDetection, by_size, fit_hit_miss, proven_size
 from sealscope.evaluation.roc import Area, Roc, auc, roc_curve
-from sealscope.evaluation.table import ALWAYS, NEVER, SummaryRow, summary
+from sealscope.evaluation.table import ALWAYS, CANNOT_TELL, NEVER, Confusion, SummaryRow, confusion_matrix, summary
 from sealscope.evaluation.thresholds import Promise, Threshold, quantile_threshold, records_needed
 
 _K = TypeVar("_K")
