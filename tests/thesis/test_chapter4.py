@@ -11,6 +11,7 @@ import pytest
 
 from sealscope.parameters import load_rig
 from sealscope.physics.rig import throttle_coefficients
+from sealscope.thesis.chapters.chapter4 import claims as chapter4_claims
 from sealscope.thesis.chapters.chapter4 import figures as chapter4
 from sealscope.thesis.chapters.chapter4.cases import (
     AS_PRINTED,
@@ -30,9 +31,8 @@ from sealscope.thesis.chapters.chapter4.cases import (
     steady_output,
     visible_pressure,
 )
+from sealscope.thesis.chapters.chapter4.claims import ringing, sine_fit
 from sealscope.thesis.chapters.chapter4.friction import falls_up_to, jumps_at_threshold
-from sealscope.thesis.claims import chapter4 as chapter4_claims
-from sealscope.thesis.claims.chapter4 import ringing, sine_fit
 from sealscope.thesis.engine.context import RunSpec, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Claim, Figure, ThesisTable

@@ -22,8 +22,8 @@ from sealscope.recordings.recording import Array
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, ThesisTable
-from sealscope.thesis.notes import note
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, QUANTITIES, Condition, DataSheet, experiment_values, groups
+from sealscope.thesis.texts import note
 from sealscope.units import PSI
 
 if TYPE_CHECKING:

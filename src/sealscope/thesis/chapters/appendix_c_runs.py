@@ -19,8 +19,8 @@ from sealscope.recordings.recording import Array, Recording
 from sealscope.thesis.engine.context import Context, first_table
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, ThesisTable
-from sealscope.thesis.notes import note
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, QUANTITIES, UNITS, Condition, DataSheet, experiment_values
+from sealscope.thesis.texts import note
 from sealscope.units import PSI
 
 if TYPE_CHECKING:

@@ -16,8 +16,8 @@ from sealscope.thesis.chapters.appendix_c_runs import SETTLING, detail_rms, deta
 from sealscope.thesis.engine.context import Context, RunSpec, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Figure, FigureCurve, Number, Panel, Role
-from sealscope.thesis.notes import note
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, QUANTITIES, UNITS, Condition, experiment_values
+from sealscope.thesis.texts import note
 from sealscope.units import LITRE_PER_MINUTE
 
 Mask = NDArray[np.bool_]

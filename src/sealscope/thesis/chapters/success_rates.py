@@ -13,8 +13,8 @@ from sealscope.thesis.chapters.appendix_c_runs import simulated_sheet
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, ThesisTable
-from sealscope.thesis.notes import note
 from sealscope.thesis.sheet import COLUMNS, DataSheet
+from sealscope.thesis.texts import note
 
 #: The direction in which each chamber's RMS is said to move when a leak opens, section 5.6.
 DIRECTION: Mapping[str, int] = {"p_A": -1, "p_B": 1}

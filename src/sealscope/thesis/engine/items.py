@@ -16,9 +16,8 @@ from sealscope.thesis.engine.context import Context, Products
 #: Modules that list `ITEMS`, in the order of the thesis.
 MODULES = (
     "chapters.chapter3",
-    "claims.chapter3",
     "chapters.chapter4.figures",
-    "claims.chapter4",
+    "chapters.chapter4.claims",
     "chapters.chapter5",
     "chapters.appendix_c_runs",
     "chapters.appendix_c",
@@ -26,7 +25,6 @@ MODULES = (
     "chapters.success_rates",
     "claims.detection",
     "chapters.chapter6",
-    "claims.chapter6",
 )
 
 

@@ -28,7 +28,7 @@ from sealscope.thesis.chapters.chapter4.friction import friction_models, stribec
 from sealscope.thesis.engine.context import Context, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, Figure, FigureCurve, Number, Panel, Role, ThesisTable
-from sealscope.thesis.notes import note
+from sealscope.thesis.texts import note
 from sealscope.units import LITRE_PER_MINUTE
 
 #: Unit and factor from SI of what the figures show.

@@ -11,7 +11,7 @@ from sealscope.recordings.recording import Array
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Figure, FigureCurve, Number, Panel
-from sealscope.thesis.notes import note
+from sealscope.thesis.texts import note
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig

@@ -30,11 +30,10 @@ from sealscope.thesis.chapters.chapter4.cases import (
     throttled,
 )
 from sealscope.thesis.chapters.chapter4.friction import falls_up_to, jumps_at_threshold, thesis_rig
-from sealscope.thesis.claims.judged import judged
 from sealscope.thesis.engine.context import Context, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, Claim, ThesisTable
-from sealscope.thesis.notes import note
+from sealscope.thesis.texts import judged, note
 
 #: Share of the drift without orifices that a change of drift must reach to count.
 DRIFT_SHARE = 0.01
