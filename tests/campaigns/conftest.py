@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shutil import copytree
 
 import pytest
+
+from sealscope.campaigns.execution.run import run
+from sealscope.campaigns.plans.reader import load_plan
 
 TINY = """
 [campaign]
@@ -51,6 +55,22 @@ def tiny(tmp_path):
     path = tmp_path / "tiny.toml"
     path.write_text(TINY, encoding="utf-8")
     return path
+
+
+@pytest.fixture(scope="session")
+def _finished(tmp_path_factory):
+    """The tiny plan's folder as one process leaves it."""
+    place = tmp_path_factory.mktemp("finished")
+    (place / "tiny.toml").write_text(TINY, encoding="utf-8")
+    state = run(load_plan(place / "tiny.toml"), place / "rows", jobs=1)
+    assert (state.done, state.failed, state.complete) == (26, 0, True)
+    return place / "rows"
+
+
+@pytest.fixture
+def finished_tiny(_finished, tmp_path):
+    """A copy of the finished campaign of the tiny plan."""
+    return copytree(_finished, tmp_path / "finished")
 
 
 @pytest.fixture

@@ -97,8 +97,6 @@ def test_what_cannot_be_separated_is_refused() -> None:
         cramer_rao(np.zeros((1, 1)))
     with pytest.raises(InputError, match="positive definite"):
         information(slopes, np.zeros((1, 1)))
-    with pytest.raises(InputError, match=r"slopes must be \(parameters, channels, samples\)"):
-        information(slopes[0], np.eye(1))
 
 
 def test_noise_of_the_rig_holds_own_common_and_conversion(rig: Rig) -> None:
@@ -169,7 +167,6 @@ def test_unknown_friction_stiffness_and_gain_cost_a_known_share(rig: Rig) -> Non
     with all else known."""
     result = leak_bound(run_of(rig, "7 sin(4t)", 90.0), covariance=WHITE, unknown=UNKNOWN)
     assert result.unknown is not None
-    assert result.unknown_parameters == UNKNOWN
     assert math.sqrt(2.0) * in_lpm(result.unknown) == pytest.approx(0.0005, rel=0.15)
     assert 1.2 < result.unknown / result.known < 2.0
 

@@ -80,12 +80,12 @@ def test_in_batches_it_says_so_and_goes_on(call, tiny, tmp_path):
     assert "the same mode of making rows" in err
 
 
-def test_the_page_is_whole_and_asks_nothing_of_a_network(call, tiny, tmp_path):
-    call("campaign", "run", tiny, "-o", tmp_path / "mine", "-j", "1")
-    page = (tmp_path / "mine" / "report.html").read_text(encoding="utf-8")
+def test_the_page_is_whole_and_asks_nothing_of_a_network(call, tiny, finished_tiny):
+    call("campaign", "report", tiny, "-o", finished_tiny)
+    page = (finished_tiny / "report.html").read_text(encoding="utf-8")
     assert "http" not in page.replace("http-equiv", "")
     for href in re.findall(r'href="([^"]+)"', page):
-        assert (tmp_path / "mine" / href).is_file()
+        assert (finished_tiny / href).is_file()
     plan = load_plan(tiny)
     for name in plan.detectors:
         assert page.count(f"<summary>{name}</summary>") == 1
@@ -96,11 +96,10 @@ def test_the_page_is_whole_and_asks_nothing_of_a_network(call, tiny, tmp_path):
     assert not re.search(r">(nan|inf|None)<", page)
 
 
-def test_an_incomplete_campaign_says_so(call, tiny, tmp_path):
-    call("campaign", "run", tiny, "-o", tmp_path / "mine", "-j", "1")
-    rows = (tmp_path / "mine" / "rows.jsonl").read_bytes().splitlines(keepends=True)
-    (tmp_path / "mine" / "rows.jsonl").write_bytes(b"".join(rows[:-3]))
-    status, out, _ = call("campaign", "report", tiny, "-o", tmp_path / "mine")
+def test_an_incomplete_campaign_says_so(call, tiny, finished_tiny):
+    rows = (finished_tiny / "rows.jsonl").read_bytes().splitlines(keepends=True)
+    (finished_tiny / "rows.jsonl").write_bytes(b"".join(rows[:-3]))
+    status, out, _ = call("campaign", "report", tiny, "-o", finished_tiny)
     assert status == 0
     assert "Not complete: 3 records of the plan have no row yet." in out
 

@@ -29,8 +29,8 @@ from sealscope.reporting.campaign.page import campaign_text, render_campaign_pag
 PLAN = """
 [campaign]
 name = "watched"
-duration = "40 s"
-onset = "20 s"
+duration = "24 s"
+onset = "12 s"
 rate = "500 Hz"
 false_alarm = 0.2
 seed = 3
@@ -43,7 +43,7 @@ pressures = ["u", "p_A", "p_B"]
 
 [[records]]
 use = "calibrate"
-count = 6
+count = 5
 
 [[records]]
 count = 2
@@ -75,7 +75,7 @@ class Watcher:
         moved = float(recording["p_A"][len(recording) // 2 :].std() / recording["p_A"][: len(recording) // 2].std())
         leak = "leak" if "x" in recording else "no leak"
         return Evidence(
-            leak, f"at {p}", 2.0 + abs(math.log(moved)), 2.0, 21.0, (19.0, 23.0), self.rig.pump.q_b, (0.0, 1.0),
+            leak, f"at {p}", 2.0 + abs(math.log(moved)), 2.0, 13.0, (11.0, 15.0), self.rig.pump.q_b, (0.0, 1.0),
             cause=None if "x" in recording else "friction change",
         )  # fmt: skip
 
@@ -125,10 +125,10 @@ def test_rows_keep_what_was_stated_and_come_back_from_disk(plan, done):
         "diagnose, quick @ pressures", "rms change",
     }  # fmt: skip
     said = row.statements["watcher"]
-    assert (said.verdict, said.threshold, said.onset_s, said.onset_interval_s) == ("leak", 2.0, 21.0, (19.0, 23.0))
+    assert (said.verdict, said.threshold, said.onset_s, said.onset_interval_s) == ("leak", 2.0, 13.0, (11.0, 15.0))
     assert (said.leak_lpm, said.leak_interval_lpm) == (plan.rig.pump.q_b, (0.0, 1.0))
     assert row.statements["watcher @ pressures"].cause == "friction change"
-    assert row.scores["watcher @ pressures"] == (None, 21.0)  # another cause: the lowest of scores
+    assert row.scores["watcher @ pressures"] == (None, 13.0)  # another cause: the lowest of scores
     assert CaseRow.from_dict(json.loads(json.dumps(row.as_dict(), allow_nan=False))) == row
     line = json.loads((done / "rows.jsonl").read_text().splitlines()[0])
     del line["statements"]
@@ -232,7 +232,7 @@ def test_rows_of_an_older_form_are_refused(plan, done):
 
 @pytest.mark.slow
 def test_detectors_may_assume_another_rig(plan, done, tmp_path):
-    text = PLAN.replace("seed = 3", 'seed = 3\nassume_set = { "pump.q_b" = 1e-7 }').replace("count = 6", "count = 4")
+    text = PLAN.replace("seed = 3", 'seed = 3\nassume_set = { "pump.q_b" = 1e-7 }').replace("count = 5", "count = 4")
     (tmp_path / "watched.toml").write_text(text, encoding="utf-8")
     other = load_plan(tmp_path / "watched.toml")
     assert other.rig == plan.rig
@@ -284,7 +284,7 @@ def test_what_breaks_a_rule_is_one_line(plan, tmp_path, before, after, message):
 
 @pytest.mark.slow
 def test_channels_restrict_those_that_name_no_view(plan, tmp_path):
-    text = PLAN.replace("seed = 3", 'seed = 3\nchannels = ["p_A", "p_B"]').replace("count = 6", "count = 4")
+    text = PLAN.replace("seed = 3", 'seed = 3\nchannels = ["p_A", "p_B"]').replace("count = 5", "count = 4")
     (tmp_path / "watched.toml").write_text(text, encoding="utf-8")
     campaign.run(load_plan(tmp_path / "watched.toml"), tmp_path / "few", jobs=1)
     assert set(examined) == {("p_A", "p_B"), ("u", "p_A", "p_B")}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+from shutil import copytree
 
 import pytest
 
@@ -40,9 +41,10 @@ size = 0.3
 """
 
 
-@pytest.fixture
-def folder(tmp_path):
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory):
     """Twelve healthy recordings and two leaky ones of one machine."""
+    tmp_path = tmp_path_factory.mktemp("measured")
     for seed in range(1, 13):
         made = simulate_with_truth(Experiment.of(command="3 sin(4t)", duration=8.0, seed=seed)).recording
         write(made, tmp_path / f"healthy-{seed}.csv")
@@ -52,6 +54,12 @@ def folder(tmp_path):
         )
         write(leak.recording, tmp_path / f"leaky-{seed}.csv")
     return tmp_path
+
+
+@pytest.fixture
+def folder(recordings, tmp_path):
+    """A copy of them."""
+    return copytree(recordings, tmp_path, dirs_exist_ok=True)
 
 
 def plan_of(folder, text=PLAN):

@@ -32,13 +32,10 @@ def files_of(plan, folder):
 
 
 @pytest.fixture
-def once(tiny, tmp_path):
+def once(tiny, finished_tiny):
     """The plan, and the files of a campaign that ran through in this process."""
     plan = load_plan(tiny)
-    folder = tmp_path / "once"
-    state = campaign.run(plan, folder, jobs=1)
-    assert (state.done, state.failed, state.complete) == (26, 0, True)
-    return plan, files_of(plan, folder)
+    return plan, files_of(plan, finished_tiny)
 
 
 def test_processes_make_the_same_bytes(once, tmp_path):
@@ -224,18 +221,15 @@ def test_the_code_key_covers_every_source_that_a_case_runs(tiny):
     assert outcome.stdout.splitlines() == ["[]", "True"]
 
 
-def test_rows_of_another_campaign_are_not_mixed_in(tiny, text, tmp_path):
-    folder = tmp_path / "mine"
-    campaign.run(load_plan(tiny), folder, jobs=1)
+def test_rows_of_another_campaign_are_not_mixed_in(finished_tiny, text, tmp_path):
     other = tmp_path / "other.toml"
     other.write_text(text.replace("seed = 3", "seed = 4"), encoding="utf-8")
     with pytest.raises(InputError, match="continues only with the same rig, bench, length, onset or seed"):
-        campaign.run(load_plan(other), folder, jobs=1)
+        campaign.run(load_plan(other), finished_tiny, jobs=1)
 
 
-def test_more_records_and_detectors_are_added_to_what_is_there(tiny, text, tmp_path):
-    folder = tmp_path / "mine"
-    campaign.run(load_plan(tiny), folder, jobs=1)
+def test_more_records_and_detectors_are_added_to_what_is_there(finished_tiny, text, tmp_path):
+    folder = finished_tiny
     more = tmp_path / "more.toml"
     more.write_text(text.replace("count = 6", "count = 8"), encoding="utf-8")
     reported = []

@@ -34,7 +34,7 @@ def test_the_challenger_s_o_rings():
     assert (fit.intercept, fit.slope) == pytest.approx((-15.0429, 0.2322), abs=5e-5)
     assert np.sqrt(np.diag(fit.covariance)) == pytest.approx((7.3786, 0.1082), abs=5e-5)
     assert (-2 * fit.null, -2 * fit.log_likelihood) == pytest.approx((28.267, 20.315), abs=5e-4)
-    assert (fit.estimator, fit.separated) == ("maximum likelihood", False)
+    assert fit.estimator == "maximum likelihood"
     assert math.log(fit.a50) == pytest.approx(15.0429 / 0.232163, abs=1e-3)
     assert math.log(fit.a90) == pytest.approx((15.0429 + math.log(9)) / 0.232163, abs=1e-3)
     assert 1 - fit.detection(math.exp(31.0))[0] == pytest.approx(0.9996, abs=5e-5)
@@ -103,7 +103,6 @@ def test_sizes_rise_with_probability_and_confidence(seed):
 def test_firth_s_fit_is_half_a_count_more_in_a_table_of_two_sizes():
     """With two sizes the model is saturated, and Firth's estimate adds 1/2 to each cell (Heinze and Schemper 2002)."""
     fit = fit_hit_miss(np.repeat([1.0, 10.0], 20), np.r_[np.zeros(20), np.ones(17), np.zeros(3)])
-    assert fit.separated
     assert fit.estimator == "firth"
     assert fit.detection(np.array([1.0, 10.0])) == pytest.approx((0.5 / 21, 17.5 / 21), abs=1e-8)
 
@@ -112,7 +111,7 @@ def test_hits_and_misses_apart_still_give_a_curve_and_a_wide_bound():
     few = fit_hit_miss([1, 2, 3, 4, 5, 6, 7, 8], [0, 0, 0, 0, 1, 1, 1, 1])
     many = fit_hit_miss(np.repeat([1.0, 2, 3, 4, 5, 6, 7, 8], 40), np.repeat([0, 0, 0, 0, 1, 1, 1, 1], 40))
     for fit in (few, many):
-        assert fit.separated
+        assert fit.estimator == "firth"
         assert 4.0 < fit.a50 < 5.0
         assert fit.a90 < fit.a90_95
     assert many.a90_95 < 5.2 < few.a90_95

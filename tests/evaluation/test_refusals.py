@@ -8,16 +8,11 @@ import pytest
 
 from sealscope.errors import InputError
 from sealscope.evaluation.binomial import at_least, clopper_pearson, holm, sign_test
-from sealscope.evaluation.confusion import CANNOT_TELL, confusion_matrix
 from sealscope.evaluation.estimates import estimate_error, onset_errors, quantile_of
 from sealscope.evaluation.pod import fit_hit_miss
 from sealscope.evaluation.roc import auc, roc_curve
-from sealscope.evaluation.table import NEVER, JudgedRecord, events_per_hour, poisson_interval, summary
+from sealscope.evaluation.table import CANNOT_TELL, confusion_matrix, events_per_hour, poisson_interval
 from sealscope.evaluation.thresholds import quantile_threshold, records_needed
-
-
-def judged(*records: tuple[str, float, str]) -> None:
-    summary([JudgedRecord(detector, "a", size, verdict) for detector, size, verdict in records])
 
 
 @pytest.mark.parametrize(
@@ -31,9 +26,6 @@ def judged(*records: tuple[str, float, str]) -> None:
         (fit_hit_miss, ([1.0, 2.0], [0, 0.5])), (fit_hit_miss, ([1.0, 2.0], [0])),
         (auc, ([], [1.0])), (auc, ([0.0, 1.0], [1.0])), (auc, ([0.0, math.nan], [1.0, 2.0])), (auc, (["a"], [1.0])),
         (roc_curve, ([[0.0]], [1.0])),
-        (judged, ()), (judged, (("d3", 0.0, "maybe"),)), (judged, (("d3", -1.0, "leak"),)),
-        (judged, (("d3", 0.0, "leak"), ("d4", 0.1, "leak"))), (judged, (("d3", 0.0, "leak"),) * 2),
-        (judged, ((NEVER, 0.0, "no leak"),)),
         (confusion_matrix, (["none"], [], ["none"])), (confusion_matrix, ([CANNOT_TELL], ["none"], ["none"])),
         (confusion_matrix, (["none"], ["rust"], ["none"])),
         (quantile_threshold, (range(50), 1.5)), (quantile_threshold, ([1.0, math.inf], 0.5)),

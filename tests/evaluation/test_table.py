@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sealscope.evaluation.confusion import CANNOT_TELL, confusion_matrix
-from sealscope.evaluation.table import ALWAYS, NEVER, JudgedRecord, events_per_hour, summary
+from sealscope.evaluation.table import ALWAYS, CANNOT_TELL, NEVER, confusion_matrix, events_per_hour, summary
 
 FAULTS = ["none", "piston leak", "pump leak"]
 names = st.lists(st.tuples(st.sampled_from(FAULTS), st.sampled_from([*FAULTS, CANNOT_TELL])), min_size=1, max_size=60)
@@ -48,25 +47,11 @@ def test_counts_add_up_in_any_order(pairs, random):
     assert np.array_equal(again.counts, result.counts)
 
 
-SIZES = (0.0, 0.0042, 0.015)
-
-
-def outcomes(detector: str, verdicts: dict[float, list[str]], **more) -> list[JudgedRecord]:
-    return [
-        JudgedRecord(detector, f"{size} {i}", size, verdict, **more)
-        for size, said in verdicts.items()
-        for i, verdict in enumerate(said)
-    ]
-
-
-def a_campaign() -> list[JudgedRecord]:
-    first = {0.0: ["leak"] + ["no leak"] * 9, 0.015: ["leak"] * 4 + [CANNOT_TELL], 0.0042: ["leak", "no leak"]}
-    second = {0.0: ["no leak"] * 10, 0.015: ["leak"] * 5, 0.0042: ["no leak"] * 2}
-    return outcomes("d3", first, hours=0.05) + outcomes("d4", second, hours=0.05)
-
-
 def test_the_summary_by_hand():
-    table = summary(a_campaign())
+    sizes = [0.0] * 10 + [0.015] * 5 + [0.0042] * 2
+    d3 = ["leak"] + ["no leak"] * 9 + ["leak"] * 4 + [CANNOT_TELL] + ["leak", "no leak"]
+    d4 = ["no leak"] * 10 + ["leak"] * 5 + ["no leak"] * 2
+    table = summary(sizes, {"d3": d3, "d4": d4}, hours=0.05)
     assert [(row.detector, row.leak_lpm) for row in table] == [
         (name, size) for name in ("d3", "d4", ALWAYS, NEVER) for size in (0.0042, 0.015)
     ]
@@ -77,17 +62,21 @@ def test_the_summary_by_hand():
     assert row.informedness == pytest.approx(0.8 - 0.1)
 
 
+SIZES = st.sampled_from((0.0, 0.0042, 0.015))
+
+
 @settings(deadline=None)
-@given(st.lists(st.tuples(st.sampled_from(SIZES), st.sampled_from(["leak", "no leak", CANNOT_TELL])), min_size=1))
+@given(st.lists(st.tuples(SIZES, st.sampled_from(["leak", "no leak", CANNOT_TELL])), min_size=1))
 def test_the_rows_that_do_not_look_are_always_there_and_never_informed(cases):
-    table = summary([JudgedRecord("any", i, size, verdict) for i, (size, verdict) in enumerate(cases)])
+    sizes, said = zip(*cases, strict=True)
+    table = summary(sizes, {"any": said})
     own, always, never = ([row for row in table if row.detector == name] for name in ("any", ALWAYS, NEVER))
     assert [row.leak_lpm for row in own] == [row.leak_lpm for row in always] == [row.leak_lpm for row in never]
     for row, fires, silent in zip(own, always, never, strict=True):
         assert row.n == fires.n == silent.n
         assert row.leak_lpm == 0.0 or (fires.detection.value, silent.detection.value) == (1.0, 0.0)
         if row.false_alarm is None:
-            assert all(size > 0.0 for size, _ in cases)
+            assert all(size > 0.0 for size in sizes)
         else:
             assert (fires.false_alarm.value, silent.false_alarm.value) == (1.0, 0.0)
             assert row.leak_lpm == 0.0 or fires.informedness == silent.informedness == 0.0

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from sealscope.recordings.chambers import CHAMBERS
+from sealscope.thesis.chapters.appendix_c_runs import SimulatedTest, table_of
 from sealscope.thesis.engine.context import RunSpec, SimulatedRun, simulated_run
-from sealscope.thesis.engine.products import Claim, Product
-from sealscope.thesis.sheet import APPENDIX_C, FILES, QUANTITIES, DataSheet, read_sheet
+from sealscope.thesis.engine.products import Claim, Figure, Product, ThesisTable
+from sealscope.thesis.sheet import APPENDIX_C, FILES, QUANTITIES, Condition, DataSheet, read_sheet
 
 #: The folder of the measured sheet beside this checkout.
 FOLDER = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -38,11 +39,16 @@ class Kept:
 
     def run(self, spec: RunSpec) -> SimulatedRun:
         if spec not in self.runs:
-            self.runs[spec] = simulated_run(spec.experiment(), spec.prove)
+            self.runs[spec] = simulated_run(spec)
         return self.runs[spec]
 
     def product(self, item: str) -> tuple[Product | Claim, ...]:
         return self.products[item]
+
+
+def numbers(figure: Figure) -> dict[str, float]:
+    """The numbers behind a figure by name."""
+    return {number.name: float(number.value) for number in figure.numbers}
 
 
 def made_sheet(
@@ -58,6 +64,15 @@ def made_sheet(
             change = random.normal((shifts or {}).get((chamber, name), 0.0), scatter, n)
             rms[chamber][name] = np.column_stack([before, before * np.exp(change)])
     return DataSheet(rms)
+
+
+def table_with(sheet: DataSheet, item: str, range_MPa: Callable[[Condition], float]) -> ThesisTable:
+    """The table of the simulated tests, resolved, with the values of a sheet and a range of both pressures."""
+    rows = []
+    for k, condition in enumerate(APPENDIX_C):
+        rms = {c: {q: tuple(sheet.rms[c][q][k].tolist()) for q in QUANTITIES} for c in CHAMBERS}
+        rows.append(SimulatedTest(condition, rms, condition.mean_leak_lpm, (range_MPa(condition),) * 2, True))
+    return table_of(rows, item, "made")
 
 
 @pytest.fixture(scope="session")

@@ -15,7 +15,7 @@ from sealscope.thesis.chapters.appendix_c_runs import RigDrift, draw_rig_drift, 
 from sealscope.thesis.engine.products import Claim, Product, ThesisTable
 from sealscope.thesis.sheet import APPENDIX_C, QUANTITIES, DataSheet
 
-from .conftest import Kept, made_sheet
+from .conftest import Kept, made_sheet, table_with
 
 TWO = (APPENDIX_C[10], APPENDIX_C[11], APPENDIX_C[39])
 
@@ -24,7 +24,8 @@ TWO = (APPENDIX_C[10], APPENDIX_C[11], APPENDIX_C[39])
 def tables() -> dict[str, tuple[ThesisTable, ...]]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulation, "APPENDIX_C", TWO)
-        patch.setattr(simulation, "QUICK_HALF", 20.0)
+        patch.setattr(simulation, "QUICK_HALF", 15.0)
+        patch.setattr(simulation, "_SIZING", 10.0)
         context = Kept()
         return {item.id: simulation.runs_table(context, item) for item in simulation.ITEMS}  # type: ignore[arg-type]
 
@@ -91,17 +92,7 @@ def test_a_drifted_rig_differs_in_friction_bulk_modulus_and_noise_alone() -> Non
 
 
 def full_table(sheet: DataSheet, item: str) -> ThesisTable:
-    rows = [
-        simulation.SimulatedTest(
-            condition,
-            {c: {q: (sheet.rms[c][q][k, 0], sheet.rms[c][q][k, 1]) for q in QUANTITIES} for c in CHAMBERS},
-            condition.mean_leak_lpm,
-            (0.1, 0.1),
-            True,
-        )
-        for k, condition in enumerate(APPENDIX_C)
-    ]
-    return simulation.table_of(rows, item, "made")
+    return table_with(sheet, item, lambda condition: 0.1)
 
 
 @pytest.mark.parametrize("given", [True, False], ids=["with sheet", "without sheet"])

@@ -30,7 +30,7 @@ from sealscope.thesis.engine.products import Figure
 from sealscope.thesis.sheet import APPENDIX_C
 from sealscope.units import PSI
 
-from .conftest import Kept
+from .conftest import Kept, numbers
 
 THESIS = sorted((Path(__file__).resolve().parents[3] / "shared" / "thesis").glob("0*.txt"))
 
@@ -54,10 +54,6 @@ def item(number: int) -> Item:
 def drawn(context: Direct, number: int) -> Figure:
     (made,) = figure(context, item(number))
     return made
-
-
-def numbers(made: Figure) -> dict[str, float]:
-    return {one.name: float(one.value) for one in made.numbers}
 
 
 def test_every_number_once_and_in_order() -> None:

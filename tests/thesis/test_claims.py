@@ -8,16 +8,15 @@ from dataclasses import replace
 import pytest
 
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.thesis.chapters.appendix_c_runs import SimulatedTest, table_of
 from sealscope.thesis.chapters.chapter5 import TESTS, ShownMeasures
 from sealscope.thesis.claims import detection as claims
 from sealscope.thesis.claims import rig as claims_rig
 from sealscope.thesis.claims import sheet as claims_sheet
 from sealscope.thesis.claims.evidence import NO_SHEET, ClaimEvidence, correlated
 from sealscope.thesis.engine.products import Claim, Product
-from sealscope.thesis.sheet import APPENDIX_C, QUANTITIES, DataSheet
+from sealscope.thesis.sheet import QUANTITIES, DataSheet
 
-from .conftest import Kept, made_sheet, needs_sheet
+from .conftest import Kept, made_sheet, needs_sheet, table_with
 
 #: Log changes of a rig on which everything the thesis says of its columns is true.
 AS_SAID = {("p_A", "d3"): -0.3, ("p_A", "d4"): -0.3, ("p_A", "d3d4"): -0.6}
@@ -38,21 +37,12 @@ def one_shown(section: str, step_s: float | None = None) -> ShownMeasures:
 
 def evidence(measured: DataSheet | None, leak: DataSheet | None = None) -> ClaimEvidence:
     leak = leak or made(11, AS_SAID)
-    rows = [
-        SimulatedTest(
-            row,
-            {c: {q: (leak.rms[c][q][k, 0], leak.rms[c][q][k, 1]) for q in QUANTITIES} for c in CHAMBERS},
-            row.mean_leak_lpm,
-            (0.12 * (1 + row.closed_pct / 1000 * float(row.command[0])),) * 2,
-        )
-        for k, row in enumerate(APPENDIX_C)
-    ]
     return ClaimEvidence(
         measured,
         leak,
         made(12),
         made(13),
-        table_of(rows, "appendix-c-leak", "made"),
+        table_with(leak, "appendix-c-leak", lambda row: 0.12 * (1 + row.closed_pct / 1000 * float(row.command[0]))),
         {section: one_shown(section) for section in TESTS},
         one_shown("5.2a"),
     )

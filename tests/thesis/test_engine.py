@@ -230,7 +230,7 @@ def test_equal_runs_are_simulated_once_and_kept_exactly(
 
 
 def test_a_run_survives_the_file(tmp_path: Path) -> None:
-    run = simulated_run(RunSpec("3 sin(4t)", 2.0).experiment(), prove=False)
+    run = simulated_run(RunSpec("3 sin(4t)", 2.0))
     kept = ResultsFolder(tmp_path)
     kept.run("key", lambda: run)
     again = kept.run("key", lambda: pytest.fail("simulated again"))

@@ -79,14 +79,20 @@ def test_a_sensor_that_reads_less_lowers_its_own_chamber_only() -> None:
     assert without[1] == pytest.approx(0.5 * without[0], rel=1e-6)
 
 
+@pytest.fixture(scope="module")
+def residuals(measured_sheet: DataSheet) -> np.ndarray:
+    return log_residuals(load_rig(BENCH_RIG), measured_sheet)
+
+
 @needs_sheet
-def test_the_identified_rig_meets_the_leak_free_columns_within_a_quarter(measured_sheet: DataSheet) -> None:
+def test_the_identified_rig_meets_the_leak_free_columns_within_a_quarter(
+    measured_sheet: DataSheet, residuals: np.ndarray
+) -> None:
     """Geometric mean of simulated/measured for each of d1..d4 in both chambers within 25 %."""
-    sheet = measured_sheet
-    ratio = np.exp(log_residuals(load_rig(BENCH_RIG), sheet).mean(axis=0))
+    ratio = np.exp(residuals.mean(axis=0))
     assert ratio.shape == (2, 5)
     assert np.all(np.abs(ratio[:, :4] - 1.0) <= 0.25), ratio
-    printed = np.exp(log_residuals(load_rig("thesis"), sheet).mean(axis=0))
+    printed = np.exp(log_residuals(load_rig("thesis"), measured_sheet).mean(axis=0))
     assert np.any(np.abs(printed[:, :4] - 1.0) > 0.25), "the rig as printed does not fit, so the check can fail"
 
 
@@ -105,13 +111,12 @@ def test_the_sign_of_d3_on_p_A_is_predicted_from_leak_free_data(measured_sheet: 
 
 
 @needs_sheet
-def test_only_the_leak_free_columns_are_read(measured_sheet: DataSheet) -> None:
+def test_only_the_leak_free_columns_are_read(measured_sheet: DataSheet, residuals: np.ndarray) -> None:
     sheet = measured_sheet
     blind = DataSheet(
         {c: {q: np.stack([v[:, 0], np.full(41, np.nan)], axis=1) for q, v in of.items()} for c, of in sheet.rms.items()}
     )
-    rig = load_rig(BENCH_RIG)
-    assert np.array_equal(log_residuals(rig, sheet), log_residuals(rig, blind))
+    assert np.array_equal(residuals, log_residuals(load_rig(BENCH_RIG), blind))
 
 
 def test_the_table_of_parameters_shows_every_fitted_value_with_its_interval() -> None:

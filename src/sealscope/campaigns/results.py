@@ -12,7 +12,7 @@ from sealscope.campaigns.execution import store
 from sealscope.campaigns.held_out.checks import HeldOutCheck, checks_of
 from sealscope.campaigns.held_out.classifiers import MeasuredSamples, held_out_rows
 from sealscope.campaigns.judging.judge import Judgement, judge
-from sealscope.campaigns.judging.tables import PriorKnowledge, ResultTable, rows_table, tables_of, write_tables
+from sealscope.campaigns.judging.tables import PriorKnowledge, TableRow, records_table, tables_of, write_tables
 from sealscope.campaigns.plans.detectors import ALL_CHANNELS, plan_detector
 from sealscope.campaigns.plans.model import AnyPlan, HeldOutPlan, RecordedPlan, SimulatedPlan
 from sealscope.errors import InputError
@@ -97,31 +97,23 @@ def detectors_of(plan: AnyPlan) -> list[str]:
     return [detector if isinstance(detector, str) else detector.name for detector in plan.detectors]
 
 
-def _check_table(checks: Sequence[HeldOutCheck]) -> ResultTable:
-    """Return the checks as a table, one line a classifier."""
-    columns = (
-        "detector", "AUC, tests held out", "tests: low", "tests: high", "AUC, conditions held out", "conditions: low",
-        "conditions: high", "AUC that 5 % of swapped labels reach", "swaps that reach the true labels' AUC", "swaps",
-        "chosen",
-    )  # fmt: skip
-    rows = tuple(
-        (
-            check.detector, *check.tests, *check.conditions, check.chance, check.reached if check.swaps else None,
-            check.swaps or None, "; ".join(f"{features}: {times}" for features, times in check.picks),
-        )
-        for check in checks
-    )  # fmt: skip
-    return ResultTable("held_out", columns, rows)
+def _check_row(check: HeldOutCheck) -> TableRow:
+    return {
+        "detector": check.detector,
+        **dict(zip(("AUC, tests held out", "tests: low", "tests: high"), check.tests, strict=True)),
+        **dict(zip(("AUC, conditions held out", "conditions: low", "conditions: high"), check.conditions, strict=True)),
+        "AUC that 5 % of swapped labels reach": check.chance,
+        "swaps that reach the true labels' AUC": check.reached if check.swaps else None,
+        "swaps": check.swaps or None,
+        "chosen": "; ".join(f"{features}: {times}" for features, times in check.picks),
+    }
 
 
 def write_result(result: CampaignResult, folder: Path) -> list[Path]:
     """Write the tables into the folder; return the files."""
     make_folder(folder)
     unit = result.plan.unit
-    part = result.plan.part if isinstance(result.plan, SimulatedPlan) else ""
-    tables = [
-        *tables_of(result.judgement, unit, result.known, part),
-        rows_table(result.rows, detectors_of(result.plan), unit),
-        _check_table(result.checks),
-    ]
+    tables = tables_of(result.judgement, unit, result.known, getattr(result.plan, "part", ""))
+    tables["records"] = records_table(result.rows, detectors_of(result.plan), unit)
+    tables["held_out"] = [_check_row(check) for check in result.checks]
     return write_tables(folder, tables)

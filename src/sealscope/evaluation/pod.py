@@ -7,7 +7,6 @@ MIL-HDBK-1823A fits hit/miss data.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -18,7 +17,7 @@ from sealscope.errors import InputError
 from sealscope.evaluation.binomial import Proportion, lower_bound, proportion
 from sealscope.evaluation.checks import Array, flags, share, sizes
 
-Estimator = Literal["maximum likelihood", "firth"]
+#: Spans of the tested sizes' logarithms beyond which a bound counts as infinite.
 _FARTHEST = 1e4
 
 
@@ -38,7 +37,6 @@ def by_size(leaks: npt.ArrayLike, hits: npt.ArrayLike, confidence: float = 0.95)
     """
     leak = sizes(leaks)
     hit = flags(hits, leak.size, "hits")
-    share(confidence, "confidence")
     rows = []
     for size in np.unique(leak):
         here = hit[leak == size]
@@ -73,11 +71,8 @@ def _information(design: Array, n: Array, eta: Array) -> Array:
     return np.asarray(design.T @ (design * weight[:, None]), dtype=np.float64)
 
 
-def _objective(design: Array, n: Array, k: Array, eta: Array, firth: bool) -> float:
-    """Return the log-likelihood ``sum of k eta - n ln(1 + exp eta)``, Firth's with the penalty.
-
-    The penalty is half the log determinant of the information.
-    """
+def _log_likelihood(design: Array, n: Array, k: Array, eta: Array, firth: bool) -> float:
+    """Return ``sum of k eta - n ln(1 + exp eta)``; Firth's penalty adds half the log determinant of the information."""
     value = float(np.sum(k * eta - n * np.logaddexp(0.0, eta)))
     if not firth:
         return value
@@ -85,41 +80,26 @@ def _objective(design: Array, n: Array, k: Array, eta: Array, firth: bool) -> fl
     return value + 0.5 * float(log_determinant) if sign > 0 else -math.inf
 
 
-def _newton(design: Array, n: Array, k: Array, firth: bool) -> tuple[Array, float]:
-    """Return coefficients and objective at the maximum, by Fisher scoring with step halving."""
+def _fitted(design: Array, n: Array, k: Array, firth: bool) -> Array:
+    """Return the coefficients at the maximum of the log-likelihood."""
+    from scipy.optimize import minimize
     from scipy.special import expit
 
-    beta = np.zeros(design.shape[1])
-    beta[0] = _log_odds((k.sum() + 0.5) / (n.sum() + 1.0))
-    value = _objective(design, n, k, design @ beta, firth)
-    for _ in range(200):
+    def loss(beta: Array) -> tuple[float, Array]:
         eta = design @ beta
         p = expit(eta)
-        inverse = np.linalg.inv(_information(design, n, eta))
         residual = k - n * p
         if firth:  # leverage of each size times (1/2 - p): Firth (1993), Heinze and Schemper (2002)
-            leverage = n * p * (1.0 - p) * np.einsum("ij,jk,ik->i", design, inverse, design)
-            residual = residual + leverage * (0.5 - p)
-        step = inverse @ (design.T @ residual)
-        length = min(1.0, 5.0 / max(1e-300, float(np.abs(step).max())))
-        while length > 1e-12:
-            trial = _objective(design, n, k, design @ (beta + length * step), firth)
-            if trial >= value - 1e-13 * abs(value):
-                break
-            length *= 0.5
-        beta = beta + length * step
-        done = float(np.abs(length * step).max()) < 1e-10
-        value = _objective(design, n, k, design @ beta, firth)
-        if done:
-            break
-    return beta, value
+            inverse = np.linalg.pinv(_information(design, n, eta))
+            residual += n * p * (1.0 - p) * np.einsum("ij,jk,ik->i", design, inverse, design) * (0.5 - p)
+        return -_log_likelihood(design, n, k, eta, firth), -design.T @ residual
+
+    start = np.array([_log_odds((k.sum() + 0.5) / (n.sum() + 1.0)), 0.0])
+    return np.asarray(minimize(loss, start, jac=True, method="BFGS", options={"gtol": 1e-9}).x, dtype=np.float64)
 
 
-def is_separated(n: Array, k: Array) -> bool:
-    """Return whether misses and hits of rising sizes (n tested, k hits at each) overlap in one size at most.
-
-    Then the likelihood has no maximum at a finite slope.
-    """
+def _is_separated(n: Array, k: Array) -> bool:
+    """Return whether misses and hits of rising sizes overlap in one size at most: no maximum at a finite slope."""
     hits = k / n
     mixed = np.count_nonzero((hits > 0.0) & (hits < 1.0))
     steps = np.diff(hits)
@@ -130,16 +110,15 @@ def is_separated(n: Array, k: Array) -> bool:
 class HitMiss:
     """``ln(POD/(1 - POD)) = intercept + slope ln(size)``.
 
-    `covariance` (2, 2) of both; `estimator`: Firth's penalised likelihood where hits and misses are `separated`, else
-    maximum likelihood; `log_likelihood` of the fit and `null` without the size (both with the penalty where there is
-    one); `size`, `tested`, `hits` (m,): the data by size.
+    `covariance` (2, 2) of both; `estimator`: Firth's penalised likelihood where hits and misses are separated by size,
+    else maximum likelihood; `log_likelihood` of the fit and `null` without the size (both with the penalty where there
+    is one); `size`, `tested`, `hits` (m,): the data by size.
     """
 
     intercept: float
     slope: float
     covariance: Array
-    estimator: Estimator
-    separated: bool
+    estimator: Literal["maximum likelihood", "firth"]
     log_likelihood: float
     null: float
     size: Array
@@ -150,19 +129,14 @@ class HitMiss:
         """Return the probability of detection at each size."""
         from scipy.special import expit
 
-        x = _log_sizes(size)
-        return np.asarray(expit(self.intercept + self.slope * x), dtype=np.float64)
+        return np.asarray(expit(self.intercept + self.slope * _log_sizes(size)), dtype=np.float64)
 
     def detection_band(self, size: npt.ArrayLike, confidence: float = 0.95) -> tuple[Array, Array]:
-        """Return the two-sided pointwise Wald interval of the probability of detection at each size.
-
-        It is made on the log odds.
-        """
+        """Return the two-sided pointwise Wald interval, on the log odds, of the detection at each size."""
         from scipy.special import expit, ndtri
 
+        x, v = _log_sizes(size), self.covariance
         z = float(ndtri(0.5 + share(confidence, "confidence") / 2.0))
-        x = _log_sizes(size)
-        v = self.covariance
         half = z * np.sqrt(v[0, 0] + 2.0 * v[0, 1] * x + v[1, 1] * x * x)
         eta = self.intercept + self.slope * x
         return np.asarray(expit(eta - half), dtype=np.float64), np.asarray(expit(eta + half), dtype=np.float64)
@@ -173,9 +147,7 @@ class HitMiss:
         Infinite where detection does not rise with the size.
         """
         share(detection, "the probability of detection")
-        if not self.slope > 0.0:
-            return math.inf
-        return _size((_log_odds(detection) - self.intercept) / self.slope)
+        return _size((_log_odds(detection) - self.intercept) / self.slope) if self.slope > 0.0 else math.inf
 
     def size_bound(self, detection: float = 0.9, confidence: float = 0.95) -> float:
         """Return the one-sided upper confidence bound of `size_at(detection)`, by default a90/95.
@@ -185,14 +157,28 @@ class HitMiss:
         Technometrics 25 (1983) 77-86, doi 10.1080/00401706.1983.10487822, gives the simultaneous counterparts, which
         are wider.
         """
+        from scipy.optimize import brentq
         from scipy.special import ndtri
 
         share(detection, "the probability of detection")
         if not 0.5 <= confidence < 1.0:
             raise InputError(f"confidence must be from 0.5 to 1, got {confidence}")
-        if not self.slope > 0.0:
+        odds, drop = _log_odds(detection), 0.5 * float(ndtri(confidence)) ** 2
+        if not self.slope > 0.0 or self.log_likelihood - self.null <= drop:
             return math.inf
-        return _size(self._profile_bound(_log_odds(detection), 0.5 * float(ndtri(confidence)) ** 2))
+
+        def beyond(at: float) -> float:
+            return self.log_likelihood - self._profile(odds, at) - drop
+
+        span = float(np.ptp(_log_sizes(self.size)))
+        near, step = (odds - self.intercept) / self.slope, span / 8.0
+        far = near + step
+        while beyond(far) < 0.0:
+            near, step = far, 2.0 * step
+            far += step
+            if step > _FARTHEST * span:
+                return math.inf
+        return _size(float(brentq(beyond, near, far, xtol=1e-10 * max(1.0, abs(far)))))
 
     @property
     def a50(self) -> float:
@@ -209,43 +195,20 @@ class HitMiss:
         """The size found nine times in ten, with 95 % confidence (likelihood ratio)."""
         return self.size_bound()
 
-    def _profile(self) -> Callable[[float, float], float]:
-        """Return the log-likelihood at log odds `odds` in the point x, maximised over the slope."""
+    def _profile(self, odds: float, at: float) -> float:
+        """Return the log-likelihood of lines with these log odds at the log size `at`, maximised over the slope."""
         from scipy.optimize import minimize_scalar
 
         x = _log_sizes(self.size)
-        design, n, k = np.column_stack([np.ones(x.size), x]), self.tested, self.hits
-        firth = self.estimator == "firth"
+        design = np.column_stack([np.ones(x.size), x])
 
-        def profile(odds: float, at: float) -> float:
-            def loss(slope: float) -> float:
-                value = _objective(design, n, k, odds + slope * (x - at), firth)
-                return -value if math.isfinite(value) else 1e300
+        def loss(slope: float) -> float:
+            eta = odds + slope * (x - at)
+            value = _log_likelihood(design, self.tested, self.hits, eta, self.estimator == "firth")
+            return -value if math.isfinite(value) else 1e300
 
-            width = max(float(np.abs(x - at).max()), 1e-300)
-            return -float(minimize_scalar(loss, bracket=(0.0, 1.0 / width), options={"xtol": 1e-9}).fun)
-
-        return profile
-
-    def _profile_bound(self, odds: float, drop: float) -> float:
-        from scipy.optimize import brentq
-
-        if self.log_likelihood - self.null <= drop:
-            return math.inf
-        profile = self._profile()
-        x = _log_sizes(self.size)
-        best, step = (odds - self.intercept) / self.slope, float(np.ptp(x)) / 8.0
-
-        def short(at: float) -> float:
-            return self.log_likelihood - profile(odds, at) - drop
-
-        near, far = best, best + step
-        while short(far) < 0.0:
-            near, step = far, 2.0 * step
-            far += step
-            if step > _FARTHEST * float(np.ptp(x)):
-                return math.inf
-        return float(brentq(short, near, far, xtol=1e-10 * max(1.0, abs(far))))
+        width = max(float(np.abs(x - at).max()), 1e-300)
+        return -float(minimize_scalar(loss, bracket=(0.0, 1.0 / width), options={"xtol": 1e-9}).fun)
 
 
 def _log_sizes(values: npt.ArrayLike) -> Array:
@@ -274,38 +237,26 @@ def fit_hit_miss(leaks: npt.ArrayLike, hits: npt.ArrayLike) -> HitMiss:
     values, where = np.unique(x, return_inverse=True)
     if values.size < 2:
         raise InputError(f"a curve needs leaks of at least 2 sizes, got {hit.size} of one size")
-    n = np.bincount(where).astype(np.float64)
-    k = np.asarray(np.bincount(where, weights=hit.astype(np.float64)), dtype=np.float64)
-    separated = is_separated(n, k)
+    n, k = (np.asarray(np.bincount(where, of), dtype=np.float64) for of in (None, hit.astype(np.float64)))
+    firth = _is_separated(n, k)
     # centred and scaled while fitting, so that the size's unit does not matter
     centre, spread = float(values.mean()), float(np.ptp(values)) / 2.0
     design = np.column_stack([np.ones(values.size), (values - centre) / spread])
-    beta, _ = _newton(design, n, k, separated)
+    beta = _fitted(design, n, k, firth)
     back = np.array([[1.0, -centre / spread], [0.0, 1.0 / spread]])
     covariance = back @ np.linalg.inv(_information(design, n, design @ beta)) @ back.T
     intercept, slope = (float(b) for b in back @ beta)
     plain = np.column_stack([np.ones(values.size), values])
-    null = _null(plain, n, k, separated)
+    more = 1.0 if firth else 0.0  # with slope 0 Firth's penalty is ln(p(1 - p)) and a constant: a hit and a miss more
+    level = np.full(n.size, _log_odds((k.sum() + more) / (n.sum() + 2.0 * more)))
     return HitMiss(
         intercept=intercept,
         slope=slope,
         covariance=np.asarray(covariance, dtype=np.float64),
-        estimator="firth" if separated else "maximum likelihood",
-        separated=separated,
-        log_likelihood=_objective(plain, n, k, intercept + slope * values, separated),
-        null=null,
+        estimator="firth" if firth else "maximum likelihood",
+        log_likelihood=_log_likelihood(plain, n, k, intercept + slope * values, firth),
+        null=_log_likelihood(plain, n, k, level, firth),
         size=np.exp(values),
         tested=n,
         hits=k,
     )
-
-
-def _null(design: Array, n: Array, k: Array, firth: bool) -> float:
-    """Return the objective's maximum with slope 0.
-
-    Firth's penalty there is ln(p(1 - p)) and a constant, as one more hit and one more miss would add: ``p = (k + 1)/(n
-    + 2)``.
-    """
-    more = 1.0 if firth else 0.0
-    eta = _log_odds((k.sum() + more) / (n.sum() + 2.0 * more))
-    return _objective(design, n, k, np.full(n.size, eta), firth)

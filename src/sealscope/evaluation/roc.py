@@ -79,18 +79,12 @@ def roc_curve(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float 
     return Roc(thresholds, false_alarm, detection, low, high)
 
 
-def _placements(leak_free: Array, leaky: Array) -> tuple[Array, Array]:
+def placements(leak_free: Array, leaky: Array) -> tuple[Array, Array]:
     """Return the share of the other kind's scores on the right side of each score, ties half: (n,), (m,)."""
     a, b = np.sort(leak_free), np.sort(leaky)
     below = (np.searchsorted(a, leaky, "left") + np.searchsorted(a, leaky, "right")) / (2.0 * a.size)
     above = 1.0 - (np.searchsorted(b, leak_free, "left") + np.searchsorted(b, leak_free, "right")) / (2.0 * b.size)
     return np.asarray(above, dtype=np.float64), np.asarray(below, dtype=np.float64)
-
-
-def _variance(placements: Array) -> float:
-    """Return the part (1, n) placements of one kind have in the variance of the area."""
-    centred, n = placements - placements.mean(axis=1, keepdims=True), placements.shape[1]
-    return float((centred @ centred.T / (n - 1) / n)[0, 0])
 
 
 def _newcombe(value: float, leak_free: int, leaky: int, z: float) -> tuple[float, float]:
@@ -99,20 +93,17 @@ def _newcombe(value: float, leak_free: int, leaky: int, z: float) -> tuple[float
     SE as Hanley and McNeil's with both numbers at their mean. Source: Newcombe, Stat. Med. 25 (2006) 559-573, doi
     10.1002/sim.2324, method 5.
     """
+    from scipy.optimize import brentq
+
     middle = (leak_free + leaky) / 2.0
 
-    def outside(t: float) -> bool:
+    def excess(t: float) -> float:
         q = (1.0 - t) / (2.0 - t) + t / (1.0 + t)
-        return (t - value) ** 2 > z * z * t * (1.0 - t) * (1.0 + (middle - 1.0) * q) / (leak_free * leaky)
+        return (t - value) ** 2 - z * z * t * (1.0 - t) * (1.0 + (middle - 1.0) * q) / (leak_free * leaky)
 
-    limits = []
-    for end in (0.0, 1.0):
-        inner, outer = value, end
-        for _ in range(60):
-            half = 0.5 * (inner + outer)
-            inner, outer = (inner, half) if outside(half) else (half, outer)
-        limits.append(inner)
-    return limits[0], limits[1]
+    low = brentq(excess, 0.0, value * (1.0 - 1e-9)) if value > 0.0 else 0.0
+    high = brentq(excess, value + (1.0 - value) * 1e-9, 1.0) if value < 1.0 else 1.0
+    return float(low), float(high)
 
 
 def auc(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float = 0.95) -> Area:
@@ -130,9 +121,9 @@ def auc(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float = 0.95
     n = min(a.size, b.size)
     if n < 2:
         raise InputError(f"an interval of the area needs at least 2 records of each kind, got {n}")
-    placements = _placements(a, b)
-    value = float(placements[1].mean())
-    error = math.sqrt(sum(_variance(side[None]) for side in placements))
+    sides = placements(a, b)
+    value = float(sides[1].mean())
+    error = math.sqrt(sum(side.var(ddof=1) / side.size for side in sides))
     if error < 1e-12:
         return Area(value, error, *_newcombe(value, a.size, b.size, z), "newcombe")
     return Area(value, error, max(0.0, value - z * error), min(1.0, value + z * error), "delong")

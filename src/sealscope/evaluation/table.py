@@ -1,33 +1,21 @@
-"""The summary of detectors by size of leak, beside one that always fires and one that never does."""
+"""The summary of detectors by size of leak, beside two that do not look; and which fault is named for which."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Iterable
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
 
 from sealscope.errors import InputError
 from sealscope.evaluation.binomial import IntervalEstimate, Proportion, proportion
 from sealscope.evaluation.checks import share
-from sealscope.evaluation.confusion import CANNOT_TELL
 
 ALWAYS, NEVER = "always fire", "never fire"
-_VERDICTS = ("leak", "no leak", CANNOT_TELL)
-
-
-@dataclass(frozen=True)
-class JudgedRecord:
-    """The verdict of one detector on one record, beside the truth.
-
-    `case`: the record, the same name for each detector; `leak_lpm`: the true size, 0 without a leak, in L/min or any
-    other unit; `hours`: operating time of the record, None where it is not known.
-    """
-
-    detector: str
-    case: Hashable
-    leak_lpm: float
-    verdict: str
-    hours: float | None = None
+#: The verdict that names no fault; it always has a column of its own, the last.
+CANNOT_TELL = "cannot tell"
 
 
 @dataclass(frozen=True)
@@ -72,84 +60,79 @@ def events_per_hour(count: int, hours: float, confidence: float = 0.95) -> Inter
     return IntervalEstimate(int(count), count / hours, low / hours, high / hours)
 
 
-def _checked(records: Iterable[JudgedRecord]) -> list[JudgedRecord]:
-    """Return the records; a case has the same truth for each detector, and is judged once by each."""
-    checked: list[JudgedRecord] = []
-    truth: dict[Hashable, float] = {}
-    judged: set[tuple[str, Hashable]] = set()
-    for record in records:
-        case, size = record.case, record.leak_lpm
-        if record.verdict not in _VERDICTS:
-            raise InputError(f"the verdict must be one of {', '.join(_VERDICTS)}, got {record.verdict!r} ({case})")
-        if not (math.isfinite(size) and size >= 0.0):
-            raise InputError(f"the size of the leak must be >= 0, got {size} ({case})")
-        if record.detector in (ALWAYS, NEVER):
-            raise InputError(f"the rows {ALWAYS!r} and {NEVER!r} are added by the summary itself")
-        if truth.setdefault(case, size) != size:
-            raise InputError(f"a case must have one true size, got {truth[case]} and {size} ({case})")
-        if (record.detector, case) in judged:
-            raise InputError(f"a case must be judged once by each detector, got two rows ({record.detector}, {case})")
-        judged.add((record.detector, case))
-        checked.append(record)
-    if not checked:
-        raise InputError("a summary needs at least one row")
-    return checked
-
-
-def _references(records: list[JudgedRecord]) -> list[JudgedRecord]:
-    """Return the verdicts of the two detectors that do not look, on every case that any detector judged."""
-    cases = {record.case: record for record in records}
-    return [
-        JudgedRecord(name, case, record.leak_lpm, verdict, record.hours)
-        for name, verdict in ((ALWAYS, "leak"), (NEVER, "no leak"))
-        for case, record in cases.items()
-    ]
-
-
-def _false_alarms(
-    leak_free: list[JudgedRecord], confidence: float
-) -> tuple[Proportion | None, IntervalEstimate | None]:
-    if not leak_free:
-        return None, None
-    count = sum(record.verdict == "leak" for record in leak_free)
-    hours = [record.hours for record in leak_free if record.hours is not None]
-    hourly = events_per_hour(count, math.fsum(hours), confidence) if len(hours) == len(leak_free) else None
-    return proportion(count, len(leak_free), confidence), hourly
-
-
-def summary(records: Iterable[JudgedRecord], confidence: float = 0.95) -> list[SummaryRow]:
+def summary(
+    sizes: Sequence[float],
+    verdicts: Mapping[str, Sequence[str]],
+    confidence: float = 0.95,
+    hours: float | None = None,
+) -> list[SummaryRow]:
     """Return one row for each detector and size of leak, sizes rising, `always fire` and `never fire` last.
 
-    A detector without a record with a leak has one row of size 0, with no detection. Intervals as in `proportion` and
-    `events_per_hour`. Raises InputError for an unknown verdict, a size < 0, a case with two truths or one judged
-    twice.
+    `sizes` (n,): of the leak in each record, 0 without one; `verdicts`: detector -> (n,); `hours`: operating time of a
+    record. A detector without a record with a leak has one row of size 0, with no detection. Intervals as in
+    `proportion` and `events_per_hour`.
     """
-    checked = _checked(records)
-    rows: list[SummaryRow] = []
-    by_detector: dict[str, list[JudgedRecord]] = {}
-    for record in [*checked, *_references(checked)]:
-        by_detector.setdefault(record.detector, []).append(record)
-    for detector, own in by_detector.items():
-        false_alarm, hourly = _false_alarms([record for record in own if record.leak_lpm == 0.0], confidence)
-        by_size: dict[float, list[JudgedRecord]] = {}
-        for record in own:
-            if record.leak_lpm > 0.0:
-                by_size.setdefault(record.leak_lpm, []).append(record)
-        for size in sorted(by_size) or [0.0]:
-            here = by_size.get(size, [])
-            detection = proportion(sum(record.verdict == "leak" for record in here), len(here), confidence)
-            counted = here or own
-            unsure = sum(record.verdict == CANNOT_TELL for record in counted)
+    size, rows = np.asarray(sizes, dtype=np.float64), []
+    references = {ALWAYS: ["leak"] * size.size, NEVER: ["no leak"] * size.size}
+    for detector, given in {**verdicts, **references}.items():
+        alarm, unsure = np.array(given) == "leak", np.array(given) == CANNOT_TELL
+        free, false_alarm, hourly = size == 0.0, None, None
+        if free.any():
+            false_alarm = proportion(alarm[free].sum(), free.sum(), confidence)
+            hourly = events_per_hour(false_alarm.count, hours * false_alarm.n, confidence) if hours else None
+        for own in np.unique(size[~free]) if not free.all() else (0.0,):
+            here = size == own
+            leaky = here & ~free
+            detection = proportion(alarm[leaky].sum(), leaky.sum(), confidence)
             rows.append(
                 SummaryRow(
                     detector=detector,
-                    leak_lpm=size,
-                    n=len(counted),
+                    leak_lpm=float(own),
+                    n=int(here.sum()),
                     detection=detection,
-                    cannot_tell=proportion(unsure, len(counted), confidence),
+                    cannot_tell=proportion(unsure[here].sum(), here.sum(), confidence),
                     false_alarm=false_alarm,
                     per_hour=hourly,
                     informedness=detection.value - false_alarm.value if false_alarm else math.nan,
                 )
             )
     return rows
+
+
+@dataclass(frozen=True)
+class Confusion:
+    """`counts[i, j]`: records with fault `rows[i]` that were called `columns[j]`; the last column is `cannot tell`.
+
+    `shares[i][j]`: that count over all records of the row, with its interval; `accuracy`: right verdicts over all
+    records, `cannot tell` not among the right ones.
+    """
+
+    rows: tuple[str, ...]
+    columns: tuple[str, ...]
+    counts: npt.NDArray[np.int_]
+    shares: tuple[tuple[Proportion, ...], ...]
+    accuracy: Proportion
+
+
+def confusion_matrix(
+    truth: Sequence[str], verdicts: Sequence[str], faults: Sequence[str], confidence: float = 0.95
+) -> Confusion:
+    """Count verdicts by true fault, with Clopper-Pearson's intervals for each row.
+
+    `truth`, `verdicts`: as many names (`none` is a name like any other; `cannot tell` is no truth); `faults`: order of
+    rows and columns, and all names that may occur. Raises InputError for a name outside `faults`.
+    """
+    if len(truth) != len(verdicts) or not truth:
+        raise InputError(f"verdicts must be as many as the true faults, got {len(verdicts)} for {len(truth)}")
+    if CANNOT_TELL in truth or CANNOT_TELL in faults:
+        raise InputError(f"{CANNOT_TELL!r} is a verdict and no fault")
+    rows = tuple(dict.fromkeys(faults))
+    columns = (*rows, CANNOT_TELL)
+    strange = [name for name in truth if name not in rows] + [name for name in verdicts if name not in columns]
+    if strange:
+        raise InputError(f"a fault must be one of {', '.join(rows)}, got {strange[0]!r}")
+    counts = np.zeros((len(rows), len(columns)), dtype=np.int_)
+    for true, verdict in zip(truth, verdicts, strict=True):
+        counts[rows.index(true), columns.index(verdict)] += 1
+    shares = tuple(tuple(proportion(int(k), int(line.sum()), confidence) for k in line) for line in counts)
+    return Confusion(rows, columns, counts, shares, proportion(int(np.trace(counts)), len(truth), confidence))

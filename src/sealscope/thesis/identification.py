@@ -23,6 +23,7 @@ from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, ThesisTable
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, QUANTITIES, Condition, DataSheet, experiment_values, groups
+from sealscope.thesis.texts import note
 from sealscope.units import PSI
 
 if TYPE_CHECKING:
@@ -81,9 +82,9 @@ def log_rms(squares: Array, sigma: float) -> Array:
 
 def noise_of(rig: Rig, chamber: str) -> float:
     """Return the deviation of a sample [psi] in a chamber's channel by own noise, common noise and conversion."""
-    sensor, daq = getattr(rig.sensors, chamber), rig.daq
-    step = daq.step / (daq.sensor_volts_hi - daq.sensor_volts_lo) * (sensor.range_hi - sensor.range_lo)
-    return float(np.sqrt(sensor.noise**2 + rig.sensors.common_noise**2 + step**2 / 12.0)) / PSI
+    from sealscope.campaigns.cases.bound import noise_covariance
+
+    return float(np.sqrt(noise_covariance(rig, [chamber])[0, 0])) / PSI
 
 
 def log_residuals(rig: Rig, sheet: DataSheet) -> Array:
@@ -178,9 +179,8 @@ def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     for chamber, name, of in columns:
         mean, scatter = float(np.exp(of.mean())), float(np.exp(of.std(ddof=1)))
         rows.append((chamber, name, mean, "yes" if abs(mean - 1.0) <= 0.25 else "no", scatter))
-    notes = "Only these columns were fitted. Noise is added by its mean square; nothing is drawn."
     heads = (*heads, "scatter between tests [factor]")
-    summary = ThesisTable(item.id, item.title, heads, tuple(rows), notes=notes)
+    summary = ThesisTable(item.id, item.title, heads, tuple(rows), notes=note("fit"))
     heads, rows = ("input", "closed [%]", "tests", *(f"{c} {q} simulated / measured" for c, q, _ in columns)), []
     for group in groups():
         own = np.array([condition.group == group for condition in APPENDIX_C])
@@ -211,8 +211,7 @@ def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
         changes = [100 * (float(np.exp(np.mean(predicted.log_change(c, q)))) - 1.0) for c, q in changed]
         same = [int(np.sum(signs(predicted, c, q) == signs(sheet, c, q))) for c, q in shown]
         rows.append((hypothesis.name, *(float(np.exp(level)) for level in levels), *changes, *same))
-    notes = "Nothing here was fitted to the leak columns. Changes are geometric means over the 41 tests."
-    return (ThesisTable(item.id, item.title, tuple(heads), tuple(rows), notes=notes),)
+    return (ThesisTable(item.id, item.title, tuple(heads), tuple(rows), notes=note("hypotheses")),)
 
 
 _FIT = "How the calibrated rig fits the leak-free columns of Appendix C"

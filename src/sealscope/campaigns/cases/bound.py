@@ -38,8 +38,6 @@ UNKNOWN = (
     "fluid.K_oil",
     "motor.omega_per_volt",
 )
-#: The gain behind a servo valve, in place of the speed loop's.
-_VALVE_GAIN = "valve.Q_N"
 #: Length [s] of the run whose bound stands for a record's: four periods of the slowest of the bench's commands.
 BOUND_SECONDS = 25.2
 #: Reciprocal condition of the scaled information below which a parameter cannot be told from the others.
@@ -50,13 +48,12 @@ _SINGULAR = 1e-12
 class LeakBound:
     """Standard deviation of the best unbiased estimate of a small leak over one run, as conductance G [m^3/(s Pa)].
 
-    `known`: all else known; `unknown`: the parameters `unknown_parameters` estimated from the same run, None where
-    there are none; `duration` [s]; `nonlinearity`: of the worst derivative.
+    `known`: all else known; `unknown`: other parameters estimated from the same run, None where there are none;
+    `duration` [s]; `nonlinearity`: of the worst derivative.
     """
 
     known: float
     unknown: float | None
-    unknown_parameters: tuple[str, ...]
     duration: float
     nonlinearity: float
 
@@ -67,7 +64,7 @@ def unknown_of(rig: Rig) -> tuple[str, ...]:
     Behind a servo valve the rated flow of the edges stands for the speed loop's gain. Overlaps are taken as known: they
     do not change within a record.
     """
-    return (*UNKNOWN[:-1], _VALVE_GAIN) if rig.valve.spool == "present" else UNKNOWN
+    return (*UNKNOWN[:-1], "valve.Q_N") if rig.valve.spool == "present" else UNKNOWN
 
 
 def in_lpm(conductance: float, dp: float = REFERENCE_DP) -> float:
@@ -95,21 +92,14 @@ def noise_covariance(rig: Rig, channels: Sequence[str] = CHAMBERS) -> Array:
 def information(slopes: Array, covariance: Array) -> Array:
     """Return the Fisher information (k, k) from derivatives `slopes` (k, c, n) and the covariance (c, c) of one sample.
 
-    Raises InputError where shapes do not fit or the covariance is not positive definite.
+    Raises InputError where the covariance is not positive definite.
     """
-    slopes, covariance = np.asarray(slopes, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
-    if slopes.ndim != 3 or covariance.shape != (slopes.shape[1], slopes.shape[1]):
-        raise InputError(
-            f"slopes must be (parameters, channels, samples) and the covariance (channels, channels), got "
-            f"{slopes.shape} and {covariance.shape}"
-        )
     try:
         root = np.linalg.cholesky(covariance)
     except np.linalg.LinAlgError:
         raise InputError("the covariance of the noise must be positive definite, got one that is not") from None
-    white = np.linalg.solve(root, slopes)
-    flat = white.reshape(len(white), -1)
-    return np.asarray(flat @ flat.T)
+    white = np.linalg.solve(root, slopes).reshape(len(slopes), -1)
+    return np.asarray(white @ white.T)
 
 
 def cramer_rao(fisher: Array) -> Array:
@@ -117,7 +107,6 @@ def cramer_rao(fisher: Array) -> Array:
 
     Raises InputError where F is singular: some parameter cannot be told from the others.
     """
-    fisher = np.asarray(fisher, dtype=np.float64)
     size = np.sqrt(np.diag(fisher))
     if np.all(size > 0.0):
         scaled = fisher / np.outer(size, size)
@@ -152,7 +141,6 @@ def leak_bound(
     return LeakBound(
         known=1.0 / math.sqrt(fisher[0, 0]),
         unknown=math.sqrt(cramer_rao(fisher)[0, 0]) if unknown else None,
-        unknown_parameters=tuple(unknown),
         duration=experiment.duration,
         nonlinearity=max(sensitivity.nonlinearity for sensitivity in sensitivities),
     )

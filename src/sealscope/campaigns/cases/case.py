@@ -6,7 +6,7 @@ import hashlib
 import itertools
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -147,8 +147,13 @@ def sources() -> Iterator[Path]:
 
 def code_key() -> str:
     """Return a hash of the sources that a row depends on: rows of other sources must not stand in the same table."""
+    return files_digest(sources())[:16]
+
+
+def files_digest(paths: Iterable[Path]) -> str:
+    """Return a SHA-256 of files of the package, their names and contents."""
     key = hashlib.sha256()
-    for path in sources():
+    for path in paths:
         key.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0")
         key.update(path.read_bytes())
-    return key.hexdigest()[:16]
+    return key.hexdigest()

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, get_args
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any
 
 from sealscope.campaigns.cases.case import CampaignCase
 from sealscope.campaigns.plans.duty import COMMAND
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause, Evidence, Verdict
 from sealscope.errors import SealscopeError
-from sealscope.evaluation.confusion import CANNOT_TELL
+from sealscope.evaluation.table import CANNOT_TELL
+from sealscope.storage.plain_values import as_type
 
 PISTON_LEAK, NO_CAUSE = "piston leak", "none"
 #: The level that tells strokes in either direction, of recordings.
@@ -30,10 +31,30 @@ _CAUSES = (
 _EITHER = {"piston or pump leak": (PISTON_LEAK, "pump leak")}
 #: detector -> (score, None where it cannot tell; onset [s], None where it finds none)
 Scores = Mapping[str, tuple[float | None, float | None]]
-#: The figures of a detector's evidence that a row stores.
-STATED = (
-    "verdict", "score", "threshold", "onset_s", "onset_interval_s", "leak_lpm", "leak_interval_lpm", "cause",
-)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Statement:
+    """The figures of a detector's evidence that a row stores; those that are not finite are None."""
+
+    verdict: Verdict
+    score: float | None = None
+    threshold: float | None = None
+    onset_s: float | None = None
+    onset_interval_s: tuple[float, float] | None = None
+    leak_lpm: float | None = None
+    leak_interval_lpm: tuple[float, float] | None = None
+    cause: Cause | None = None
+
+    @classmethod
+    def of(cls, evidence: Evidence | Statement) -> Statement:
+        """Return what a row stores of evidence."""
+        values = {field.name: getattr(evidence, field.name) for field in fields(cls)}
+        for name, value in values.items():
+            ends = value if isinstance(value, tuple) else (value,)
+            if any(isinstance(end, float) and not math.isfinite(end) for end in ends):
+                values[name] = None
+        return cls(**values)
 
 
 def cause_of(fault: str) -> str:
@@ -56,34 +77,7 @@ def finite(value: float | None) -> float | None:
     return None if value is None or not math.isfinite(value) else float(value)
 
 
-def _pair(pair: Any) -> tuple[float, float] | None:
-    if pair is None:
-        return None
-    low, high = (finite(end) for end in pair)
-    return None if low is None or high is None else (low, high)
-
-
-def stated_evidence(values: Mapping[str, Any]) -> Evidence:
-    """Return the part of evidence that a row stores, from its `STATED` values; a number that is not finite is None.
-
-    Raises TypeError, KeyError or ValueError where they are no such values.
-    """
-    if values["verdict"] not in get_args(Verdict) or values["cause"] not in (None, *get_args(Cause)):
-        raise ValueError("no verdict or no cause")
-    return Evidence(
-        verdict=values["verdict"],
-        reason="",
-        score=finite(values["score"]),
-        threshold=finite(values["threshold"]),
-        onset_s=finite(values["onset_s"]),
-        onset_interval_s=_pair(values["onset_interval_s"]),
-        leak_lpm=finite(values["leak_lpm"]),
-        leak_interval_lpm=_pair(values["leak_interval_lpm"]),
-        cause=values["cause"],
-    )
-
-
-def named_cause(evidence: Evidence) -> str:
+def named_cause(evidence: Evidence | Statement) -> str:
     """Return the cause that evidence names.
 
     A leak of the piston for `leak` (or of the pump, where it says so), `none` for a plain `no leak`, else `cannot
@@ -96,7 +90,7 @@ def named_cause(evidence: Evidence) -> str:
     return CANNOT_TELL if evidence.verdict == CANNOT_TELL else NO_CAUSE
 
 
-def rank_of(evidence: Evidence) -> float | None:
+def rank_of(evidence: Evidence | Statement) -> float | None:
     """Return the score by which records are ordered; None where it cannot tell, or names another cause."""
     return evidence.score if named_cause(evidence) in (*LEAKS, NO_CAUSE) else None
 
@@ -116,8 +110,8 @@ class CaseRow:
 
     `flow_lpm`: mean leak [L/min] while open, as the run really had it; `bound_lpm`: standard deviation [L/min] of the
     best unbiased estimate of the change at the onset, from pressures and command (`bound.change_bound`), None where it
-    was not asked for or there is none; `scores` and `statements` (evidence with the `STATED` figures alone) by the
-    plan's name of a detector; `seconds`: processor time, which takes no part in the result.
+    was not asked for or there is none; `scores` and `statements` by the plan's name of a detector; `seconds`: processor
+    time, which takes no part in the result.
     """
 
     id: str
@@ -130,16 +124,13 @@ class CaseRow:
     scores: Scores = field(default_factory=dict)
     error: str | None = None
     seconds: float = 0.0
-    statements: Mapping[str, Evidence] = field(default_factory=dict)
+    statements: Mapping[str, Statement] = field(default_factory=dict)
     law: str = "laminar"
     bound_lpm: float | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return the row as plain JSON values."""
-        statements = {
-            key: {name: getattr(evidence, name) for name in STATED} for key, evidence in self.statements.items()
-        }
-        return {**self.__dict__, "statements": statements}
+        return {**self.__dict__, "statements": {name: asdict(own) for name, own in self.statements.items()}}
 
     @classmethod
     def of(cls, case: CampaignCase, **values: Any) -> CaseRow:
@@ -149,17 +140,6 @@ class CaseRow:
         )  # fmt: skip
 
     @classmethod
-    def from_dict(cls, tree: Mapping[str, Any]) -> CaseRow:
-        """Return the row of plain values; raise TypeError, KeyError or ValueError where they are none."""
-        error = tree.get("error")
-        if not isinstance(error, str | None) or not isinstance(tree["id"], str):
-            raise TypeError("an error and an id are texts")
-        scores = {str(name): (_number(score), _number(onset)) for name, (score, onset, *_) in tree["scores"].items()}
-        statements = {str(key): stated_evidence(plain) for key, plain in tree.get("statements", {}).items()}
-        numbers = {name: _number(tree.get(name)) for name in ("flow_lpm", "bound_lpm")}
-        seconds = float(tree.get("seconds", 0.0))
-        return cls(**{**tree, **numbers, "seconds": seconds, "scores": scores, "statements": statements})
-
-
-def _number(value: Any) -> float | None:
-    return None if value is None else float(value)
+    def from_dict(cls, tree: Any) -> CaseRow:
+        """Return the row of plain values; raise ValueError where they are none."""
+        return as_type(cls, tree)

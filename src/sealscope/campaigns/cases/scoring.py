@@ -7,7 +7,7 @@ import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from sealscope.campaigns.cases.row import STATED, Scores, finite, rank_of, stated_evidence
+from sealscope.campaigns.cases.row import Scores, Statement, finite, rank_of
 from sealscope.campaigns.plans.detectors import ALL_CHANNELS, DIAGNOSE, PlanDetector, Views, plan_detector
 from sealscope.campaigns.plans.scorers import Sides
 from sealscope.diagnosis.diagnose import Examination
@@ -24,7 +24,7 @@ _PORTION = 1.0
 
 def stated(
     examination: Examination, split_s: float, names: Sequence[str], views: Views
-) -> tuple[Scores, dict[str, Evidence]]:
+) -> tuple[Scores, dict[str, Statement]]:
     """Return score and onset of each detector, and what each that is no scorer states; every detector is run once.
 
     `split_s` [s]: the moment on the recording's time axis at which scorers split it.
@@ -35,11 +35,10 @@ def stated(
     }
     rules = [detector.name for detector in detectors if detector.scorer is not None]
     scores = scored(Sides.of(examination.recording, split_s), rules, views) if rules else {}
-    statements: dict[str, Evidence] = {}
+    statements: dict[str, Statement] = {}
     for detector in detectors:
         if detector.scorer is None:
-            evidence = _evidence(detector, examinations[detector.view])
-            statement = stated_evidence({name: getattr(evidence, name) for name in STATED})
+            statement = Statement.of(_evidence(detector, examinations[detector.view]))
             statements[detector.name] = statement
             rank = _share(statement) if detector.of == DIAGNOSE else rank_of(statement)
             scores[detector.name] = (rank, statement.onset_s)
@@ -65,7 +64,7 @@ def scored(sides: Sides, names: Sequence[str], views: Views) -> dict[str, tuple[
     return scores
 
 
-def _share(evidence: Evidence) -> float | None:
+def _share(evidence: Statement) -> float | None:
     """Return the fused verdict's score over its threshold: the deciding detector differs between records."""
     rank, threshold = rank_of(evidence), evidence.threshold
     if rank is None or threshold is None:

@@ -87,93 +87,74 @@ def in_batches(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads: int)
 
     A row derives from its case alone, whatever stands beside it.
     """
-    batches = _Batches(plan, threads)
+    from sealscope.simulation.bench.profile import load_profile
+
+    profile = load_profile(plan.profile) if plan.profile else None
+    steps = StepChooser(plan, profile)
     for start in range(0, len(cases), RUNS):
-        yield from batches.rows(cases[start : start + RUNS])
-
-
-class _Batches:
-    """Carries out the cases of one plan."""
-
-    def __init__(self, plan: SimulatedPlan, threads: int) -> None:
-        from sealscope.simulation.bench.profile import load_profile
-
-        self._plan, self._threads = plan, threads
-        self._profile = load_profile(plan.profile) if plan.profile else None
-        self._steps = StepChooser(plan, self._profile)
-        self._bounds = bounds_of(plan)
-
-    def rows(self, cases: Sequence[CampaignCase]) -> list[CaseRow]:
-        started = time.process_time()
+        started, batch = time.process_time(), cases[start : start + RUNS]
         drawn: list[tuple[CampaignCase, Experiment]] = []
         rows: list[CaseRow] = []
-        for case in cases:
+        for case in batch:
             try:
-                experiment = unsized(self._plan, case, self._profile)
-                drawn.append((case, replace(experiment, step=self._steps.of(case, experiment))))
+                experiment = unsized(plan, case, profile)
+                drawn.append((case, replace(experiment, step=steps.of(case, experiment))))
             except Exception as error:
                 rows.append(CaseRow.of(case, error=error_text(error)))
-        rows += self._carried_out(drawn)
-        seconds = round((time.process_time() - started) / max(1, len(cases)), 4)
-        return [replace(row, seconds=seconds) for row in rows]
+        rows += _carried_out(plan, drawn, threads)
+        seconds = round((time.process_time() - started) / len(batch), 4)
+        yield from (replace(row, seconds=seconds) for row in rows)
 
-    def _carried_out(self, drawn: Sequence[tuple[CampaignCase, Experiment]]) -> list[CaseRow]:
-        """Return the rows of one batch; where it fails, of its halves, down to the run that is to blame."""
-        try:
-            return self._made(drawn) if drawn else []
-        except Exception as error:
-            if len(drawn) == 1:
-                return [CaseRow.of(drawn[0][0], error=error_text(error))]
-        middle = len(drawn) // 2
-        return self._carried_out(drawn[:middle]) + self._carried_out(drawn[middle:])
 
-    def _made(self, drawn: Sequence[tuple[CampaignCase, Experiment]]) -> list[CaseRow]:
-        from sealscope.simulation.batch.batch import simulate_batch
+def _carried_out(plan: SimulatedPlan, drawn: Sequence[tuple[CampaignCase, Experiment]], threads: int) -> list[CaseRow]:
+    """Return the rows of one batch; where it fails, of its halves, down to the run that is to blame."""
+    from sealscope.simulation.batch.batch import simulate_batch
 
-        cases = [case for case, _ in drawn]
-        experiments = self._sized([experiment for _, experiment in drawn])
-        edges = self._bounds.ravel() / self._plan.rig.daq.sample_rate
-        batch = simulate_batch(experiments, bounds=edges, threads=self._threads)
-        squares = batch.rms[:, :, [0, 2]] ** 2
-        rows = []
-        for k, case in enumerate(cases):
-            sides = Sides.of_squares(dict(zip(CHAMBERS, squares[k], strict=True)), self._bounds)
-            rows.append(
-                CaseRow.of(
-                    case,
-                    flow_lpm=float(batch.mean_leak_lpm[k]) if case.leak_lpm else 0.0,
-                    scores=scored(sides, self._plan.detectors, self._plan.views),
-                )
-            )
+    if not drawn:
+        return []
+    bounds, rows = bounds_of(plan), []
+    try:
+        experiments = _sized([experiment for _, experiment in drawn], threads)
+        batch = simulate_batch(experiments, bounds=bounds.ravel() / plan.rig.daq.sample_rate, threads=threads)
+        for (case, _), rms, flow in zip(drawn, batch.rms, batch.mean_leak_lpm, strict=True):
+            sides = Sides.of_squares(dict(zip(CHAMBERS, rms[:, [0, 2]] ** 2, strict=True)), bounds)
+            scores = scored(sides, plan.detectors, plan.views)
+            rows.append(CaseRow.of(case, flow_lpm=float(flow) if case.leak_lpm else 0.0, scores=scores))
         return rows
+    except Exception as error:
+        if len(drawn) == 1:
+            return [CaseRow.of(drawn[0][0], error=error_text(error))]
+    middle = len(drawn) // 2
+    return _carried_out(plan, drawn[:middle], threads) + _carried_out(plan, drawn[middle:], threads)
 
-    def _sized(self, experiments: Sequence[Experiment]) -> list[Experiment]:
-        """Return the experiments with steps that resolve their leaks, sized side by side as `sized_once` does."""
-        from sealscope.physics.solvers.limits import longest_step
-        from sealscope.simulation.batch.batch import simulate_batch
-        from sealscope.simulation.batch.run import with_sizes
-        from sealscope.simulation.courses import numbers_under
 
-        sized = list(experiments)
-        leaky = [k for k, experiment in enumerate(experiments) if experiment.leaks]
-        if not leaky:
-            return sized
-        short = [sizing_run(experiments[k]) for k in leaky]
-        try:
-            sizes = simulate_batch(short, threads=self._threads).coefficients.tolist()
-        except SealscopeError:
-            if len(experiments) > 1:  # halving finds the one that is to blame
-                raise
-            sizes = [leak.coefficient for leak in sized_once(replace(experiments[0], step=None))]
-        for k, size in zip(leaky, sizes, strict=True):
-            experiment = with_sizes(experiments[k], size)
-            laminar = experiment.leaks[0].law == "laminar"
-            numbers = numbers_under(experiment.rig, experiment.load)
-            limit = longest_step(numbers, size if laminar else 0.0, 0.0 if laminar else size)
-            if experiment.step is not None and experiment.step > limit:
-                experiment = replace(experiment, step=stepped(experiment.rate * oversampling(experiment), limit))
-            sized[k] = experiment
+def _sized(experiments: Sequence[Experiment], threads: int) -> list[Experiment]:
+    """Return the experiments with steps that resolve their leaks, sized side by side as `sized_once` does."""
+    from sealscope.physics.solvers.limits import longest_step
+    from sealscope.simulation.batch.batch import simulate_batch
+    from sealscope.simulation.batch.run import with_sizes
+    from sealscope.simulation.courses import numbers_under
+
+    sized = list(experiments)
+    leaky = [k for k, experiment in enumerate(experiments) if experiment.leaks]
+    if not leaky:
         return sized
+    short = [sizing_run(experiments[k]) for k in leaky]
+    try:
+        sizes = simulate_batch(short, threads=threads).coefficients.tolist()
+    except SealscopeError:
+        if len(experiments) > 1:  # halving finds the one that is to blame
+            raise
+        sizes = [leak.coefficient for leak in sized_once(replace(experiments[0], step=None))]
+    for k, size in zip(leaky, sizes, strict=True):
+        experiment = with_sizes(experiments[k], size)
+        laminar = experiment.leaks[0].law == "laminar"
+        numbers = numbers_under(experiment.rig, experiment.load)
+        limit = longest_step(numbers, size if laminar else 0.0, 0.0 if laminar else size)
+        if experiment.step is not None and experiment.step > limit:
+            experiment = replace(experiment, step=stepped(experiment.rate * oversampling(experiment), limit))
+        sized[k] = experiment
+    return sized
 
 
 class StepChooser:
@@ -196,7 +177,7 @@ class StepChooser:
         from sealscope.simulation.integrate import FINEST
 
         method = choose_method(experiment.rig, experiment.method)
-        step = self._cell(case.levels).get(method) or chosen_step(experiment)
+        step = self._cell(case.levels).get(method) or _chosen(experiment)[1]
         limit = max(longest_step(numbers_under(experiment.rig, experiment.load)), LONGEST_STEP / FINEST)
         return step if step <= limit else stepped(experiment.rate * oversampling(experiment), limit)
 
@@ -224,11 +205,7 @@ def stepped(rate: float, limit: float) -> float:
     return 1.0 / (rate * steps_per_output(rate, limit))
 
 
-def chosen_step(experiment: Experiment) -> float:
-    """Return the step [s] that `integrate` chooses by error over the first seconds of an experiment."""
-    return _chosen(experiment)[1]
-
-
 def _chosen(experiment: Experiment) -> tuple[str, float]:
+    """Return method and step [s] that `integrate` chooses by error over the first seconds of an experiment."""
     path = trajectory(replace(experiment, duration=min(experiment.duration, SCOUTED), leaks=()), ())
     return path.method, path.step

@@ -117,7 +117,7 @@ def read_rows(folder: Path) -> dict[str, CaseRow]:
                     break
                 try:
                     row = CaseRow.from_dict(parse_json(line))
-                except (ValueError, TypeError, KeyError, AttributeError, IndexError, OverflowError, RecursionError):
+                except ValueError:
                     raise UnreadableFile(
                         f"a line of a campaign must be a row, got something else ({path}, line {number})"
                     ) from None

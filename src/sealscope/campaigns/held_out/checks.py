@@ -16,7 +16,7 @@ from sealscope.campaigns.held_out.classifiers import (
     held_out_scores,
 )
 from sealscope.campaigns.plans.model import ChosenClassifier, Classifier, HeldOutPlan
-from sealscope.evaluation.roc import auc
+from sealscope.evaluation.roc import auc, placements
 
 
 @dataclass(frozen=True)
@@ -68,9 +68,8 @@ def clustered_area(
 
     free, leaky = scores[~leaks], scores[leaks]
     placed = np.empty(scores.size)
-    above = (free[None, :] < leaky[:, None]) + 0.5 * (free[None, :] == leaky[:, None])
-    placed[leaks], placed[~leaks] = above.mean(axis=1), above.mean(axis=0)
-    value = float(above.mean())
+    placed[~leaks], placed[leaks] = placements(free, leaky)
+    value = float(placed[leaks].mean())
     share = np.where(leaks, 1.0 / leaky.size, 1.0 / free.size)
     number = int(clusters.max()) + 1
     each = np.bincount(clusters, weights=share * (placed - value), minlength=number)

@@ -103,33 +103,33 @@ def held_out_scores(
     `leave_out`: `test` or `condition`; `leaks` (n,): other labels than the samples' own.
     """
     leaks = samples.leak_lpm > 0 if leaks is None else leaks
-    of = group_numbers(samples, leave_out)
-    if of.max() < 1:
-        raise InputError(f"tests to leave out in turn must be at least 2, got {of.max() + 1}")
-    folds = of[None, :] != np.arange(of.max() + 1)[:, None]
-    if isinstance(detector, LogisticClassifier):
-        odds = fold_log_odds(samples.matrix(detector.features), leaks, folds, detector.ridge)
-    else:
-        candidates = detector.candidates()
-        best = _choices(samples, detector, of, leaks, folds)
-        odds = np.empty(folds.shape)
-        for number in dict.fromkeys(best):
-            mine, candidate = best == number, candidates[number]
-            odds[mine] = fold_log_odds(samples.matrix(candidate.features), leaks, folds[mine], candidate.ridge)
+    of, folds = _folds(samples, leave_out)
+    candidates = detector.candidates()
+    best, odds = _choices(samples, candidates, of, leaks, folds), np.empty(folds.shape)
+    for number in dict.fromkeys(best):
+        mine, candidate = best == number, candidates[number]
+        odds[mine] = fold_log_odds(samples.matrix(candidate.features), leaks, folds[mine], candidate.ridge)
     return np.asarray(odds[of, np.arange(of.size)])
 
 
 def chosen_candidates(samples: MeasuredSamples, detector: ChosenClassifier, leave_out: str) -> list[LogisticClassifier]:
     """Return what the training samples of each fold chose, one for each test or condition held out."""
-    of = group_numbers(samples, leave_out)
-    folds = of[None, :] != np.arange(of.max() + 1)[:, None]
+    of, folds = _folds(samples, leave_out)
     candidates = detector.candidates()
-    return [candidates[number] for number in _choices(samples, detector, of, samples.leak_lpm > 0, folds)]
+    return [candidates[number] for number in _choices(samples, candidates, of, samples.leak_lpm > 0, folds)]
+
+
+def _folds(samples: MeasuredSamples, leave_out: str) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.bool_]]:
+    """Return the group of each sample, (n,), and the samples that are left when each group is held out, (k, n)."""
+    of = group_numbers(samples, leave_out)
+    if of.max() < 1:
+        raise InputError(f"tests to leave out in turn must be at least 2, got {of.max() + 1}")
+    return of, of[None, :] != np.arange(of.max() + 1)[:, None]
 
 
 def _choices(
     samples: MeasuredSamples,
-    detector: ChosenClassifier,
+    candidates: Sequence[LogisticClassifier],
     of: npt.NDArray[np.intp],
     leaks: npt.NDArray[np.bool_],
     folds: npt.NDArray[np.bool_],
@@ -139,13 +139,15 @@ def _choices(
     The loss is the mean of -ln P(label) over `_INNER` parts of the places (tests or conditions) that the fold trains
     on, each held out once; what the fold leaves out takes no part.
     """
+    if len(candidates) == 1:
+        return np.zeros(len(folds), dtype=np.intp)
     inner = of % _INNER
     parts = [part for part in range(_INNER) if np.any(inner == part)]
     masks = np.stack([fold & (inner != part) for fold in folds for part in parts])
     judged = np.stack([fold & (inner == part) for fold in folds for part in parts])
     sign = np.where(leaks, 1.0, -1.0)
     losses = []
-    for candidate in detector.candidates():
+    for candidate in candidates:
         odds = fold_log_odds(samples.matrix(candidate.features), leaks, masks, candidate.ridge)
         losses.append((np.logaddexp(0.0, -sign * odds) * judged).reshape(len(folds), -1).sum(axis=1))
     return np.asarray(np.argmin(np.array(losses), axis=0))

@@ -15,16 +15,23 @@ import numpy as np
 
 from sealscope.campaigns.cases.bound import smallest_detectable
 from sealscope.campaigns.cases.case import FAMILY
-from sealscope.campaigns.cases.row import NO_CAUSE, PISTON_LEAK, CaseRow, cause_of, covers, duty_of, named_cause
+from sealscope.campaigns.cases.row import (
+    NO_CAUSE,
+    PISTON_LEAK,
+    CaseRow,
+    Statement,
+    cause_of,
+    covers,
+    duty_of,
+    named_cause,
+)
 from sealscope.campaigns.plans.detectors import plan_detector
-from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.errors import InputError
 from sealscope.evaluation.binomial import IntervalEstimate, Proportion, proportion
-from sealscope.evaluation.confusion import CANNOT_TELL, Confusion, confusion_matrix
 from sealscope.evaluation.estimates import EstimateError, OnsetErrors, estimate_error, onset_errors, quantile_of
 from sealscope.evaluation.pod import HitMiss, SizeDetection, by_size, fit_hit_miss, proven_size
 from sealscope.evaluation.roc import Area, Roc, auc, roc_curve
-from sealscope.evaluation.table import ALWAYS, NEVER, JudgedRecord, SummaryRow, summary
+from sealscope.evaluation.table import ALWAYS, CANNOT_TELL, NEVER, Confusion, SummaryRow, confusion_matrix, summary
 from sealscope.evaluation.thresholds import Promise, Threshold, quantile_threshold, records_needed
 
 _K = TypeVar("_K")
@@ -216,17 +223,18 @@ def judge(
         (name, row.id): _verdict(row, name, fixed.get(name), thresholds) for name in detectors for row in judged
     }
     plain = [row for row in judged if not row.fault]
-    records = [
-        JudgedRecord(name, row.id, row.leak_lpm, verdicts[name, row.id], hours) for name in detectors for row in plain
-    ]
+    of_plain = {name: [verdicts[name, row.id] for row in plain] for name in detectors}
+    sizes = [row.leak_lpm for row in plain]
+    any_size = [1.0 if size else 0.0 for size in sizes]
+    overall = [replace(row, leak_lpm=math.nan) for row in summary(any_size, of_plain, confidence, hours)]
     these = _Judging(plain, judged, detectors, verdicts, confidence, false_alarm)
     return Judgement(
         thresholds=thresholds,
         leak_free=sum(row.use == "calibrate" and row.error is None for row in rows) if thresholds else 0,
         judged=sum(row.error is None for row in judged),
         failed=tuple(row for row in sorted(rows, key=lambda row: row.id) if row.error is not None),
-        table=tuple(summary(records, confidence)) if plain else (),
-        overall=tuple(_any_size(records, confidence)) if plain else (),
+        table=tuple(summary(sizes, of_plain, confidence, hours)) if plain else (),
+        overall=tuple(overall) if plain else (),
         onsets=() if onset_s is None else tuple(these.onsets(onset_s)),
         flows=tuple(these.flows()),
         causes=tuple(these.causes()),
@@ -252,7 +260,7 @@ def _verdict(row: CaseRow, detector: str, own: float | None, thresholds: Thresho
     return "leak" if value > limit else "no leak"
 
 
-def _statement(row: CaseRow, detector: str) -> Evidence | None:
+def _statement(row: CaseRow, detector: str) -> Statement | None:
     """Return what a detector stated on a row; None where it states nothing, or the record failed."""
     return row.statements.get(detector) if row.error is None else None
 
@@ -267,12 +275,6 @@ def _by(rows: Iterable[CaseRow], key: Callable[[CaseRow], _K]) -> dict[_K, list[
     for row in rows:
         groups.setdefault(key(row), []).append(row)
     return dict(sorted(groups.items(), key=lambda group: group[0]))  # type: ignore[arg-type, return-value]
-
-
-def _any_size(records: Sequence[JudgedRecord], confidence: float) -> list[SummaryRow]:
-    """Return the table with all leaks in one row."""
-    together = [replace(record, leak_lpm=1.0 if record.leak_lpm else 0.0) for record in records]
-    return [replace(row, leak_lpm=math.nan) for row in summary(together, confidence)]
 
 
 def _realised(rows: Sequence[CaseRow]) -> dict[float, tuple[float, float]]:

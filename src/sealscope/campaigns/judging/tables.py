@@ -8,22 +8,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sealscope.campaigns.cases.row import CaseRow
+from sealscope.campaigns.cases.row import CaseRow, Statement
 from sealscope.campaigns.judging.judge import ALLOWED_DETECTION, Judgement
-from sealscope.diagnosis.verdict.evidence import Evidence
-from sealscope.evaluation.binomial import Proportion
+from sealscope.evaluation.binomial import IntervalEstimate, Proportion
 from sealscope.storage.atomic import atomic_write
 
 Value = str | float | int | None
-
-
-@dataclass(frozen=True)
-class ResultTable:
-    """A table: its file's stem, columns, rows."""
-
-    name: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[Value, ...], ...]
+#: Name of a column -> value; every row of a table has the same columns.
+TableRow = dict[str, Value]
+_ONSET = "true onset given"
 
 
 @dataclass(frozen=True)
@@ -39,18 +32,26 @@ class PriorKnowledge:
     rig: str
 
 
-def _of(proportion: Proportion | None) -> tuple[Value, ...]:
-    if proportion is None:
-        return (None,) * 5
-    return (proportion.count, proportion.n, proportion.value, proportion.low, proportion.high)
+def _share(what: str, share: Proportion | None) -> TableRow:
+    """Return the five columns of a proportion, empty where there is none."""
+    parts = (None,) * 5 if share is None else (share.count, share.n, share.value, share.low, share.high)
+    return {f"{what}: {part}": of for part, of in zip(("count", "of", "fraction", "low", "high"), parts, strict=True)}
 
 
-def _columns(what: str) -> tuple[str, ...]:
-    return tuple(f"{what}: {part}" for part in ("count", "of", "fraction", "low", "high"))
+def _coverage(what: str, coverage: Proportion) -> TableRow:
+    return _share(f"interval holds the {what}", coverage if coverage.n else None)
 
 
-def _stated_coverage(coverage: Proportion) -> tuple[Value, ...]:
-    return _of(coverage if coverage.n else None)
+def _interval(what: str, name: str, estimate: IntervalEstimate | None) -> TableRow:
+    parts = (None,) * 3 if estimate is None else (estimate.value, estimate.low, estimate.high)
+    return dict(zip((name, f"{what}: low", f"{what}: high"), parts, strict=True))
+
+
+def _known(known: PriorKnowledge | None) -> TableRow:
+    if known is None:
+        return dict.fromkeys((_ONSET, "channels given", "rig assumed"))
+    onset = "yes" if known.onset else "no"
+    return {_ONSET: onset, "channels given": " ".join(known.channels), "rig assumed": known.rig}
 
 
 def _size(leak_lpm: float) -> Value:
@@ -59,208 +60,156 @@ def _size(leak_lpm: float) -> Value:
 
 def tables_of(
     judgement: Judgement, unit: str = "L/min", known: Mapping[str, PriorKnowledge] | None = None, part: str = ""
-) -> list[ResultTable]:
-    """Return every table of a judgement.
+) -> dict[str, list[TableRow]]:
+    """Return every table of a judgement by the stem of its file.
 
     Sizes of leaks in `unit`, `known`: what each detector was given, `part`: what the campaign's families are for.
     """
-    by_size = [make(judgement, unit) for make in (_pods, _rocs, _cells, _onsets, _flows)]
-    return [
-        _main(judgement, unit, known or {}),
-        *by_size,
-        _thresholds(judgement),
-        _faults(judgement),
-        _causes(judgement),
-        _families(judgement, unit, known or {}, part),
-    ]
+    leak, known, j = f"leak [{unit}]", known or {}, judgement
+    factors = list(dict.fromkeys(name for cell in j.cells for name in cell.levels))
+    return {
+        "table": [
+            {
+                "detector": row.detector, leak: _size(row.leak_lpm), **_share("detected", row.detection),
+                **_share("false alarms", row.false_alarm), **_share("cannot tell", row.cannot_tell),
+                **_interval("per hour", "false alarms per hour", row.per_hour),
+                "detected less false alarms": row.informedness,
+                **(_known(known.get(row.detector)) if known else {}),
+            }
+            for row in (*j.table, *j.overall)
+        ],
+        "pod": [
+            {
+                "detector": pod.detector, leak: at.size, **_share("detected", at.proportion),
+                "one-sided lower bound": at.lower, f"a50 [{unit}]": pod.curve.a50 if pod.curve else None,
+                f"a90 [{unit}]": pod.curve.a90 if pod.curve else None,
+                f"a90/95 [{unit}]": pod.curve.a90_95 if pod.curve else None,
+                f"a90/95 without a curve [{unit}]": pod.proven,
+                "curve": pod.curve.estimator if pod.curve else pod.why,
+            }
+            for pod in j.pods
+            for at in pod.sizes
+        ],
+        "roc": [
+            {
+                "detector": roc.detector, leak: _size(roc.leak_lpm),
+                "AUC": roc.area.value, "low": roc.area.low, "high": roc.area.high,
+            }
+            for roc in j.rocs
+        ],
+        "cells": [
+            {
+                "detector": cell.detector, leak: cell.leak_lpm, **{name: cell.levels.get(name) for name in factors},
+                **_share("alarms", cell.alarms),
+            }
+            for cell in j.cells
+        ],
+        "onsets": [
+            {
+                "detector": onset.detector, leak: onset.leak_lpm, "alarms": onset.errors.n,
+                "median error [s]": onset.errors.median.value,
+                **_interval("median size", "median size [s]", onset.errors.median_size),
+                "90 % size [s]": onset.errors.ninety_size.value, **_coverage("onset", onset.errors.coverage),
+            }
+            for onset in j.onsets
+        ],
+        "estimates": [
+            {
+                "detector": flow.detector, leak: flow.leak_lpm, "with an estimate": flow.errors.bias.n,
+                "without": flow.errors.without, **_interval("bias", f"bias [{unit}]", flow.errors.bias),
+                f"median error [{unit}]": flow.median.value,
+                f"median size of the error [{unit}]": flow.median_size.value,
+                f"rms error [{unit}]": flow.errors.rmse.value, **_coverage("flow", flow.errors.coverage),
+            }
+            for flow in j.flows
+        ],
+        "thresholds": [
+            {
+                "detector": name, "duty": duty, "leak-free records": at.n, "threshold": at.value,
+                "asked probability": at.false_alarm_probability, "expected probability": at.expected,
+                "low": at.low, "high": at.high,
+            }
+            for (name, duty), at in j.thresholds.items()
+        ],
+        "faults": [
+            {
+                "detector": fault.detector, "fault that is no leak": fault.fault, **_share("alarms", fault.alarms),
+                **_share("cannot tell", fault.cannot_tell), **_share("alarms that name it", fault.named),
+            }
+            for fault in j.faults
+        ],
+        "causes": [
+            {
+                "detector": causes.detector, "there is": true, "named": named,
+                **_share("records", causes.confusion.shares[i][k]),
+            }
+            for causes in j.causes
+            for i, true in enumerate(causes.confusion.rows)
+            for k, named in enumerate(causes.confusion.columns)
+            if causes.confusion.counts[i].any()
+        ],
+        "families": [
+            {
+                "part": part, "family": row.family, "detector": row.detector,
+                **{name: of for name, of in _known(known.get(row.detector)).items() if name != _ONSET},
+                leak: row.leak_lpm, "law": row.law, **_share("alarms", row.alarms),
+                **_share("cannot tell", row.cannot_tell), **_coverage("flow", row.coverage),
+                **_share(f"bound allows {ALLOWED_DETECTION:.0%} detection", row.reachable),
+                **_share("alarms where the bound allows", row.allowed), "failed": row.failed,
+            }
+            for row in j.families
+        ],
+    }  # fmt: skip
 
 
-def _main(judgement: Judgement, unit: str, known: Mapping[str, PriorKnowledge]) -> ResultTable:
-    """Return detector by size of leak, beside one that always fires and one that never does."""
-    columns = (
-        "detector", f"leak [{unit}]", *_columns("detected"), *_columns("false alarms"), *_columns("cannot tell"),
-        "false alarms per hour", "per hour: low", "per hour: high", "detected less false alarms",
-        *(("true onset given", "channels given", "rig assumed") if known else ()),
-    )  # fmt: skip
-    rows = []
-    for row in (*judgement.table, *judgement.overall):
-        hour = row.per_hour
-        hourly = (None, None, None) if hour is None else (hour.value, hour.low, hour.high)
-        fractions = (*_of(row.detection), *_of(row.false_alarm), *_of(row.cannot_tell))
-        given = known.get(row.detector)
-        prior: tuple[Value, ...] = (None,) * 3 if known else ()
-        if given is not None:
-            prior = ("yes" if given.onset else "no", " ".join(given.channels), given.rig)
-        rows.append((row.detector, _size(row.leak_lpm), *fractions, *hourly, row.informedness, *prior))
-    return ResultTable("table", columns, tuple(rows))
+def _stated(name: str, statement: Statement | None) -> TableRow:
+    own = statement or Statement("cannot tell")
+    onset, flow = own.onset_interval_s or (None, None), own.leak_interval_lpm or (None, None)
+    return {
+        f"{name}: verdict": statement.verdict if statement else None, f"{name}: threshold": own.threshold,
+        f"{name}: onset [s]": own.onset_s, f"{name}: onset: low": onset[0], f"{name}: onset: high": onset[1],
+        f"{name}: flow": own.leak_lpm, f"{name}: flow: low": flow[0], f"{name}: flow: high": flow[1],
+        f"{name}: cause": own.cause,
+    }  # fmt: skip
 
 
-def _families(judgement: Judgement, unit: str, known: Mapping[str, PriorKnowledge], part: str) -> ResultTable:
-    """Return what each detector finds in each family of machines, beside what the Cramer-Rao bound allows to find."""
-    columns = (
-        "part", "family", "detector", "channels given", "rig assumed", f"leak [{unit}]", "law", *_columns("alarms"),
-        *_columns("cannot tell"), *_columns("interval holds the flow"),
-        *_columns(f"bound allows {ALLOWED_DETECTION:.0%} detection"), *_columns("alarms where the bound allows"),
-        "failed",
-    )  # fmt: skip
-    rows: list[tuple[Value, ...]] = []
-    for row in judgement.families:
-        given = known.get(row.detector)
-        prior = (None, None) if given is None else (" ".join(given.channels), given.rig)
-        stated = *_of(row.alarms), *_of(row.cannot_tell), *_stated_coverage(row.coverage)
-        shares = (*stated, *_of(row.reachable), *_of(row.allowed))
-        rows.append((part, row.family, row.detector, *prior, row.leak_lpm, row.law, *shares, row.failed))
-    return ResultTable("families", columns, tuple(rows))
-
-
-def _thresholds(judgement: Judgement) -> ResultTable:
-    columns = (
-        "detector", "duty", "leak-free records", "threshold", "asked probability", "expected probability", "low",
-        "high",
-    )  # fmt: skip
-    rows = tuple(
-        (name, duty, at.n, at.value, at.false_alarm_probability, at.expected, at.low, at.high)
-        for (name, duty), at in judgement.thresholds.items()
-    )
-    return ResultTable("thresholds", columns, rows)
-
-
-def _pods(judgement: Judgement, unit: str) -> ResultTable:
-    columns = (
-        "detector", f"leak [{unit}]", *_columns("detected"), "one-sided lower bound",
-        f"a50 [{unit}]", f"a90 [{unit}]", f"a90/95 [{unit}]", f"a90/95 without a curve [{unit}]", "curve",
-    )  # fmt: skip
-    rows: list[tuple[Value, ...]] = []
-    for pod in judgement.pods:
-        curve = pod.curve
-        sizes: tuple[Value, ...] = (None,) * 3 if curve is None else (curve.a50, curve.a90, curve.a90_95)
-        how = pod.why if curve is None else curve.estimator
-        rows += [(pod.detector, at.size, *_of(at.proportion), at.lower, *sizes, pod.proven, how) for at in pod.sizes]
-    return ResultTable("pod", columns, tuple(rows))
-
-
-def _rocs(judgement: Judgement, unit: str) -> ResultTable:
-    columns = ("detector", f"leak [{unit}]", "AUC", "low", "high")
-    rows = tuple(
-        (roc.detector, _size(roc.leak_lpm), roc.area.value, roc.area.low, roc.area.high) for roc in judgement.rocs
-    )
-    return ResultTable("roc", columns, rows)
-
-
-def _cells(judgement: Judgement, unit: str) -> ResultTable:
-    factors = list(dict.fromkeys(name for cell in judgement.cells for name in cell.levels))
-    columns = ("detector", f"leak [{unit}]", *factors, *_columns("alarms"))
-    rows = tuple(
-        (cell.detector, cell.leak_lpm, *(cell.levels.get(name) for name in factors), *_of(cell.alarms))
-        for cell in judgement.cells
-    )
-    return ResultTable("cells", columns, rows)
-
-
-def _onsets(judgement: Judgement, unit: str) -> ResultTable:
-    columns = (
-        "detector", f"leak [{unit}]", "alarms", "median error [s]", "median size [s]", "median size: low",
-        "median size: high", "90 % size [s]", *_columns("interval holds the onset"),
-    )  # fmt: skip
-    rows: list[tuple[Value, ...]] = []
-    for onset in judgement.onsets:
-        errors, size = onset.errors, onset.errors.median_size
-        sizes = (size.value, size.low, size.high, errors.ninety_size.value)
-        stated = _stated_coverage(errors.coverage)
-        rows.append((onset.detector, onset.leak_lpm, errors.n, errors.median.value, *sizes, *stated))
-    return ResultTable("onsets", columns, tuple(rows))
-
-
-def _flows(judgement: Judgement, unit: str) -> ResultTable:
-    """Return errors of the flow that detectors state, leak-free records (size 0) among them."""
-    columns = (
-        "detector", f"leak [{unit}]", "with an estimate", "without", f"bias [{unit}]", "bias: low", "bias: high",
-        f"median error [{unit}]", f"median size of the error [{unit}]", f"rms error [{unit}]",
-        *_columns("interval holds the flow"),
-    )  # fmt: skip
-    rows: list[tuple[Value, ...]] = []
-    for flow in judgement.flows:
-        errors, bias = flow.errors, flow.errors.bias
-        sizes = (bias.value, bias.low, bias.high, flow.median.value, flow.median_size.value, errors.rmse.value)
-        rows.append((flow.detector, flow.leak_lpm, bias.n, errors.without, *sizes, *_stated_coverage(errors.coverage)))
-    return ResultTable("estimates", columns, tuple(rows))
-
-
-def _causes(judgement: Judgement) -> ResultTable:
-    """Return which cause each detector names for which there is; one line for each pair."""
-    columns = ("detector", "there is", "named", *_columns("records"))
-    rows = tuple(
-        (causes.detector, true, named, *_of(causes.confusion.shares[i][j]))
-        for causes in judgement.causes
-        for i, true in enumerate(causes.confusion.rows)
-        for j, named in enumerate(causes.confusion.columns)
-        if causes.confusion.counts[i].any()
-    )
-    return ResultTable("causes", columns, rows)
-
-
-def _faults(judgement: Judgement) -> ResultTable:
-    columns = (
-        "detector",
-        "fault that is no leak",
-        *_columns("alarms"),
-        *_columns("cannot tell"),
-        *_columns("alarms that name it"),
-    )
-    rows = tuple(
-        (fault.detector, fault.fault, *_of(fault.alarms), *_of(fault.cannot_tell), *_of(fault.named))
-        for fault in judgement.faults
-    )
-    return ResultTable("faults", columns, rows)
-
-
-_STATED = (
-    "verdict", "threshold", "onset [s]", "onset: low", "onset: high", "flow", "flow: low", "flow: high", "cause",
-)  # fmt: skip
-
-
-def _stated(statement: Evidence | None) -> tuple[Value, ...]:
-    if statement is None:
-        return (None,) * len(_STATED)
-    onset, flow = statement.onset_interval_s or (None, None), statement.leak_interval_lpm or (None, None)
-    timed = (statement.onset_s, *onset)
-    return (statement.verdict, statement.threshold, *timed, statement.leak_lpm, *flow, statement.cause)
-
-
-def rows_table(rows: Iterable[CaseRow], detectors: Sequence[str], unit: str = "L/min") -> ResultTable:
+def records_table(rows: Iterable[CaseRow], detectors: Sequence[str], unit: str = "L/min") -> list[TableRow]:
     """Return every record of a campaign in the order of its id, without what differs from run to run."""
     ordered = sorted(rows, key=lambda row: row.id)
     factors = list(dict.fromkeys(name for row in ordered for name in sorted(row.levels)))
-    keys = sorted({key for row in ordered for key in row.statements})
-    columns = (
-        "id", "use", f"leak [{unit}]", "fault", *factors, "replicate", f"flow [{unit}]", *detectors,
-        *(f"{key}: {part}" for key in keys for part in _STATED), "error",
-    )  # fmt: skip
-    body = tuple(
-        (
-            row.id, row.use, row.leak_lpm, row.fault, *(row.levels.get(name) for name in factors), row.replicate,
-            row.flow_lpm, *(row.scores[name][0] if name in row.scores else None for name in detectors),
-            *(value for key in keys for value in _stated(row.statements.get(key))), row.error,
-        )
-        for row in ordered
-    )  # fmt: skip
-    return ResultTable("records", columns, body)
+    stating = sorted({name for row in ordered for name in row.statements})
+    table = []
+    for row in ordered:
+        record: TableRow = {
+            "id": row.id,
+            "use": row.use,
+            f"leak [{unit}]": row.leak_lpm,
+            "fault": row.fault,
+            **{name: row.levels.get(name) for name in factors},
+            "replicate": row.replicate,
+            f"flow [{unit}]": row.flow_lpm,
+            **{name: row.scores[name][0] if name in row.scores else None for name in detectors},
+        }
+        for name in stating:
+            record |= _stated(name, row.statements.get(name))
+        table.append({**record, "error": row.error})
+    return table
 
 
-def write_tables(folder: Path, tables: Iterable[ResultTable]) -> list[Path]:
+def write_tables(folder: Path, tables: Mapping[str, Sequence[TableRow]]) -> list[Path]:
     """Write each table that has rows as `NAME.csv`, numbers in full; return the files."""
     paths = []
-    for table in tables:
-        path = folder / f"{table.name}.csv"
-        if not table.rows:
+    for name, rows in tables.items():
+        path = folder / f"{name}.csv"
+        if not rows:
             path.unlink(missing_ok=True)
             continue
         with (
             atomic_write(path) as temporary,
             temporary.open("w", encoding="utf-8", errors="backslashreplace", newline="") as file,
         ):
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(table.columns)
-            writer.writerows([["" if value is None else value for value in row] for row in table.rows])
+            writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
         paths.append(path)
     return paths

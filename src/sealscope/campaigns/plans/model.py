@@ -166,6 +166,10 @@ class LogisticClassifier:
     features: Names
     ridge: Ridge = 1.0
 
+    def candidates(self) -> list[LogisticClassifier]:
+        """Return itself: nothing is chosen."""
+        return [self]
+
 
 @dataclass(frozen=True)
 class ChosenClassifier:

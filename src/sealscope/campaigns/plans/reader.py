@@ -92,12 +92,14 @@ def _in(entry: str, place: str, read: Callable[[], _T]) -> _T:
         raise InputError(f"{entry}: {error} ({place})") from None
 
 
-def _table(given: Any, name: str, place: str, unknown: Collection[str] = ()) -> dict[str, Any]:
-    """Return a table's entries; InputError for one that is `unknown`."""
+def _table(
+    given: Any, name: str, place: str, unknown: Collection[str] = (), known: Collection[str] = ()
+) -> dict[str, Any]:
+    """Return a table's entries; InputError for one that is `unknown`, or none of the `known` where these are named."""
     if not isinstance(given, Mapping):
         raise InputError(f"[{name}] must be a table, got {given!r} ({place})")
     for entry in given:
-        if entry in unknown:
+        if entry in unknown or (known and entry not in known):
             raise InputError(f"{name}.{entry} is not known ({place})")
     return dict(given)
 
@@ -298,17 +300,10 @@ def _check_records(plan: SimulatedPlan) -> None:
         )
 
 
-def _two_tables(tree: Mapping[str, Any], name: str, own: Collection[str], place: str) -> tuple[dict[str, Any], ...]:
-    """Return the entries of [campaign], and those of the table that has the `own` ones."""
-    head = _table(tree.get("campaign", {}), "campaign", place, {*_NO_ENTRIES, *own})
-    part = _table(tree[name], name, place)
-    for entry in part.keys() - set(own):
-        raise InputError(f"{name}.{entry} is not known ({place})")
-    return head, part
-
-
 def _recorded(tree: Mapping[str, Any], place: str) -> RecordedPlan:
-    head, part = _two_tables(tree, "recordings", ("map", "rate", "unit", "sets"), place)
+    own = ("map", "rate", "unit", "sets")
+    head = _table(tree.get("campaign", {}), "campaign", place, {*_NO_ENTRIES, *own})
+    part = _table(tree["recordings"], "recordings", place, known=own)
     sets = _tables(part.pop("sets", ()), "recordings.sets", place)
     part["sets"] = tuple(_part(RecordingSet, of, name, place) for name, of in sets)
     plan = _judged(RecordedPlan, {**head, **part}, tree, None, place, second=("recordings", part))
@@ -319,7 +314,8 @@ def _recorded(tree: Mapping[str, Any], place: str) -> RecordedPlan:
 
 def _held_out(tree: Mapping[str, Any], place: str) -> HeldOutPlan:
     own = ("data", "leave_out", "permutations", "seed", "detectors")
-    head, part = _two_tables(tree, "held_out", own, place)
+    head = _table(tree.get("campaign", {}), "campaign", place, {*_NO_ENTRIES, *own})
+    part = _table(tree["held_out"], "held_out", place, known=own)
     part["detectors"] = tuple(
         _part(ChosenClassifier if "choose" in of else LogisticClassifier, of, name, place)
         for name, of in _tables(part.pop("detectors", ()), "held_out.detectors", place)

@@ -20,6 +20,7 @@ from sealscope.thesis.engine.context import Context, first_table
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, ThesisTable
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, QUANTITIES, UNITS, Condition, DataSheet, experiment_values
+from sealscope.thesis.texts import note
 from sealscope.units import PSI
 
 if TYPE_CHECKING:
@@ -237,27 +238,15 @@ def sheet_of(table: ThesisTable) -> DataSheet:
 def runs_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate the 41 tests with their leak from half time on, with nothing happening there, or with a drift."""
     half, name = QUICK_HALF if context.quick else HALF, item.inputs["runs"]
-    simulate, notes = _RUNS[name]
+    _, simulate = _RUNS[name]
     proof = (
         "No run is proved (quick)." if context.quick else "One test of each condition is proved by halving the step."
     )
     parts = {"friction": FRICTION_DRIFT, "bulk": BULK_DRIFT, "noise": NOISE_DRIFT}
     bounds = {part: f"{100 * low:g} to {100 * high:g} %" for part, (low, high) in parts.items()}
-    where = f"Rig {BENCH_RIG}, {half:g} s a half{' (quick)' if context.quick else ''}, the first 5 s left out"
-    notes = f"{where}; RMS in psi, the unit the sheet is taken to be in. {notes.format(proof=proof, **bounds)}"
+    of = note(f"runs-{name}", proof=proof, **bounds)
+    notes = note("runs", rig=BENCH_RIG, half=half, quick=" (quick)" if context.quick else "", of=of)
     return (table_of(list(simulate(half, context.quick)), item.id, item.title, notes),)
-
-
-_RUNS: dict[str, tuple[Callable[[float, bool], Iterator[SimulatedTest]], str]] = {
-    "leak": (with_leak, "Laminar leak of the test's own mean. {proof}"),
-    "no-leak": (without_leak, 'Nothing leaks: "leak" heads the second half.'),
-    "drift": (
-        with_drift,
-        'Nothing leaks: "leak" heads the second half, from a rig with friction moved {friction}, bulk modulus {bulk}, '
-        "noise {noise}, up or down at random. The sizes are assumed: the scatter of d1 on the thesis's own sheet is "
-        "4 %, the others were not measured.",
-    ),
-}
 
 
 def simulated_sheet(context: Context, runs: str) -> tuple[ThesisTable, DataSheet]:
@@ -266,11 +255,12 @@ def simulated_sheet(context: Context, runs: str) -> tuple[ThesisTable, DataSheet
     return table, sheet_of(table)
 
 
-_TITLES = {
-    "leak": "The 41 tests of Appendix C simulated with their leak",
-    "no-leak": "The same 41 tests simulated with no leak",
-    "drift": "The same 41 tests simulated with no leak on a rig that drifts",
+#: Title of each kind of runs, and what simulates it.
+_RUNS: dict[str, tuple[str, Callable[[float, bool], Iterator[SimulatedTest]]]] = {
+    "leak": ("The 41 tests of Appendix C simulated with their leak", with_leak),
+    "no-leak": ("The same 41 tests simulated with no leak", without_leak),
+    "drift": ("The same 41 tests simulated with no leak on a rig that drifts", with_drift),
 }
 ITEMS: tuple[Item, ...] = tuple(
-    Item(f"appendix-c-{name}", 5, "case", title, runs_table, {"runs": name}) for name, title in _TITLES.items()
+    Item(f"appendix-c-{name}", 5, "case", title, runs_table, {"runs": name}) for name, (title, _) in _RUNS.items()
 )

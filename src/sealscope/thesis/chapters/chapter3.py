@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
+
 import numpy as np
 
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
+from sealscope.thesis.chapters.chapter4.cases import visible_pressure
 from sealscope.thesis.engine.context import Context, RunSpec
 from sealscope.thesis.engine.items import Item
-from sealscope.thesis.engine.products import Figure, FigureCurve, Image, Number, Panel, Role
+from sealscope.thesis.engine.products import Claim, Figure, FigureCurve, Image, Number, Panel, Role
+from sealscope.thesis.texts import judged, note
 
 #: Sampling rate [Hz] of the signals of this chapter; the thesis gives none.
 RATE = 1000.0
@@ -16,6 +22,9 @@ TONES = ((100.0, 1.0), (30.0, 0.5))
 WAVELET = "db8"
 #: Sine command and leak of the pressure record of eq. (3.4): the largest mean leak at 3 sin(4t) among the tests.
 RECORD = RunSpec(command="3 sin(4t)", duration=20.0, leaks=("0.0163 L/min from 10 s",), prove=True)
+#: Pressures without a leak and with the largest mean leak among the tests at 3 sin(4t).
+_NO_LEAK = RunSpec(command="3 sin(4t)", duration=40.0)
+_LEAK = replace(_NO_LEAK, leaks=("0.0163 L/min",))
 _ONSET, _SETTLED, _BLOCK = 10.0, 1.0, 0.05
 _OCTAVES = 24
 
@@ -142,11 +151,8 @@ def two_tones(context: Context, item: Item) -> tuple[Figure, ...]:
         Panel("t [s]", "x(t) [1]", (signal,), "(a) Signal"),
         Panel("frequency [Hz]", "amplitude [1]", (spectrum,), "(b) Amplitude spectrum", x_range=shown),
     )
-    notes = (
-        "1 s sampled at 1000 Hz; the thesis gives neither. Its text names two cosines, eq. (3.3) has a sine at 30 Hz: "
-        "the amplitudes are the same, the phase at 30 Hz is -90 degrees."
-    )
-    return (Figure(item.id, item.title, panels, tuple(numbers), ("claim-3.1", "claim-3.2"), None, notes),)
+    claims = ("claim-3.1", "claim-3.2")
+    return (Figure(item.id, item.title, panels, tuple(numbers), claims, None, note("two-tones")),)
 
 
 def db8(context: Context, item: Item) -> tuple[Figure, ...]:
@@ -168,8 +174,7 @@ def db8(context: Context, item: Item) -> tuple[Figure, ...]:
         Number("vanishing moments", float(vanishing_moments(psi, t))),
         Number("frequency of the largest response", wavelet_centre()[1], "1/sample"),
     )
-    notes = "The wavelet is asymmetric and of finite length: 15 sampling intervals at scale 1."
-    return (Figure(item.id, item.title, panels, numbers, ("claim-3.3",), None, notes),)
+    return (Figure(item.id, item.title, panels, numbers, ("claim-3.3",), None, note("db8")),)
 
 
 def vanishing_moments(psi: Array, t: Array) -> int:
@@ -214,12 +219,7 @@ def four_views(context: Context, item: Item) -> tuple[Figure, ...]:
         Number("width of the pulse at 300 Hz in (c)", _width(times, short[nearest(bins, 300.0)]), "s"),
         Number("width of the pulse at 300 Hz in (d)", _width(t[pulse], wavelet[high][pulse]), "s"),
     )
-    notes = (
-        "A signal of our own choice, for the thesis's figure is a sketch: the tones of eq. (3.3) in turn and one "
-        "sample of height 8 at 0.75 s. Only (c) and (d) tell when a tone sounds; (d) places the pulse more sharply at "
-        "high frequencies and less at low ones."
-    )
-    return (Figure(item.id, item.title, panels, numbers, (), None, notes),)
+    return (Figure(item.id, item.title, panels, numbers, notes=note("four-views")),)
 
 
 def _width(t: Array, values: Array) -> float:
@@ -258,11 +258,7 @@ def pressure_scalogram(context: Context, item: Item) -> tuple[Figure, ...]:
         Number("rms at the ringing, leak / no leak", float(strength["leak"][ring] / strength["no leak"][ring])),
         Number("mean leak", run.mean_leak_lpm, "L/min"),
     )
-    notes = (
-        f"Simulated at {RECORD.command}, a leak from {_ONSET:g} s. The vertical axis is the frequency at which the "
-        f"wavelet of scale a responds most, b the middle of the wavelet; grey is the rms over {_BLOCK:g} s. The "
-        "ringing of the oil columns stands between the reversals, and the leak damps it."
-    )
+    notes = note("scalogram", command=RECORD.command, onset=_ONSET, block=_BLOCK)
     return (Figure(item.id, item.title, tuple(panels), numbers, ("claim-3.5",), run.resolved, notes),)
 
 
@@ -273,9 +269,62 @@ def _running_rms(t: Array, rows: Array, size: int) -> tuple[Array, Array]:
     return t[:whole].reshape(-1, size).mean(axis=1), power
 
 
+def judge_claims(context: Context, item: Item) -> tuple[Claim, ...]:
+    """Judge claims 3.1 to 3.6."""
+    return (*_fourier(), *_wavelet(), _leak(context))
+
+
+def _fourier() -> Iterator[Claim]:
+    t = np.arange(round(RATE)) / RATE
+    frequency, amplitude, phase = amplitude_spectrum(two_tone_signal(t), RATE)
+    tones = [nearest(frequency, tone) for tone, _ in TONES]
+    elsewhere = np.delete(amplitude, tones).max()
+    present = np.abs(amplitude[tones] - [height for _, height in TONES]).max() < 1e-6
+    high, low = amplitude[tones]
+    yield judged("3.1", [present, elsewhere < 1e-6], high=high, low=low, elsewhere=elsewhere)
+    high, low = phase[tones]
+    yield judged("3.2", np.abs(phase[tones]) < 1e-3, high=high, low=low)
+
+
+def _wavelet() -> Iterator[Claim]:
+    _, psi, t = mother_wavelet()
+    step = float(t[1] - t[0])
+    mean, energy = float(psi.sum() * step), float((psi**2).sum() * step)
+    moments, peak = vanishing_moments(psi, t), wavelet_centre()[1]
+    yield judged("3.3", [abs(mean) < 1e-9], length=t[-1] - t[0], mean=mean, moments=moments, peak=peak)
+    scaled = []
+    for a in (0.5, 2.0, 10.0):
+        fine = np.arange(0.0, a * t[-1], a * step)
+        scaled.append(float(np.sum((a**-0.5 * np.interp(fine / a, t, psi)) ** 2) * a * step))
+    tests = [abs(of - 1.0) < 1e-3 for of in (energy, *scaled)]
+    yield judged("3.4", tests, energy=energy, scaled=", ".join(f"{of:.4f}" for of in scaled))
+    gains = (inverse_gain(np.array([30.0, 100.0]), weight) for weight in (2.0, 0.0))
+    (constant, at_100), (printed, printed_at_100) = gains
+    spread, falls = constant / at_100, printed / printed_at_100
+    yield judged("3.5", [abs(falls - 1.0) < 0.01], printed=falls, proper=spread, constant=constant)
+
+
+def _leak(context: Context) -> Claim:
+    without, leaking = context.run(_NO_LEAK), context.run(_LEAK)
+    failed = without.diverged or leaking.diverged
+    if failed:
+        return replace(judged("3.6", [None], leak=0.0, moved=""), simulation=failed, why="a run failed")
+    late = without.t > 10.0
+    changes: dict[str, list[float]] = {
+        name: [
+            float(of(leaking.outputs[name][late]) - of(without.outputs[name][late])) for of in (np.mean, np.max, np.ptp)
+        ]
+        for name in CHAMBERS
+    }
+    moved = ["{}: mean {:+.0f} Pa, peak {:+.0f} Pa, range {:+.0f} Pa".format(name, *of) for name, of in changes.items()]
+    tests = [change < -visible_pressure() for of in changes.values() for change in of]
+    return judged("3.6", tests, leak=leaking.mean_leak_lpm, moved="; ".join(moved))
+
+
 ITEMS: tuple[Item, ...] = (
     Item("fig-3.2", 3, "figure", "Two tones and their spectrum", two_tones),
     Item("fig-3.3", 3, "figure", "The db8 wavelet and its scaling function", db8),
     Item("fig-3.4", 3, "figure", "One signal in four views", four_views),
     Item("eq-3.4", 3, "figure", "Continuous wavelet transform of a pressure record", pressure_scalogram),
+    Item("chapter-3-claims", 3, "claims", "What chapter 3 claims", judge_claims),
 )

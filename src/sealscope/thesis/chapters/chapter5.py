@@ -17,6 +17,7 @@ from sealscope.thesis.engine.context import Context, RunSpec, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Figure, FigureCurve, Number, Panel, Role
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, QUANTITIES, UNITS, Condition, experiment_values
+from sealscope.thesis.texts import note
 from sealscope.units import LITRE_PER_MINUTE
 
 Mask = NDArray[np.bool_]
@@ -130,14 +131,10 @@ class FigureView:
         """Return which row of Appendix C was simulated, and how it was chosen."""
         row = self.test.condition
         others = ", ".join(str(of.number) for of in self.test.candidates if of is not row)
-        chosen = (
-            f"; the thesis does not say which row of Appendix C this is: of rows {row.number}, {others} the one with "
-            "the mean leak nearest to the level's nominal one is taken"
-        )
-        return (
-            f"Simulated on rig {BENCH_RIG}: row {row.number} of Appendix C, throttles {row.closed_pct:g} % closed, "
-            f"mean leak {self.run.mean_leak_lpm:.4f} L/min from {self.test.half:g} s{chosen if others else ''}."
-        )
+        chosen = note("chosen-row", row=row.number, others=others) if others else ""
+        leak, half = self.run.mean_leak_lpm, self.test.half
+        given = {"rig": BENCH_RIG, "row": row.number, "closed": row.closed_pct, "leak": leak, "half": half}
+        return note("shown-test", chosen=chosen, **given)
 
     def _panel(self, label: str, *curves: FigureCurve) -> Panel:
         return Panel("t [s]", label, curves, marks=((self.test.half, "leak opens"),), x_range=self.span)

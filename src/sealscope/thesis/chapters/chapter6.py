@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.recordings.recording import Array
-from sealscope.thesis.engine.context import Context
+from sealscope.thesis.engine.context import Context, first_table
 from sealscope.thesis.engine.items import Item
-from sealscope.thesis.engine.products import Cell, Figure, FigureCurve, Panel, Role, ThesisTable
+from sealscope.thesis.engine.products import Cell, Claim, Figure, FigureCurve, Panel, Role, ThesisTable
+from sealscope.thesis.texts import judged, note
 from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
@@ -57,6 +58,12 @@ _VALVE_ROLES: dict[tuple[str, ...], Role] = {
     ("valve", "pi"): "leak",
     ("valve", "flatness"): "75 %",
 }
+#: Tracking and stiffness count as restored within this share of those without a leak.
+RESTORED = 0.1
+#: A drift [mm/min] that nobody would call one: a tenth of a millimetre.
+STILL = 0.1
+#: Two machines, or controllers, are told apart where one has this many times what the other has.
+APART = 1.5
 CYCLE = 2.0 * math.pi / OMEGA
 DUTY = f"position {1e3 * AMPLITUDE} mm sin({OMEGA!r}t)"
 
@@ -186,10 +193,7 @@ def controllers_table(context: Context, item: Item) -> tuple[ThesisTable | Figur
         for lpm in _leaks(context):
             error, energy, flow = tracking(*on_duty(name, lpm))
             rows.append((name, lpm, error, bandwidth(name, lpm), energy, stiffness(name, lpm), flow))
-    notes = (
-        f"{RIG}, friction +20 % and bulk modulus -20 % against what the controllers assume, {LOAD:g} N, leak sized at "
-        f"it; {1e3 * AMPLITUDE:g} mm at {1 / CYCLE:g} Hz. `ideal` knows the leak, nobody else does."
-    )
+    notes = note("controllers", rig=RIG, load=LOAD, mm=1e3 * AMPLITUDE, f=1 / CYCLE)
     table = ThesisTable(item.id, item.title, COLUMNS, tuple(rows), notes=notes)
     return table, _against_the_leak(table, "Error and stiffness against the leak", _ROLES, (_ERROR, _STIFF))
 
@@ -236,7 +240,7 @@ def open_loop_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
         *("leak [L/min]", "open: amplitude [mm]", "open: drift [mm/min]", "open: drift by the leak [mm/min]"),
         *("pi: drift [mm/min]", "fault-tolerant: drift [mm/min]"),
     )
-    notes = f"{RIG} under {LOAD:g} N, friction and stiffness off by 20 %. At 0.25 Hz; open: {u:g} V, closed: 40 mm."
+    notes = note("open-loop", rig=RIG, load=LOAD, u=u)
     return (ThesisTable(item.id, item.title, heads, tuple(rows), notes=notes),)
 
 
@@ -254,8 +258,7 @@ def load_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     for force in (0.0, 2000.0) if context.quick else (0.0, 500.0, 1000.0, 2000.0):
         pairs = (tracking(*on_duty(name, lpm, f"{force - LOAD!r} N"))[:2] for name, lpm in cases)
         rows.append((force, *itertools.chain.from_iterable(pairs)))
-    notes = "The leak is a conductance: 0.05 L/min under 2 kN, in proportion less under a smaller load."
-    return (ThesisTable(item.id, item.title, tuple(heads), tuple(rows), notes=notes),)
+    return (ThesisTable(item.id, item.title, tuple(heads), tuple(rows), notes=note("load")),)
 
 
 def outside_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
@@ -271,10 +274,7 @@ def outside_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
         third, fifth = (1e-3 * float(np.mean(lower[_cycle_of(run.t, k)])) for k in (2, 4))
         error, _, flow = tracking(run, late)
         rows.append((side, name, lpm, error, stiffness(name, 0.0, values=values), flow, fifth - third))
-    notes = (
-        f"{RIG} under {LOAD:g} N, which side A carries ({1e-6 * pressure['A']:.2g} MPa on average, B "
-        f"{1e-6 * pressure['B']:.2g}); the leak has its size at that pressure. Friction and stiffness off by 20 %."
-    )
+    notes = note("outside", rig=RIG, load=LOAD, A=1e-6 * pressure["A"], B=1e-6 * pressure["B"])
     return (ThesisTable(item.id, item.title, OUTSIDE_COLUMNS, tuple(rows), notes=notes),)
 
 
@@ -287,21 +287,72 @@ def valve_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...
         given, efficiency, taken = energies(name, lpm, rig)
         loop = bandwidth(name, lpm, rig), stiffness(name, lpm, rig)
         rows.append((source, name, lpm, error, *loop, energy, given, 100 * efficiency, 100 * taken))
-    notes = (
-        f"{RIG} and {VALVE_RIG}: one cylinder, oil, motor and pump, one controller with the same gains, friction and "
-        f"stiffness off by 20 %; {1e3 * AMPLITUDE:g} mm at {1 / CYCLE:g} Hz under {LOAD:g} N, efficiencies against a "
-        f"damper of {DAMPER:g} N s/m instead. The valve's supply turns at a constant speed; the last column leaves its "
-        "losses, motor and pump out. A pump takes energy back on the way down where the load drives it."
-    )
+    notes = note("valve", rig=RIG, other=VALVE_RIG, mm=1e3 * AMPLITUDE, f=1 / CYCLE, load=LOAD, damper=DAMPER)
     table = ThesisTable(item.id, item.title, VALVE_COLUMNS, tuple(rows), notes=notes)
     shown = ("electrical energy a cycle [J]", _STIFF)
     return table, _against_the_leak(table, "Energy and stiffness, pump and valve", _VALVE_ROLES, shown, log_y=True)
 
 
+def _rows(context: Context, item: str, names: int) -> dict[tuple[str, ...], dict[float, list[float]]]:
+    """Return the numbers of a table by its first `names` columns and by the leak [L/min] in the next."""
+    by: dict[tuple[str, ...], dict[float, list[float]]] = {}
+    for row in first_table(context, item).rows:
+        leak, *numbers = (float(cell) for cell in row[names:] if isinstance(cell, int | float))
+        by.setdefault(tuple(map(str, row[:names])), {})[leak] = numbers
+    return by
+
+
+def judge_claims(context: Context, item: Item) -> tuple[Claim, ...]:
+    """Judge claims 6.2.1 to 6.2.4."""
+    return _disturbance(context), _tolerance(context), _load(context), _valves(context)
+
+
+def _disturbance(context: Context) -> Claim:
+    rows = {lpm: row[2:4] for lpm, row in _rows(context, "sec-6.2-open-loop", 0)[()].items() if lpm > 0}
+    texts = [f"{lpm:g} L/min: {opened:.1f} open, {closed:.2f} closed" for lpm, (opened, closed) in rows.items()]
+    return judged("6.2.1", [abs(closed) < STILL for _, closed in rows.values()], drifts="; ".join(texts))
+
+
+def _tolerance(context: Context) -> Claim:
+    rows = _rows(context, "sec-6.2-controllers", 1)
+    fixed, tolerant = rows[("pi",)], rows[("fault-tolerant",)]
+    error, _, _, stiffness, _ = fixed[0.0]
+    tests, texts = [], []
+    for lpm in sorted(lpm for lpm in fixed if lpm > 0):
+        a, b = fixed[lpm], tolerant[lpm]
+        tests += [b[0] <= (1 + RESTORED) * error, b[3] >= (1 - RESTORED) * stiffness]
+        texts.append(f"{lpm:g} L/min: {a[0]:.3f} and {b[0]:.3f} mm, {a[3]:.0f} and {b[3]:.0f} N/mm")
+    unharmed = tolerant[0.0][0] == error and tolerant[0.0][4] == 0.0
+    unless = "" if unharmed else " NOT"
+    return judged("6.2.2", [*tests, unharmed], pairs="; ".join(texts), error=error, stiffness=stiffness, unless=unless)
+
+
+def _load(context: Context) -> Claim:
+    rows = _rows(context, "sec-6.2-load", 0)[()].values()
+    spread = {}
+    for column, name in ((0, "pi"), (4, "flatness"), (8, "fault-tolerant")):
+        errors = [row[column] for row in rows]
+        spread[name] = min(errors), max(errors)
+    least, worst = max(low for low, _ in spread.values()), [high for _, high in spread.values()]
+    text = "; ".join(f"{name} {low:.3f} to {high:.3f} mm" for name, (low, high) in spread.items())
+    return judged("6.2.3", [max(worst) > APART * min(worst)], spread=text, near=max(worst) < 0.4, least=least)
+
+
+def _valves(context: Context) -> Claim:
+    rows = _rows(context, "sec-6.2-valve", 2)
+    pump, valve = rows["pump", "pi"], rows["valve", "pi"]
+    largest = max(pump)
+    tests = [max(ends) > APART * min(ends) for ends in ((pump[0.0][k], valve[0.0][k]) for k in (5, 0))]
+    worn = pump[largest], valve[largest]
+    return judged("6.2.4", tests, pump=pump[0.0], valve=valve[0.0], largest=largest, worn=worn)
+
+
+_NEEDS = tuple(f"sec-6.2-{name}" for name in ("open-loop", "controllers", "load", "valve"))
 ITEMS: tuple[Item, ...] = (
     Item("sec-6.2-open-loop", 6, "table", "The piston's drift with a leak: open loop and closed loop", open_loop_table),
     Item("sec-6.2-controllers", 6, "table", "Controllers against the size of the leak", controllers_table),
     Item("sec-6.2-load", 6, "table", "Tracking and energy against the load on the cylinder", load_table),
     Item("sec-6.2-outside", 6, "table", "Controllers against oil that leaves past a rod seal", outside_table),
     Item("sec-6.2-valve", 6, "table", "Pump-controlled against valve-controlled", valve_table),
+    Item("chapter-6-claims", 6, "claims", "What section 6.2 expects", judge_claims, needs=_NEEDS),
 )

@@ -14,6 +14,7 @@ from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, ThesisTable
 from sealscope.thesis.sheet import COLUMNS, DataSheet
+from sealscope.thesis.texts import note
 
 #: The direction in which each chamber's RMS is said to move when a leak opens, section 5.6.
 DIRECTION: Mapping[str, int] = {"p_A": -1, "p_B": 1}
@@ -160,19 +161,15 @@ def table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     tables = {
         ("", item.title, RATES): (
             counts(measured, leak, still, drift),
-            "A rule fires when the RMS of the second half lies on the stated side of the first. Intervals are exact "
-            f"(Clopper-Pearson) and take the tests as independent, which repeats of one condition are not.{none} The "
-            "bench had no leak-free test, so its own false-alarm rate is unknown. " + leak_runs.notes,
+            note("rates", none=none, runs=leak_runs.notes),
         ),
         ("-columns", "Sign tests of every column of Appendix C", TESTS): (
             tests,
-            "Two-sided exact sign tests; a low p says that the halves differ, not that a leak is the reason: the leak "
-            "always came second.",
+            note("column-tests"),
         ),
         ("-thresholds", f"The rules of Table 5.1 set for {100 * FALSE_ALARMS:g} % false alarms", THRESHOLDS): (
             thresholds(measured, leak, drift),
-            "On the sheet the threshold is 1.645 times the scatter of d1's changes about zero in the same chamber: "
-            "they are the only leak-free ones; in simulation it is the 95 % point of the drift-only tests.",
+            note("thresholds"),
         ),
     }
     return tuple(

@@ -17,10 +17,10 @@ from sealscope.recordings.recording import Array
 from sealscope.thesis.chapters.appendix_c_runs import simulated_sheet
 from sealscope.thesis.chapters.chapter5 import TESTS, ShownMeasures, measure_test
 from sealscope.thesis.chapters.success_rates import DIRECTION, Rule, column_tests
-from sealscope.thesis.claims.judged import judged
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.products import Claim, ThesisTable
 from sealscope.thesis.sheet import APPENDIX_C, DataSheet
+from sealscope.thesis.texts import judged
 
 if TYPE_CHECKING:
     from sealscope.campaigns.held_out.classifiers import MeasuredSamples

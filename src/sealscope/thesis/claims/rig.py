@@ -11,9 +11,9 @@ from sealscope.recordings.chambers import CHAMBERS
 from sealscope.thesis.chapters.appendix_c_runs import column
 from sealscope.thesis.chapters.success_rates import CLAIMED
 from sealscope.thesis.claims.evidence import NO_SHEET, ClaimEvidence, counted_share, fired
-from sealscope.thesis.claims.judged import judged
 from sealscope.thesis.engine.products import Claim
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG
+from sealscope.thesis.texts import judged
 
 #: How near an estimated onset must come [s].
 _NEAR = 10.0

@@ -30,9 +30,9 @@ from sealscope.thesis.claims.evidence import (
     in_percent,
     moves_beyond_chance,
 )
-from sealscope.thesis.claims.judged import judged
 from sealscope.thesis.engine.products import Claim
 from sealscope.thesis.sheet import APPENDIX_C, DataSheet, mean_leaks
+from sealscope.thesis.texts import judged
 
 _N = len(APPENDIX_C)
 _A_D3, _, _A_BOTH, _, _, _B_BOTH, _TOGETHER = CLAIMED

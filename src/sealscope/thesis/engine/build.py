@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
-from functools import cache, lru_cache
+from dataclasses import astuple, dataclass, replace
+from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
+from sealscope.campaigns.cases.case import digest, files_digest
 from sealscope.campaigns.execution.workers import carried_out, process_count
 from sealscope.errors import InputError, SealscopeError
-from sealscope.thesis.engine.context import Context, RunSpec, SimulatedRun, simulated_run
+from sealscope.thesis.engine.context import Context, Products, RunSpec, SimulatedRun, simulated_run
 from sealscope.thesis.engine.items import Item, collect, select_items, with_needed
 from sealscope.thesis.engine.kept import ResultsFolder
-from sealscope.thesis.engine.products import Claim, Figure, Product, ThesisTable, thinned
+from sealscope.thesis.engine.products import Claim, Figure, Product, thinned
 from sealscope.thesis.sheet import MISSING, DataSheet, find_sheet, read_sheet
 
 #: Draws an item's products into a folder and returns its files, relative to the folder.
-Publish = Callable[[Item, tuple[Product | Claim, ...], Path], tuple[str, ...]]
+Publish = Callable[[Item, Products, Path], tuple[str, ...]]
 #: Called with how many items have ended, of how many, and which are in work.
 Progress = Callable[[int, int, Sequence[str]], None]
 State = Literal["made", "kept", "left out", "failed", "not made"]
@@ -57,19 +56,14 @@ class Reproduction:
         self, folder: Path, items: Sequence[Item], quick: bool, sheet: Path | None, publish: Publish | None
     ) -> None:
         self.folder, self.items = ResultsFolder(folder), {item.id: item for item in items}
-        self.quick, self.publish, self._sheet_folder = quick, publish, sheet
+        self.quick, self.publish = quick, publish
         self.sheet: DataSheet | None = None
         self._sheet_key = ""
         if sheet is not None:
             self.sheet, self._sheet_key = read_sheet(sheet)
         self.statuses: dict[str, ItemStatus] = {}
-        self._run = lru_cache(maxsize=2)(self._kept_run)
 
-    def __reduce__(self) -> tuple[type[Reproduction], tuple[Any, ...]]:
-        given = self.folder.path, tuple(self.items.values()), self.quick, self._sheet_folder, self.publish
-        return Reproduction, given
-
-    def products(self, name: str) -> tuple[Product | Claim, ...] | None:
+    def products(self, name: str) -> Products | None:
         """Return the products of an item that the folder holds; None where it has none of these sources."""
         return self.folder.products(name, self._key(self.items[name]))
 
@@ -77,10 +71,12 @@ class Reproduction:
         """Return the status of every item as the folder has it: kept, left out or not made."""
         statuses = {}
         for name, item in self.items.items():
-            files = self.folder.files(name, self._key(item))
-            statuses[name] = ItemStatus(item, "not made") if files is None else ItemStatus(item, "kept", files=files)
             if self._left_out(item):
                 statuses[name] = ItemStatus(item, "left out", MISSING)
+            elif (files := self.folder.files(name, self._key(item))) is None:
+                statuses[name] = ItemStatus(item, "not made")
+            else:
+                statuses[name] = ItemStatus(item, "kept", files=files)
         return statuses
 
     def make(self, name: str) -> ItemStatus:
@@ -104,10 +100,10 @@ class Reproduction:
         sheet = self._sheet_key if item.needs_sheet or item.uses_sheet else ""
         needs = [self._key(self.items[needed]) for needed in item.needs]
         own = [item.id, item.title, item.make.__module__, item.make.__qualname__, item.inputs]
-        return _digest([own, needs, sheet, self.publish is not None, self.quick, sources_key()])
+        return digest([own, needs, sheet, self.publish is not None, self.quick, sources_key()])
 
     def _context(self, item: Item) -> Context:
-        def product(name: str) -> tuple[Product | Claim, ...]:
+        def product(name: str) -> Products:
             if name not in item.needs:
                 raise InputError(f"{item.id} must name {name} among its needs to ask for its products")
             products = () if self._left_out(self.items[name]) else self.products(name)
@@ -115,13 +111,10 @@ class Reproduction:
                 raise InputError(f"needs {name}, which failed")
             return products
 
-        sheet = self.sheet if item.needs_sheet or item.uses_sheet else None
-        return Context(self.quick, sheet, self._run, product)
+        def run(spec: RunSpec) -> SimulatedRun:
+            return self.folder.run(digest([astuple(spec), sources_key()]), lambda: simulated_run(spec))
 
-    def _kept_run(self, spec: RunSpec) -> SimulatedRun:
-        experiment = spec.experiment()
-        key = _digest([experiment.key(), spec.prove, sources_key()])
-        return self.folder.run(key, lambda: simulated_run(experiment, spec.prove))
+        return Context(self.quick, self.sheet if item.needs_sheet or item.uses_sheet else None, run, product)
 
 
 def reproduce(
@@ -175,8 +168,6 @@ def reproduce(
 
 def _thinned(product: Product | Claim) -> Product | Claim:
     """Thin the long lines of a figure to what an eye can see."""
-    if not isinstance(product, (Figure, ThesisTable, Claim)):
-        raise TypeError(f"a maker must give Figure, ThesisTable or Claim, got {type(product).__name__}")
     if not isinstance(product, Figure):
         return product
     panels = []
@@ -192,12 +183,6 @@ def sources_key() -> str:
     """Digest of the sources of this package and the versions of the libraries under it: what every result rests on."""
     package = Path(__file__).parents[2]
     kinds = (".py", ".toml", ".csv", ".j2", ".css", ".js")
-    files = {str(path.relative_to(package)): path for path in package.rglob("*") if path.suffix in kinds}
-    sources = {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in sorted(files.items())}
+    sources = files_digest(path for path in sorted(package.rglob("*")) if path.suffix in kinds)
     versions = {of.name.lower(): of.version for of in metadata.distributions()}
-    return _digest([sources, [versions.get(name.lower()) for name in _LIBRARIES]])
-
-
-def _digest(value: Any) -> str:
-    """SHA-256 of plain values."""
-    return hashlib.sha256(json.dumps(value).encode()).hexdigest()[:32]
+    return digest([sources, [versions.get(name.lower()) for name in _LIBRARIES]])

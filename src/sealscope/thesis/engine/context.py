@@ -16,6 +16,8 @@ from sealscope.thesis.sheet import DataSheet
 if TYPE_CHECKING:
     from sealscope.simulation.experiment import Experiment
 
+Products = tuple[Product | Claim, ...]
+
 
 @dataclass(frozen=True)
 class RunSpec:
@@ -32,27 +34,16 @@ class RunSpec:
     rig: str = "thesis"
     values: tuple[tuple[str, str | float], ...] = ()
     seed: int = 0
-    x_0: float = 0.0
     method: Literal["auto", "rk4", "imex"] = "auto"
     step: float | None = None
     prove: bool = False
 
     def experiment(self) -> Experiment:
-        """Make the experiment of this spec; raise InputError for one that cannot be."""
+        """Return the experiment of this spec."""
         from sealscope.simulation.experiment import Experiment
 
-        return Experiment.of(
-            rig=self.rig,
-            command=self.command,
-            leak=self.leaks,
-            set=dict(self.values),
-            duration=self.duration,
-            seed=self.seed,
-            x_0=self.x_0,
-            method=self.method,
-            step=self.step,
-            allow_unresolved=True,
-        )
+        given = {name: getattr(self, name) for name in ("command", "duration", "rig", "seed", "method", "step")}
+        return Experiment.of(leak=self.leaks, set=dict(self.values), allow_unresolved=True, **given)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,14 +64,14 @@ class SimulatedRun:
     diverged: str = ""
 
 
-def simulated_run(experiment: Experiment, prove: bool) -> SimulatedRun:
-    """Simulate an experiment, with its halving test where it is asked for."""
+def simulated_run(spec: RunSpec) -> SimulatedRun:
+    """Simulate a run, with its halving test where it is asked for."""
     from sealscope.simulation.simulate import simulate_with_truth
 
     try:
-        simulated = simulate_with_truth(experiment, prove=prove)
+        simulated = simulate_with_truth(spec.experiment(), prove=spec.prove)
     except SimulationFailed as error:
-        return SimulatedRun(None, np.empty(0), {}, 0.0, False if prove else None, diverged=str(error))
+        return SimulatedRun(None, np.empty(0), {}, 0.0, False if spec.prove else None, diverged=str(error))
     truth, proof = simulated.truth, simulated.proof
     moved = {} if proof is None else {change.name: change.difference for change in proof.differences}
     resolved = None if proof is None else proof.resolved
@@ -98,7 +89,7 @@ class Context:
     quick: bool
     sheet: DataSheet | None
     run: Callable[[RunSpec], SimulatedRun]
-    product: Callable[[str], tuple[Product | Claim, ...]]
+    product: Callable[[str], Products]
 
 
 def first_table(context: Context, item: str) -> ThesisTable:

@@ -4,30 +4,20 @@ from __future__ import annotations
 
 import importlib
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from sealscope.calls import nearest
 from sealscope.errors import InputError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from sealscope.thesis.engine.context import Context
-    from sealscope.thesis.engine.products import Claim, Product
-
-    Maker = Callable[[Context, "Item"], tuple[Product | Claim, ...]]
-
-Kind = Literal["case", "figure", "table", "claims"]
+from sealscope.thesis.engine.context import Context, Products
 
 #: Modules that list `ITEMS`, in the order of the thesis.
 MODULES = (
     "chapters.chapter3",
-    "claims.chapter3",
     "chapters.chapter4.figures",
-    "claims.chapter4",
+    "chapters.chapter4.claims",
     "chapters.chapter5",
     "chapters.appendix_c_runs",
     "chapters.appendix_c",
@@ -35,7 +25,6 @@ MODULES = (
     "chapters.success_rates",
     "claims.detection",
     "chapters.chapter6",
-    "claims.chapter6",
 )
 
 
@@ -50,9 +39,9 @@ class Item:
 
     id: str
     chapter: int
-    kind: Kind
+    kind: Literal["case", "figure", "table", "claims"]
     title: str
-    make: Maker
+    make: Callable[[Context, Item], Products]
     inputs: Mapping[str, Any] = field(default_factory=dict)
     needs_sheet: bool = False
     uses_sheet: bool = False

@@ -151,7 +151,7 @@ class SolverPair:
 
     def of(self, solver: Solver) -> SimulatedRun:
         """Return the run with that solver."""
-        return {"literal": self.literal, "converged": self.converged}[solver]
+        return self.literal if solver == "literal" else self.converged
 
     def runs(self) -> list[tuple[Solver, str, SimulatedRun]]:
         """Return solver, label and run of those that did not diverge."""
@@ -185,43 +185,26 @@ def mean_difference(run: SimulatedRun, first: str, second: str) -> float:
     return float(np.mean(steady_output(run, first) - steady_output(run, second)))
 
 
-@dataclass(frozen=True)
-class RunNumbers:
-    """Numbers of one command under one reading, closing [%] and solver.
+def numbers_of(run: SimulatedRun) -> dict[str, float]:
+    """Return ranges, peaks and least value of the pressures, mean and largest drop at the orifices [Pa], by name.
 
-    Range, peak and least value [Pa] of each pressure, mean differences across both orifices [Pa], largest drop [Pa],
-    and how unlike the two flows are.
+    `flows differ`: rms of Q_A - Q_B over that of Q_A. All nan where the run diverged.
     """
-
-    span: dict[str, float]
-    peak: dict[str, float]
-    least: dict[str, float]
-    p_1_less_p_A: float
-    p_2_less_p_B: float
-    largest_drop: float
-    flows_differ: float
-    resolved: bool | None
-
-
-def numbers_of(run: SimulatedRun) -> RunNumbers:
-    """Return the numbers of one run; nan throughout where it diverged."""
     of = {name: steady_output(run, name) for name in (*PRESSURES, "Q_A", "Q_B")}
-    drops = [of["p_1"] - of["p_A"], of["p_2"] - of["p_B"]]
-    return RunNumbers(
-        span={name: float(np.ptp(of[name])) for name in PRESSURES},
-        peak={name: float(of[name].max()) for name in PRESSURES},
-        least={name: float(of[name].min()) for name in PRESSURES},
-        p_1_less_p_A=float(np.mean(drops[0])),
-        p_2_less_p_B=float(np.mean(drops[1])),
-        largest_drop=float(np.abs(drops).max()),
-        flows_differ=float(np.sqrt(np.mean((of["Q_A"] - of["Q_B"]) ** 2) / np.mean(of["Q_A"] ** 2))),
-        resolved=False if run.diverged else run.resolved,
-    )
+    drops = {"p_1 - p_A": of["p_1"] - of["p_A"], "p_2 - p_B": of["p_2"] - of["p_B"]}
+    return {
+        **{f"range of {name}": float(np.ptp(of[name])) for name in PRESSURES},
+        **{f"peak of {name}": float(of[name].max()) for name in PRESSURES},
+        "least pressure": min(float(of[name].min()) for name in PRESSURES),
+        **{f"mean of {name}": float(np.mean(drop)) for name, drop in drops.items()},
+        "largest drop": max(float(np.abs(drop).max()) for drop in drops.values()),
+        "flows differ": float(np.sqrt(np.mean((of["Q_A"] - of["Q_B"]) ** 2) / np.mean(of["Q_A"] ** 2))),
+    }
 
 
 def throttled(
     context: Context, reading: Reading, closed_pct: float | None, solver: Solver, command: str = COMMAND
-) -> RunNumbers:
+) -> dict[str, float]:
     """Return the numbers of a command under a reading, with throttles closed by `closed_pct` [%] (None: absent)."""
     return numbers_of(context.run(spec(command, closed_pct, reading, solver)))
 

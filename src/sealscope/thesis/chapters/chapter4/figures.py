@@ -28,6 +28,7 @@ from sealscope.thesis.chapters.chapter4.friction import friction_models, stribec
 from sealscope.thesis.engine.context import Context, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, Figure, FigureCurve, Number, Panel, Role, ThesisTable
+from sealscope.thesis.texts import note
 from sealscope.units import LITRE_PER_MINUTE
 
 #: Unit and factor from SI of what the figures show.
@@ -72,16 +73,16 @@ def _case_of(context: Context, item: Item) -> tuple[SolverPair, str]:
 
 def _notes(pair: SolverPair, reading: Reading | None) -> str:
     """Return the notes on a figure of a pair; `reading`: None without orifices."""
-    notes = ["The thesis also draws the curve measured on its rig, whose numbers it does not give."]
+    notes = [note("measured-curve")]
     if reading is not None:
         notes.append(f"Reading: {reading.title}.")
     for _, label, run in pair.runs():
         lowest = min(float(run.outputs[name].min()) for name in PRESSURES) * 1e-6
         if lowest < _VACUUM:
-            notes.append(f"With {label} a pressure falls to {lowest:.2f} MPa, below vacuum, which oil cannot.")
+            notes.append(note("vacuum", label=label, lowest=lowest))
     notes += [f"{run.diverged}." for run in (pair.literal, pair.converged) if run.diverged]
     if not pair.literal.resolved and pair.converged.resolved:
-        notes.append("The converged run passes the halving test, the one with RK4 at 1e-4 s does not.")
+        notes.append(note("literal-unresolved"))
     return " ".join(notes)
 
 
@@ -226,20 +227,15 @@ def volume_sweep(context: Context, item: Item) -> tuple[Figure, ...]:
         curves, added = _swept(f"{what} at {{:g}} cm3", pairs, measure, list(LABELS))
         panels.append(Panel("V_1 = V_2 [cm3]", f"{what} [MPa]", curves, f"({letter})", log_x=True))
         numbers += added
-    notes = (
-        f"{command}, {closed:g} % closed, {OURS.title}. Converged, the volumes only shift the ringing of the oil; with "
-        "RK4 at 1e-4 s the smaller the volume, the further the pump's pressure settles from the chamber's."
-    )
+    notes = note("volumes", command=command, closed=closed, reading=OURS.title)
     return _figure(item, panels, numbers, all(pair.resolved for pair in pairs.values()), notes, (1,))
 
 
 def measured_only(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate the figures of chapter 4 that show measured curves alone, and the simulated ones in their place."""
     rows = tuple((*row, "cannot be reproduced: no numbers are given") for row in _MEASURED)
-    notes = (
-        "The measured curves beside the simulated ones in Figs. 4.4-4.11 and 4.17-4.32 are missing for the same reason."
-    )
-    return (ThesisTable(item.id, item.title, ("figure", "what it shows", "simulated", "why"), rows, (), None, notes),)
+    heads = ("figure", "what it shows", "simulated", "why")
+    return (ThesisTable(item.id, item.title, heads, rows, notes=note("measured-only")),)
 
 
 def _of_case(number: int, title: str, case: str, quantities: tuple[str, ...]) -> Item:

@@ -11,6 +11,7 @@ from sealscope.recordings.recording import Array
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Figure, FigureCurve, Number, Panel
+from sealscope.thesis.texts import note
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -71,8 +72,7 @@ def friction_models(context: Context, item: Item) -> tuple[Figure, ...]:
         Number("breakaway force", peak, "N"),
         Number("threshold velocity", f.v_th, "m/s"),
     )
-    notes = "Sketches (a) to (c) hold the rig's own forces without pressure; the rig is simulated with (d)."
-    return (Figure(item.id, item.title, panels, numbers, ("claim-4.20",), None, notes),)
+    return (Figure(item.id, item.title, panels, numbers, ("claim-4.20",), None, note("friction-models")),)
 
 
 def stribeck_curve(context: Context, item: Item) -> tuple[Figure, ...]:
@@ -106,8 +106,4 @@ def stribeck_curve(context: Context, item: Item) -> tuple[Figure, ...]:
         ),
         Number("friction falls up to", falls_up_to(f.F_pr), "m/s"),
     )
-    notes = (
-        "Without pressure unless said. Below the velocity where the slope changes sign friction feeds the oscillation "
-        "of the piston between its oil columns: each reversal rings."
-    )
-    return (Figure(item.id, item.title, panels, numbers, ("claim-4.20",), None, notes),)
+    return (Figure(item.id, item.title, panels, numbers, ("claim-4.20",), None, note("stribeck")),)

@@ -1,4 +1,4 @@
-"""A claim of `claims.toml` with its numbers put in and its verdict."""
+"""Texts with numbers put in: notes under figures and tables (`notes.toml`), claims and verdicts (`claims.toml`)."""
 
 from __future__ import annotations
 
@@ -12,8 +12,13 @@ from sealscope.thesis.engine.products import Claim, verdict_of
 
 
 @cache
-def _texts() -> dict[str, dict[str, str]]:
-    return tomllib.loads(files(__package__).joinpath("claims.toml").read_text(encoding="utf-8"))
+def _texts(name: str) -> dict[str, Any]:
+    return tomllib.loads(files(__package__).joinpath(name).read_text(encoding="utf-8"))
+
+
+def note(name: str, **values: Any) -> str:
+    """Return the note of that name with `values` put in."""
+    return str(_texts("notes.toml")[name]).format(**values)
 
 
 def judged(id: str, tests: Iterable[bool | None], kind: str = "", /, **values: Any) -> Claim:
@@ -21,10 +26,9 @@ def judged(id: str, tests: Iterable[bool | None], kind: str = "", /, **values: A
 
     `sheet` and `simulation` among the values take the place of the texts of that name.
     """
-    texts = _texts()
+    texts = _texts("claims.toml")
     text = dict(texts[kind or id])
     text.setdefault("sheet", next(of for prefix, of in texts["sheet"].items() if id.startswith(prefix)))
     filled = {name: of.format(**values) for name, of in text.items()}
     filled |= {name: values[name] for name in ("sheet", "simulation") if name in values}
-    filled["verdict"] = verdict_of(tests)
-    return Claim(id=f"claim-{id}", **filled)  # type: ignore[arg-type]  # the verdict is one of the texts that it may be
+    return Claim(id=f"claim-{id}", verdict=verdict_of(tests), **filled)

@@ -6,10 +6,11 @@ beside.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -23,21 +24,22 @@ from sealscope.thesis.chapters.chapter4.cases import (
     OURS,
     SOLVERS,
     Reading,
-    RunNumbers,
     Solver,
     spec,
     steady_output,
     throttled,
 )
 from sealscope.thesis.chapters.chapter4.friction import falls_up_to, jumps_at_threshold, thesis_rig
-from sealscope.thesis.claims.judged import judged
 from sealscope.thesis.engine.context import Context, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, Claim, ThesisTable
+from sealscope.thesis.texts import judged, note
 
 #: Share of the drift without orifices that a change of drift must reach to count.
 DRIFT_SHARE = 0.01
 _T = TypeVar("_T")
+#: Numbers of several commands or closings, by name.
+Rows = list[dict[str, float]]
 
 
 def sine_fit(t: Array, values: Array, omega: float) -> tuple[float, float]:
@@ -181,75 +183,66 @@ def _range(values: Iterable[float], unit: str = "kPa", factor: float = 1e-3) -> 
     return f"{min(scaled):+.2f} to {max(scaled):+.2f} {unit}"
 
 
-def _at_25_percent(context: Context, under: Callable[..., Any]) -> Iterator[Claim]:
-    """Judge what is said of 3 sin(4t) with the orifices open and 25 % closed; `under` gives numbers by reading."""
-    limit = cases.visible_pressure()
-    pairs = under(lambda r, solver: [throttled(context, r, closed, solver, COMMANDS[0]) for closed in (0.0, 25.0)])
-
-    def changes(pair: list[RunNumbers]) -> list[float]:
-        """Change of the four peaks and of the four ranges."""
-        return [getattr(pair[1], of)[p] - getattr(pair[0], of)[p] for of in ("peak", "span") for p in PRESSURES]
-
-    def text(rows: list[list[RunNumbers]]) -> str:
-        return "25 % against open, peaks and ranges " + _range(change for row in rows for change in changes(row))
-
-    yield _over(8, pairs, lambda pair: (abs(change) < limit for change in changes(pair)), text)
-    yield _over(10, pairs, lambda pair: (abs(change) > limit for change in changes(pair)[:4]), text)
-    yield _over(
-        9,
-        pairs,
-        lambda pair: (pair[1].flows_differ < 0.05,),
-        lambda rows: f"rms of Q_A - Q_B over rms of Q_A at most {max(n.flows_differ for _, n in rows) * 100:.2f} %",
-    )
-    yield _over(
-        11,
-        pairs,
-        lambda pair: (pair[1].p_1_less_p_A < 0, pair[1].p_1_less_p_A < -limit),
-        lambda rows: "mean of p_1 - p_A " + _range(n.p_1_less_p_A for _, n in rows),
-    )
-    yield _over(
-        12,
-        pairs,
-        lambda pair: (pair[1].p_2_less_p_B > 0, pair[1].p_2_less_p_B > limit),
-        lambda rows: "mean of p_2 - p_B " + _range(n.p_2_less_p_B for _, n in rows),
-    )
+def _ranges(head: str, values: Callable[[Rows], Iterable[float]]) -> Callable[[list[Rows]], str]:
+    return lambda every: f"{head} {_range(value for rows in every for value in values(rows))}"
 
 
-def _over_openings(context: Context, under: Callable[..., Any]) -> Iterator[Claim]:
-    """Judge what is said of amplitudes and of tighter orifices; `under` gives numbers by reading and solver."""
+def _changes(rows: Rows, kind: str, names: Iterable[str] = PRESSURES) -> list[float]:
+    """Return by how much each later row exceeds the first, in the `kind` of number of the named pressures."""
+    keys = [f"{kind} of {name}" for name in names]
+    return [row[key] - rows[0][key] for row in rows[1:] for key in keys]
+
+
+def _orifices(context: Context) -> Iterator[Claim]:
+    """Judge what is said of the orifices under several commands and closings."""
     limit = cases.visible_pressure()
 
-    def growths(rows: list[RunNumbers]) -> list[float]:
-        return [rows[2].span[name] - rows[0].span[name] for name in PRESSURES]
+    def under(*runs: tuple[str, float]) -> dict[Solver, dict[Reading, Rows]]:
+        """Return the numbers of each command and closing, under every reading and solver."""
 
-    def rises(rows: list[RunNumbers]) -> list[float]:
-        return [row.peak[name] - rows[0].peak[name] for row in rows[1:] for name in CHAMBERS]
+        def rows(reading: Reading, solver: Solver) -> Rows:
+            return [throttled(context, reading, closed, solver, command) for command, closed in runs]
 
-    def widened(rows: list[RunNumbers]) -> Iterator[bool]:
+        return {solver: {r: rows(r, solver) for r in cases.readings(context.quick)} for solver in SOLVERS}
+
+    def both(rows: Rows) -> list[float]:
+        return _changes(rows, "peak") + _changes(rows, "range")
+
+    def widest(rows: Rows) -> list[float]:
+        return _changes([rows[0], rows[-1]], "range")
+
+    def widened(rows: Rows) -> Iterator[bool]:
         for name in PRESSURES:
-            a, b, c = (row.span[name] for row in rows)
+            a, b, c = (row[f"range of {name}"] for row in rows)
             yield a < b < c and c - a > limit
 
-    commands = under(lambda r, solver: [throttled(context, r, 50.0, solver, command) for command in COMMANDS])
-    seven = under(lambda r, solver: [throttled(context, r, closed, solver, COMMANDS[2]) for closed in CLOSINGS])
-    five = under(lambda r, solver: [throttled(context, r, closed, solver) for closed in CLOSINGS])
-    for number, numbers, measured, head in (
-        (14, commands, growths, f"{COMMANDS[2]} against {COMMANDS[0]}, 50 % closed, ranges "),
-        (15, seven, rises, f"50 and 75 against 25 % closed, {COMMANDS[2]}, peaks "),
-        (21, five, lambda rows: [n.largest_drop for n in rows], f"largest drop at 25, 50, 75 % under {COMMAND} "),
-    ):
-        yield _over(
-            number,
-            numbers,
-            lambda rows, of=measured: (value > limit for value in of(rows)),  # type: ignore[misc]
-            lambda every, of=measured, head=head: head + _range(value for rows in every for value in of(rows)),  # type: ignore[misc]
-        )
-    yield _over(
-        16,
-        five,
-        widened,
-        lambda every: "75 against 25 % closed, ranges " + _range(value for rows in every for value in growths(rows)),
-    )
+    def rises(rows: Rows) -> list[float]:
+        return _changes(rows, "peak", CHAMBERS)
+
+    def drops(rows: Rows) -> list[float]:
+        return [row["largest drop"] for row in rows]
+
+    opened = under((COMMANDS[0], 0.0), (COMMANDS[0], 25.0))
+    commands = under(*((command, 50.0) for command in COMMANDS))
+    seven, five = (under(*((command, closed) for closed in CLOSINGS)) for command in (COMMANDS[2], COMMAND))
+    text = _ranges("25 % against open, peaks and ranges", both)
+    yield _over(8, opened, lambda rows: (abs(change) < limit for change in both(rows)), text)
+    yield _over(10, opened, lambda rows: (abs(change) > limit for change in _changes(rows, "peak")), text)
+    p_1, p_2, flows = "mean of p_1 - p_A", "mean of p_2 - p_B", "flows differ"
+    most = "rms of Q_A - Q_B over rms of Q_A at most {:.2f} %"
+    text = lambda every: most.format(100 * max(rows[1][flows] for rows in every))  # noqa: E731
+    yield _over(9, opened, lambda rows: [rows[1][flows] < 0.05], text)
+    text = _ranges(p_1, lambda rows: [rows[1][p_1]])
+    yield _over(11, opened, lambda rows: (rows[1][p_1] < 0, rows[1][p_1] < -limit), text)
+    text = _ranges(p_2, lambda rows: [rows[1][p_2]])
+    yield _over(12, opened, lambda rows: (rows[1][p_2] > 0, rows[1][p_2] > limit), text)
+    text = _ranges(f"{COMMANDS[2]} against {COMMANDS[0]}, 50 % closed, ranges", widest)
+    yield _over(14, commands, lambda rows: (growth > limit for growth in widest(rows)), text)
+    text = _ranges(f"50 and 75 against 25 % closed, {COMMANDS[2]}, peaks", rises)
+    yield _over(15, seven, lambda rows: (rise > limit for rise in rises(rows)), text)
+    yield _over(16, five, widened, _ranges("75 against 25 % closed, ranges", widest))
+    text = _ranges(f"largest drop at 25, 50, 75 % under {COMMAND}", drops)
+    yield _over(21, five, lambda rows: (drop > limit for drop in drops(rows)), text)
 
 
 def _drift(context: Context) -> Iterator[Claim]:
@@ -288,30 +281,23 @@ def _drift(context: Context) -> Iterator[Claim]:
 
 def claims(context: Context, item: Item) -> tuple[ThesisTable | Claim, ...]:
     """Make the table of all readings, closings and solvers, and judge the claims of chapter 4."""
-
-    def under(of: Callable[[Reading, Solver], Any]) -> dict[Solver, dict[Reading, Any]]:
-        return {solver: {r: of(r, solver) for r in cases.readings(context.quick)} for solver in SOLVERS}
-
     judgements = (
         *_without_orifices(context),
         *_step_and_gains(context),
         *_printed(context),
-        *_at_25_percent(context, under),
-        *_over_openings(context, under),
+        *_orifices(context),
         *_drift(context),
     )
     ordered = sorted(judgements, key=lambda claim: int(claim.id.rpartition(".")[2]))
-    rows = [
-        (reading.title, closed, cases.SOLVER_TEXT[solver], *_row(throttled(context, reading, closed, solver)))
-        for reading in cases.readings(context.quick)
-        for solver in SOLVERS
-        for closed in (0.0, *CLOSINGS)
-    ]
-    notes = (
-        f"Numbers {cases.WINDOW}. Q_A unlike Q_B: rms of their difference over the rms of Q_A. Rows that did not pass "
-        "the halving test show the step, not the rig."
-    )
-    ids = tuple(claim.id for claim in ordered)
+    rows: list[tuple[Cell, ...]] = []
+    for reading, solver, closed in itertools.product(cases.readings(context.quick), SOLVERS, (0.0, *CLOSINGS)):
+        run = context.run(spec(COMMAND, closed, reading, solver))
+        numbers = cases.numbers_of(run)
+        values = (numbers[name] * factor for name, factor in _SHOWN.items())
+        tested = {True: "passed", False: "not passed", None: "not made"}[run.resolved]
+        cells = (value if math.isfinite(value) else None for value in values)
+        rows.append((reading.title, closed, cases.SOLVER_TEXT[solver], *cells, tested))
+    ids, notes = tuple(claim.id for claim in ordered), note("readings", window=cases.WINDOW)
     return (ThesisTable(item.id, item.title, _COLUMNS, tuple(rows), ids, None, notes), *ordered)
 
 
@@ -321,14 +307,13 @@ _COLUMNS = (
 )
 
 
-def _row(numbers: RunNumbers) -> tuple[Cell, ...]:
-    MPa = (*numbers.span.values(), min(numbers.least.values()))
-    kPa = (numbers.p_1_less_p_A, numbers.p_2_less_p_B, numbers.largest_drop)
-    values = (*(of * 1e-6 for of in MPa), *(of * 1e-3 for of in kPa), numbers.flows_differ * 100.0)
-    tested = {True: "passed", False: "not passed", None: "not made"}[numbers.resolved]
-    return (*(value if math.isfinite(value) else None for value in values), tested)
-
-
+#: The numbers of a row of that table, and the factor to its unit.
+_SHOWN: dict[str, float] = {
+    **{f"range of {name}": 1e-6 for name in PRESSURES},
+    "least pressure": 1e-6,
+    **dict.fromkeys(("mean of p_1 - p_A", "mean of p_2 - p_B", "largest drop"), 1e-3),
+    "flows differ": 100.0,
+}
 ITEMS: tuple[Item, ...] = (
     Item("chapter-4-claims", 4, "claims", f"Chapter 4 under every reading of its equations, {COMMAND}", claims),
 )
