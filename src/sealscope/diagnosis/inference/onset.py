@@ -45,6 +45,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sealscope.recordings.recording import Array
 
@@ -181,6 +182,11 @@ class Course(NamedTuple):
         value = float(weights @ self.mean)
         half = 1.96 * float(np.sqrt(np.maximum(weights @ self.covariance @ weights, 0.0)))
         return Interval(value, value - half, value + half)
+
+    def beyond(self, before: NDArray[np.bool_]) -> Course:
+        """Return the coefficient beyond its mean over some blocks (K,)."""
+        turn = np.eye(len(before)) - before / max(int(np.count_nonzero(before)), 1)
+        return Course(turn @ self.mean, turn @ self.covariance @ turn.T)
 
 
 def course(information: Information, test: StepTest | None, step: bool) -> Course:
