@@ -243,12 +243,17 @@ def step_test(information: Information, signs: Sequence[float] = (1.0,)) -> Step
 
     The chance of one of two is twice that stated.
     """
+    return max(step_tests(information, signs), key=lambda test: test.score, default=None)
+
+
+def step_tests(information: Information, signs: Sequence[float]) -> list[StepTest]:
+    """Return the tests of a step of each of the `signs`; none where too few blocks say anything."""
     time, precision, vector = _with_level(information)
     count = len(time)
     values, vectors = np.linalg.eigh(precision)
     kept = values > _RANK * max(float(values[-1]), 0.0)
     if count < FEWEST or np.count_nonzero(kept) < FEWEST:
-        return None
+        return []
     root = np.sqrt(values[kept])
     design = (vectors[:, kept] * root).T
     z = (vectors[:, kept].T @ vector) / root
@@ -266,8 +271,7 @@ def step_test(information: Information, signs: Sequence[float] = (1.0,)) -> Step
     steps = np.clip(index[:, None] + 1.0 - at, 0.0, 1.0)
     z, steps, eigen = basis.T @ (free @ z), basis.T @ (inner @ steps), np.maximum(eigen, 0.0)
     onsets, believed = _onset_times(time, at), -np.log1p(WALKS * unit * count / information.walk**2)
-    tests = [_scan(sign * z, steps, eigen, onsets, unit, believed) for sign in signs]
-    return max(tests, key=lambda test: test.score)
+    return [_scan(sign * z, steps, eigen, onsets, unit, believed) for sign in signs]
 
 
 def two_sided(information: Information) -> StepTest | None:

@@ -18,7 +18,6 @@ a coefficient more costs log K (G. Schwarz, Ann. Statist. 6 (1978) 461).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -30,19 +29,17 @@ from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.recordings.recording import Array, Recording
 
 _RANK = 1e-9  # directions that carry less than this share of the largest carry nothing
+A, B, HALF_A, HALF_B = np.eye(4)
 #: Oil that is lost lowers both levels; what raises them has many causes.
 CHARGE = "a loss of oil"
-
-
-class Pattern(NamedTuple):
-    """A hypothesis: which of (level A, level B, half A, half B) step together, and what that means.
-
-    `bases`: rows (m, 4) that span them; where a simpler pattern lies within, once with it first for each.
-    """
-
-    name: str
-    cause: Cause | None
-    bases: tuple[Array, ...]
+#: What a pattern means, and rows that span it; where a simpler pattern lies within, once with it first for each.
+PATTERNS: dict[str, tuple[Cause, list[list[Array]]]] = {
+    CHARGE: ("external leak", [[A + B]]),
+    "friction": ("friction change", [[A + B, HALF_A, HALF_B]]),
+    "load": ("changed duty", [[A, B], [B, A], [A + B, A]]),
+    "zero of p_A": ("sensor fault", [[A]]),
+    "zero of p_B": ("sensor fault", [[B]]),
+}
 
 
 class Level(NamedTuple):
@@ -98,18 +95,6 @@ def levels(recording: Recording) -> tuple[Array, Array] | None:
     return None
 
 
-def _patterns(mean: Array) -> Iterator[Pattern]:
-    """Yield the hypotheses about the four numbers, by their means (4,)."""
-    A, B, half_A, half_B = np.eye(4)
-    yield Pattern(CHARGE, "external leak", (np.array([A + B]),))
-    yield Pattern("friction", "friction change", (np.array([A + B, half_A, half_B]),))
-    yield Pattern("load", "changed duty", tuple(np.array(own) for own in ([A, B], [B, A], [A + B, A])))
-    yield Pattern("zero of p_A", "sensor fault", (A[None],))
-    yield Pattern("zero of p_B", "sensor fault", (B[None],))
-    yield Pattern("scale of p_A", "sensor fault", ((mean[0] * A + mean[2] * half_A)[None],))
-    yield Pattern("scale of p_B", "sensor fault", ((mean[1] * B + mean[3] * half_B)[None],))
-
-
 def level_tests(recording: Recording) -> tuple[Level, ...]:
     """Return the tests of all patterns, the most likely first."""
     made = levels(recording)
@@ -123,18 +108,21 @@ def level_tests(recording: Recording) -> tuple[Level, ...]:
     eigen, basis = np.linalg.eigh(covariance / np.outer(size, size))
     root = np.zeros((len(kept), 4))
     root[:, kept] = (basis / np.sqrt(np.maximum(eigen, _RANK))) @ basis.T / size
-    tested = []
-    for pattern in _patterns(values.mean(axis=0)):
-        tests = [_test(pattern, own @ root.T, values @ root.T, time) for own in pattern.bases]
+    mean, both, tested = values.mean(axis=0), values[:, :2].sum(axis=1), []
+    patterns = dict(PATTERNS)
+    for side, own in (("A", A + HALF_A), ("B", B + HALF_B)):
+        patterns[f"scale of p_{side}"] = "sensor fault", [[mean * own]]
+    for name, (cause, bases) in patterns.items():
+        tests = [_test(name, cause, np.array(own) @ root.T, values @ root.T, time) for own in bases]
         least = min((test for test in tests if test is not None), key=lambda test: test.rank, default=None)
         if least is not None:
-            after, both = time > least.onset, values[:, :2].sum(axis=1)
+            after = time > least.onset
             falls = after.any() and not after.all() and both[after].mean() <= both[~after].mean()
-            tested.append(least._replace(cause=None) if pattern.name == CHARGE and not falls else least)
+            tested.append(least._replace(cause=None) if name == CHARGE and not falls else least)
     return tuple(sorted(tested, key=lambda test: -test.rank))
 
 
-def _test(pattern: Pattern, rows: Array, whitened: Array, time: Array) -> Level | None:
+def _test(name: str, cause: Cause, rows: Array, whitened: Array, time: Array) -> Level | None:
     """Return the test of whitened blocks (K, c) by the steps of `rows` (m, c), the first of them as it is."""
     basis, size = np.linalg.qr(rows.T)
     basis = basis[:, np.abs(np.diag(size)) > _RANK * np.abs(size).max()]
@@ -150,4 +138,4 @@ def _test(pattern: Pattern, rows: Array, whitened: Array, time: Array) -> Level 
     chance = 2.0 * count * min(test.law.chance(score) for test in tests)
     rank = 2.0 * half * float(shares[best]) - (count - 1) * float(np.log(len(time)))
     onset, block = float(tests[0].onsets[best]), float(time[1] - time[0])
-    return Level(pattern.name, pattern.cause, rank, score, min(1.0, chance), onset, block)
+    return Level(name, cause, rank, score, min(1.0, chance), onset, block)

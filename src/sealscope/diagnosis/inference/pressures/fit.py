@@ -22,9 +22,9 @@ from sealscope.diagnosis.beliefs import beliefs as believed_of
 from sealscope.diagnosis.inference.onset import Information
 from sealscope.recordings.recording import Array
 
-#: Differences as a share of what is believed; shares of a step that are tried; gain of twice the log likelihood that is
-#: worth a run; damping after a step that did not gain.
-_NUDGE, SHARES, _ENOUGH, _DAMPED = 0.05, np.array([1.0, 0.5, 0.17, 0.06, 0.02]), 5.0, 0.1
+#: Differences as a share of what is believed; most steps of a fit, shares of one that are tried, and the gain of twice
+#: the log likelihood that is worth a run.
+_NUDGE, STEPS, _SHARES, _ENOUGH = 0.05, 12, np.array([1.0, 0.5, 0.17, 0.06, 0.02]), 5.0
 
 
 class Normal(NamedTuple):
@@ -107,14 +107,14 @@ def descend(model: Model[L], look: L, belief: Normal, steps: int, variance: floa
         move = np.linalg.solve(H + damping * np.diag(np.diag(H)), rise)
         if not float(rise @ move) >= _ENOUGH:
             break
-        paths = np.clip(look.theta + SHARES[:, None] * move * unit, *model.bounds(look.theta))
+        paths = np.clip(look.theta + _SHARES[:, None] * move * unit, *model.bounds(look.theta))
         whole, squares = model.look(paths)
         off = (paths - belief.mean) / unit
         costs = squares / noise + np.sum(off @ belief.precision * off, axis=1)
         gains = np.nan_to_num(look.cost(noise, belief, unit) - costs, nan=-np.inf)
         best = int(np.argmax(gains))
         if not gains[best] > 0.0:
-            damping = max(10.0 * damping, _DAMPED)
+            damping = max(10.0 * damping, 0.1)
             continue
         damping = 0.1 * damping
         look = whole if best == 0 else model.look(paths[best : best + 1])[0]

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
-from scipy.signal import lfilter
+from scipy.signal import find_peaks, lfilter, welch
 
 from sealscope.compiled import contracted, kernel
 from sealscope.diagnosis.inference.pressures.evidence import (
@@ -37,7 +37,7 @@ from sealscope.diagnosis.inference.pressures.evidence import (
     unusable,
     wander_of_conductance,
 )
-from sealscope.diagnosis.inference.pressures.fit import Beliefs, Block, Joint, Look, Normal, descend
+from sealscope.diagnosis.inference.pressures.fit import STEPS, Beliefs, Block, Joint, Look, Normal, descend
 from sealscope.physics.cylinder import piston_acceleration, pressure_rate
 from sealscope.physics.friction import coulomb_friction, stribeck_level
 from sealscope.physics.lanes import SINGLE_WIDTH, load, select, store
@@ -68,8 +68,8 @@ LAWS = STRIBECK, BRISTLES = "stribeck", "bristles"
 _FOLLOW = BELIEVED["follow"]
 _UNCENTRED = 1.0 / _FOLLOW["centring"]
 #: Longest step of the solver [s]: RK4 is within 100 Pa there, far under the noise of transducers; least give [m/N] and
-#: lag [s]; most steps of a fit, fewer of one among several, and length of spectra [samples].
-_STEP, _LEAST, _STEPS, _FEW_STEPS, _SEGMENT = 1.01e-3, 1e-9, 12, 2, 256
+#: lag [s]; length of spectra [samples].
+_STEP, _LEAST, _SEGMENT = 1.01e-3, 1e-9, 256
 
 
 @contracted
@@ -221,19 +221,15 @@ class Machine(NamedTuple):
 
         They are the rig's where no frequency that the recording holds is believed of the machine.
         """
-
-        def power(values: Array) -> Array:
-            parts = np.lib.stride_tricks.sliding_window_view(values, _SEGMENT)[:: _SEGMENT // 2]
-            return np.asarray(np.square(np.abs(np.fft.rfft(parts * np.hanning(_SEGMENT), 4 * _SEGMENT))).mean(axis=0))
-
         share = beliefs.width[K_OIL] / beliefs.centre[K_OIL]
         middle = 4 * _SEGMENT / self.period(beliefs.centre[K_OIL])
         k = np.arange(math.ceil(middle * math.exp(-2.0 * share)), min(2 * _SEGMENT, int(middle * math.exp(share))))
         if not k.size:
             return np.full(2, beliefs.centre[K_OIL])
-        beyond = np.pad((power(dp) - power(total))[k], 1, constant_values=-np.inf)
-        peaks = np.flatnonzero((beyond[1:-1] >= beyond[2:]) & (beyond[1:-1] >= beyond[:-2]))
-        chosen = np.resize(peaks[np.argsort(-beyond[1:-1][peaks])], 2)
+        powers = welch(np.stack([dp, total]), nperseg=_SEGMENT, nfft=4 * _SEGMENT, detrend=False)[1]
+        beyond = np.pad((powers[0] - powers[1])[k], 1, constant_values=-np.inf)
+        peaks = find_peaks(beyond)[0] - 1
+        chosen = np.resize(peaks[np.argsort(-beyond[1 + peaks])], 2)
         return np.asarray(beliefs.centre[K_OIL] * (k[chosen] / middle) ** 2)
 
 
@@ -365,7 +361,7 @@ def first_fit(stretch: Stretch, total: Array, noise: float) -> SimulatedLook:
     gains = beliefs.centre[GAIN] * _tried("start", GAIN, 8)
     springs = beliefs.centre[SPRING] + beliefs.width[SPRING] * np.array([0.0, 1.0])
     first = ranked(slow, beliefs.centre, 1, {GAIN: np.tile(gains, 2), SPRING: np.repeat(springs, 8)})
-    theta = descend(slow, slow.look(first[0])[0], beliefs.normal, _STEPS // 2).theta
+    theta = descend(slow, slow.look(first[0])[0], beliefs.normal, STEPS // 2).theta
     ringing = stretch.machine.ringing(stretch.dp, total, beliefs)
     stiffnesses = np.append(ringing, beliefs.centre[K_OIL] * _tried("start", K_OIL, 2))
     breakaways = theta[K_BRK] * _tried("start", K_BRK, 4)
@@ -379,7 +375,7 @@ def first_fit(stretch: Stretch, total: Array, noise: float) -> SimulatedLook:
 def fitted(stretch: Stretch, starts: Sequence[Array] | Array, noise: float, kept: int) -> SimulatedLook:
     """Return the likeliest look that steps from several starts lead to, few from all and more from the best `kept`."""
     looks, belief = [stretch.look(start[None])[0] for start in starts], stretch.beliefs.normal
-    for steps, number in ((_FEW_STEPS, kept), (_STEPS, 1)):
+    for steps, number in ((STEPS // 6, kept), (STEPS, 1)):
         looks = [descend(stretch, look, belief, steps, noise) for look in looks]
         costs = np.nan_to_num([look.cost(noise, belief, stretch.unit) for look in looks], nan=np.inf)
         looks = [looks[place] for place in np.argsort(costs)[:number]]
@@ -462,7 +458,7 @@ class Follower:
         """
 
         def candidate(start: Array, belief: Normal) -> tuple[float, SimulatedLook, Normal]:
-            look = descend(stretch, stretch.look(start[None])[0], belief, _STEPS, self.variance)
+            look = descend(stretch, stretch.look(start[None])[0], belief, STEPS, self.variance)
             return look.cost(self.variance, belief, stretch.unit), look, belief
 
         candidates = [candidate(self.theta, self._belief(seconds))]
@@ -508,20 +504,7 @@ def response(recording: Recording, rig: Rig) -> Joint | None:
 
 
 def evidence(recording: Recording, rig: Rig) -> PressureEvidence | None:
-    """Return what the whole response says of the conductance past the piston, block by block.
-
-    Parameters
-    ----------
-    recording : Recording
-        p_A, p_B [Pa] and the command u [V] at a uniform rate; bridged samples weigh nothing.
-    rig : Rig
-        What is believed of the machine.
-
-    Returns
-    -------
-    PressureEvidence or None
-        None where the rig's piston has no two like areas or a valve drives it, or no parameters simulate the recording.
-    """
+    """Return what the response says of the parameters; None where nothing simulates it, or the circuit is another."""
     own = response(recording, rig) if unusable(recording, rig) is None else None
     if own is None:
         return None

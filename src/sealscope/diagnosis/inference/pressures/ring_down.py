@@ -40,7 +40,7 @@ from sealscope.diagnosis.inference.pressures.evidence import (
     unusable,
     wander_of_conductance,
 )
-from sealscope.diagnosis.inference.pressures.fit import Beliefs, Block, Joint, Look, Normal, descend, strain_of
+from sealscope.diagnosis.inference.pressures.fit import STEPS, Beliefs, Block, Joint, Look, Normal, descend, strain_of
 from sealscope.recordings.recording import Array, Recording, remembered
 
 if TYPE_CHECKING:
@@ -50,9 +50,8 @@ if TYPE_CHECKING:
 #: each class of reversals logarithm of the amplitude [Pa] and phase [rad].
 DAMPING, OMEGA, SLOPE, RINGS = range(4)
 _WINDOW = BELIEVED["window"]
-#: Length of the transforms of the first look and frequencies tried; steps of a fit, largest change of a phase in one
-#: [rad], largest logarithm of a ring [Pa].
-_LENGTH, _FREQUENCIES, _STEPS, _TURN, _LOUDEST = 4096, 200, 15, 1.5, 25.0
+#: Length of the transforms of the first look, and largest logarithm of a ring [Pa].
+_LENGTH, _LOUDEST = 4096, 25.0
 
 
 class Machine(NamedTuple):
@@ -250,11 +249,9 @@ class Ring:
         return Look(paths[0], gram), np.array(squares)
 
     def bounds(self, theta: Array) -> tuple[Array, Array]:
-        """Return between which parameters a step from `theta` may lead: a frequency of the machine, part of a turn."""
-        reach = np.where((self.kind >= RINGS) & ((self.kind - RINGS) % 2 == 1), _TURN, np.inf)
-        low, high = theta - reach, theta + reach
-        low[self.kind == OMEGA], high[self.kind == OMEGA] = self.band
-        return low, high
+        """Return between which parameters a step may lead: a frequency of the machine."""
+        of_ring = self.kind == OMEGA
+        return np.where(of_ring, self.band[0], -np.inf), np.where(of_ring, self.band[1], np.inf)
 
     def spread(self, squares: float) -> float:
         """Return the variance of the noise [Pa^2] where so much is left."""
@@ -283,23 +280,22 @@ class Ring:
 
         Windows are summed over blocks of a steady amplitude, with phases that turn evenly over the recording.
         """
-        blocks, bin_width = np.arange(self.middle.size)[:, None], self.rate / _LENGTH
+        blocks, width = np.arange(self.middle.size)[:, None], 2.0 * np.pi * self.rate / _LENGTH
         drifts = _WINDOW["drift"] * np.linspace(-1.0, 1.0, 21)
-        around = np.linspace(self.band[0], self.band[1], _FREQUENCIES) / (2.0 * np.pi)
-        around = around[around < _WINDOW["highest"] * self.rate]
-        reach = np.array([around[0], around[-1]]) * (1.0 + drifts[[0, -1]]) / bin_width
-        bins = np.arange(math.floor(reach[0]), min(math.ceil(reach[1]) + 1, _LENGTH // 2))
+        low, high = self.band / width
+        around = np.arange(math.ceil(low), min(high, _WINDOW["highest"] * _LENGTH))
+        bins = np.arange(math.floor(low * (1.0 + drifts[0])), min(math.ceil(high * (1.0 + drifts[-1])), _LENGTH // 2))
         turns = np.abs(np.fft.fftfreq(4 * blocks.size, 1.0 / blocks.size)) <= _WINDOW["turns"]
         best, chosen = -1.0, (self.machine.omega, 0.0, 0.0)
         for damping in _WINDOW["dampings"]:
             sums = []
             for each in self.classes:
                 decay = np.exp(-damping * np.arange(each.tau.shape[1]) / self.rate)
-                shift = np.exp(-2j * np.pi * bin_width * bins * each.tau[:, :1])
+                shift = np.exp(-1j * width * bins * each.tau[:, :1])
                 spectra = np.fft.rfft(each.values * (decay / np.linalg.norm(decay)), _LENGTH)[:, bins] * shift
                 sums.append((each.block == blocks) @ spectra / math.sqrt(each.block.size))
             for drift in drifts:
-                at = np.rint(around * (1.0 + drift * self.middle[:, None]) / bin_width).astype(np.int64)
+                at = np.rint(around * (1.0 + drift * self.middle[:, None])).astype(np.int64)
                 at = np.minimum(at, bins[-1]) - bins[0]
                 power = sum(
                     np.max(np.abs(np.fft.fft(total[blocks, at], 4 * blocks.size, axis=0)[turns]) ** 2, axis=0)
@@ -307,7 +303,7 @@ class Ring:
                 )
                 k = int(np.argmax(power))
                 if power[k] > best:
-                    best, chosen = float(power[k]), (2.0 * np.pi * float(around[k]), float(drift), damping)
+                    best, chosen = float(power[k]), (width * float(around[k]), float(drift), damping)
         return chosen
 
 
@@ -345,7 +341,7 @@ def ring_down(recording: Recording, rig: Rig) -> RingDown | None:
         belief = Normal(model.beliefs.centre[model.kind], strain_of(model.kinds, model.beliefs, seconds))
         for share in _WINDOW["heads"]:
             model = Ring([each.head(share) for each in classes], machine, blocks, rate)
-            x = descend(model, model.look(x[None])[0], belief, _STEPS).theta
+            x = descend(model, model.look(x[None])[0], belief, STEPS).theta
         joint = Joint.of(model.blocks(x), model.beliefs, seconds, DAMPING)
         information = joint.information(DAMPING, middles(recording, edges), np.inf)
         return RingDown(x[model.kind == OMEGA], information, machine.inertance)
@@ -354,20 +350,7 @@ def ring_down(recording: Recording, rig: Rig) -> RingDown | None:
 
 
 def evidence(recording: Recording, rig: Rig) -> PressureEvidence | None:
-    """Return what the ringing says of the conductance past the piston, block by block.
-
-    Parameters
-    ----------
-    recording : Recording
-        p_A, p_B [Pa] and the command u [V] at a uniform rate; windows with bridged samples are left out.
-    rig : Rig
-        What is believed of the machine: friction's falling slope, mass over area squared, where the ring may be.
-
-    Returns
-    -------
-    PressureEvidence or None
-        None where the rig's piston has no two like areas, a valve drives it, or nothing rings after a reversal.
-    """
+    """Return what the ringing says of the conductance; None where nothing rings, or the circuit is another."""
     ring = ring_down(recording, rig) if unusable(recording, rig) is None else None
     if ring is None:
         return None
