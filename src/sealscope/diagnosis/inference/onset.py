@@ -142,19 +142,19 @@ class StepTest:
 
     def bound(self, probability: float = 0.95) -> float:
         """Return the step that is exceeded with probability 1 - `probability`, given that there is a step > 0."""
+        from scipy.optimize import brentq
         from scipy.special import ndtr
 
         deviation = np.maximum(self.deviation, np.finfo(float).tiny)
-        weights = self.weights
-        above = weights * ndtr(self.size / deviation)
-        low, high = 0.0, float(np.max(self.size + 12.0 * deviation))
-        if not above.sum() > 0.0 or not high > 0.0:
+        above = float(self.weights @ ndtr(self.size / deviation))
+        high = float(np.max(self.size + 12.0 * deviation))
+        if not above > 0.0 or not high > 0.0:
             return max(high, 0.0)
-        for _ in range(60):
-            middle = 0.5 * (low + high)
-            beyond = float((weights * ndtr((self.size - middle) / deviation)).sum())
-            low, high = (middle, high) if beyond > (1.0 - probability) * above.sum() else (low, middle)
-        return high
+
+        def beyond(share: float) -> float:
+            return float(self.weights @ ndtr((self.size - share * high) / deviation)) - (1.0 - probability) * above
+
+        return high * float(brentq(beyond, 0.0, 1.0)) if beyond(1.0) < 0.0 else high
 
     def findable(self, chance: float, power: float = 0.9) -> float:
         """Return the step that is found with probability `power` at a false-alarm probability, at the median onset."""
@@ -164,11 +164,12 @@ class StepTest:
 
     def threshold(self, chance: float) -> float:
         """Return the score that a coefficient without a step exceeds with a probability."""
-        low, high = 0.0, 1e4
-        for _ in range(60):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if self.law.chance(middle) > chance else (low, middle)
-        return high
+        from scipy.optimize import brentq
+
+        most = 1e4
+        if not self.law.chance(0.0) > chance > self.law.chance(most):
+            return 0.0 if self.law.chance(0.0) <= chance else most
+        return float(brentq(lambda score: self.law.chance(score) - chance, 0.0, most))
 
 
 class Course(NamedTuple):
