@@ -24,7 +24,7 @@ from sealscope.recordings.recording import Array
 
 #: Differences as a share of what is believed; most steps of a fit, shares of one that are tried, and the gain of twice
 #: the log likelihood that is worth a run.
-_NUDGE, STEPS, _SHARES, _ENOUGH = 0.05, 12, np.array([1.0, 0.5, 0.17, 0.06, 0.02]), 5.0
+_NUDGE, STEPS, _SHARES, _ENOUGH = 0.05, 12, np.array([1.0, *np.geomspace(0.5, 0.02, 4)]), 5.0
 
 
 class Normal(NamedTuple):
@@ -116,7 +116,7 @@ def descend(model: Model[L], look: L, belief: Normal, steps: int, variance: floa
         if not gains[best] > 0.0:
             damping = max(10.0 * damping, 0.1)
             continue
-        damping = 0.1 * damping
+        damping = 0.1 * damping if damping > 1e-3 else 0.0
         look = whole if best == 0 else model.look(paths[best : best + 1])[0]
     return look
 
@@ -166,10 +166,10 @@ class Joint:
         vector = np.concatenate([block.gram[0, 1:] for block in blocks])
         white, inflation = _noise(blocks, np.zeros(theta.size), asked)[0], 1.0
         for _ in range(2):  # the noise's variance is one of the unknowns
-            factor = cho_factor(normal / (white * inflation) + strain, overwrite_a=True)
-            mean = cho_solve(factor, vector / (white * inflation) - pull)
+            factor = cho_factor(normal / (white * inflation) + strain, check_finite=False)
+            mean = cho_solve(factor, vector / (white * inflation) - pull, check_finite=False)
             white, inflation = _noise(blocks, mean, asked)
-        covariance = cho_solve(factor, np.eye(theta.size), overwrite_b=True)
+        covariance = cho_solve(factor, np.eye(theta.size), check_finite=False)
         return Joint(beliefs, theta, kinds, mean, covariance, strain, white)
 
     @property

@@ -334,15 +334,18 @@ def ring_down(recording: Recording, rig: Rig) -> RingDown | None:
         classes = [] if slow else windows_of(recording, machine, edges)
         if not classes:
             return None
-        blocks = edges.size - 1
-        seconds = recording.duration / blocks
+        blocks, seconds = edges.size - 1, recording.duration / (edges.size - 1)
         model = Ring(classes, machine, blocks, rate)
-        x = model.start()
         belief = Normal(model.beliefs.centre[model.kind], strain_of(model.kinds, model.beliefs, seconds))
-        for share in _WINDOW["heads"]:
-            model = Ring([each.head(share) for each in classes], machine, blocks, rate)
-            x = descend(model, model.look(x[None])[0], belief, STEPS).theta
-        joint = Joint.of(model.blocks(x), model.beliefs, seconds, DAMPING)
+        with np.errstate(over="ignore", invalid="ignore"):
+            try:
+                x = model.start()
+                for share in _WINDOW["heads"]:
+                    model = Ring([each.head(share) for each in classes], machine, blocks, rate)
+                    x = descend(model, model.look(x[None])[0], belief, STEPS).theta
+                joint = Joint.of(model.blocks(x), model.beliefs, seconds, DAMPING)
+            except np.linalg.LinAlgError:
+                return None
         information = joint.information(DAMPING, middles(recording, edges), np.inf)
         return RingDown(x[model.kind == OMEGA], information, machine.inertance)
 
