@@ -99,8 +99,3 @@ def test_information_is_symmetric_and_no_less_than_none(leaking: tuple[ss.Record
     assert np.linalg.eigvalsh(precision)[0] > -1e-6 * np.linalg.eigvalsh(precision)[-1]
     step, deviation = step_of(information, 40.0)
     assert step > 4.0 * deviation > 0.0
-
-
-@pytest.mark.parametrize("rig", ["servo-valve", "single-rod-eha"])
-def test_other_circuits_are_left_to_other_providers(rig: str, leaking: tuple[ss.Recording, float]) -> None:
-    assert evidence(leaking[0].between(0.0, 20.0), load_rig(rig)) is None

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,12 +57,16 @@ class Beliefs(NamedTuple):
         return np.asarray((self.wander / self.unit) ** 2 * (seconds / time))
 
 
-@dataclass(frozen=True, eq=False)
-class Look:
-    """A model about parameters `theta` (p,): `gram` (1 + p, 1 + p) of its residual [Pa] and Jacobian [Pa per unit]."""
+class Look(NamedTuple):
+    """A model about parameters `theta` (p,): `gram` (1 + p, 1 + p) of its residual [Pa] and Jacobian [Pa per unit].
+
+    Of a simulation also these themselves, `rows` (1 + p, n), and the states at the end.
+    """
 
     theta: Array
     gram: Array
+    rows: Array = np.empty(0)
+    ends: Array = np.empty(0)
 
     def cost(self, variance: float, belief: Normal, unit: Array) -> float:
         """Return minus twice the logarithm of the posterior, beside a noise's variance [Pa^2]."""
@@ -70,17 +74,13 @@ class Look:
         return float(self.gram[0, 0] / variance + off @ belief.precision @ off)
 
 
-L = TypeVar("L", bound=Look)
-L_co = TypeVar("L_co", bound=Look, covariant=True)
-
-
-class Model(Protocol[L_co]):
+class Model(Protocol):
     """What can be fitted; `unit` (p,) of its parameters."""
 
     @property
     def unit(self) -> Array: ...  # noqa: D102
 
-    def look(self, paths: Array) -> tuple[L_co, Array]:
+    def look(self, paths: Array) -> tuple[Look, Array]:
         """Return the look about the first of some sets (m, p), and the squares [Pa^2] that each leaves, (m,)."""
         ...
 
@@ -93,7 +93,7 @@ class Model(Protocol[L_co]):
         ...
 
 
-def descend(model: Model[L], look: L, belief: Normal, steps: int, variance: float | None = None) -> L:
+def descend(model: Model, look: Look, belief: Normal, steps: int, variance: float | None = None) -> Look:
     """Return the look about likelier parameters; their noise's variance [Pa^2] is fitted where it is not given.
 
     A whole step is run with its Jacobian, beside shares of it; where none of them gains, it is damped. A step is not

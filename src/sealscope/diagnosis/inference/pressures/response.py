@@ -234,14 +234,6 @@ class Machine(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class SimulatedLook(Look):
-    """A look at a stretch: residual and Jacobian (1 + p, n), and the states of path and perturbed paths at the end."""
-
-    rows: Array
-    ends: Array
-
-
-@dataclass(frozen=True, eq=False)
 class Stretch:
     """Samples that one set of parameters holds for.
 
@@ -288,7 +280,7 @@ class Stretch:
         squares = self.dp.size * np.var(left - waves @ self.apart, axis=1)
         return np.asarray(np.nan_to_num(squares, nan=np.inf))
 
-    def look(self, paths: Array) -> tuple[SimulatedLook, Array]:
+    def look(self, paths: Array) -> tuple[Look, Array]:
         """Return the look about the first of up to 5 sets (m, p), and the squares that each leaves (m,)."""
         theta, count, simulated = paths[0], len(paths), SPRING + 1
         sets = np.concatenate([paths[:1], np.tile(theta, (simulated, 1)), paths[1:]])
@@ -297,15 +289,14 @@ class Stretch:
         shown, ends = self.machine.run(self.command, sets, states)
         rows = np.empty((len(PARAMETERS) + count, self.dp.size))  # what is left, its slopes, what the others leave
         rows[0] = self.dp - theta[SCALE] * shown[0] - theta[OFFSET]
-        np.subtract(shown[1 : simulated + 1], shown[0], out=rows[1 : simulated + 1])
-        rows[1 : simulated + 1] *= theta[SCALE]
+        rows[1 : simulated + 1] = theta[SCALE] * (shown[1 : simulated + 1] - shown[0])
         rows[1 + LEAD : 1 + OFFSET] = self._rest(theta, shown[0])
         rows[1 + OFFSET] = self.unit[OFFSET]
         rows[2 + OFFSET :] = self.dp - paths[1:, SCALE, None] * shown[simulated + 1 :] - paths[1:, OFFSET, None]
         rows, products, waves = self._fitted_part(rows)
         gram, own = rows @ rows.T - waves @ products.T, slice(2 + OFFSET)
         squares = np.diag(gram)[[0, *range(2 + OFFSET, len(rows))]]
-        return SimulatedLook(theta, gram[own, own], rows[own], ends[:, : simulated + 1]), squares
+        return Look(theta, gram[own, own], rows[own], ends[:, : simulated + 1]), squares
 
     def _rest(self, theta: Array, shown: Array) -> Array:
         """Return the slopes of lead, lag and scale (3, n) from the simulated p_A - p_B (n,)."""
@@ -332,7 +323,7 @@ class Stretch:
         """Whether a chi square is not far above the number of samples."""
         return bool(cost <= self.samples + _FOLLOW["unexplained"] * math.sqrt(2.0 * self.samples))
 
-    def block(self, look: SimulatedLook) -> Block:
+    def block(self, look: Look) -> Block:
         """Return the sums of a look, its scores in each second."""
         rows = look.rows - (look.rows @ self.apart.T) @ self._among @ self.apart
         first = np.arange(0, self.dp.size, round(self.machine.rate))
@@ -340,7 +331,7 @@ class Stretch:
         return Block(look.theta, np.arange(len(PARAMETERS)), look.gram, self.samples, scores)
 
 
-def first_fit(stretch: Stretch, total: Array, noise: float) -> SimulatedLook:
+def first_fit(stretch: Stretch, total: Array, noise: float) -> Look:
     """Return the likeliest parameters that hold over a stretch, beside a noise's variance [Pa^2].
 
     The ringing makes many local minima. So the slow part of the pressure is fitted first, from the best of several
@@ -372,7 +363,7 @@ def first_fit(stretch: Stretch, total: Array, noise: float) -> SimulatedLook:
     return look
 
 
-def fitted(stretch: Stretch, starts: Sequence[Array] | Array, noise: float, kept: int) -> SimulatedLook:
+def fitted(stretch: Stretch, starts: Sequence[Array] | Array, noise: float, kept: int) -> Look:
     """Return the likeliest look that steps from several starts lead to, few from all and more from the best `kept`."""
     looks, belief = [stretch.look(start[None])[0] for start in starts], stretch.beliefs.normal
     for steps, number in ((STEPS // 6, kept), (STEPS, 1)):
@@ -451,13 +442,13 @@ class Follower:
             wander[jumped] += (beliefs.width[jumped] / beliefs.unit[jumped]) ** 2
         return Normal(self.theta, np.asarray(np.linalg.inv(self.covariance + np.diag(wander))))
 
-    def _updated(self, stretch: Stretch, seconds: float) -> tuple[SimulatedLook, Normal]:
+    def _updated(self, stretch: Stretch, seconds: float) -> tuple[Look, Normal]:
         """Return the likeliest look and the belief beside it.
 
         Where wandering does not explain the block, a jump is looked for: of the conductance, or of the stiffness.
         """
 
-        def candidate(start: Array, belief: Normal) -> tuple[float, SimulatedLook, Normal]:
+        def candidate(start: Array, belief: Normal) -> tuple[float, Look, Normal]:
             look = descend(stretch, stretch.look(start[None])[0], belief, STEPS, self.variance)
             return look.cost(self.variance, belief, stretch.unit), look, belief
 
