@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 import sealscope as ss
@@ -56,6 +58,10 @@ def test_a_leak_from_the_first_sample_is_above_the_baseline_only() -> None:
 
 def test_other_circuits_and_counts_are_refused_in_words() -> None:
     recording = recorded(seed=1)
-    assert "position" in PressureResponse(load_rig("servo-valve")).usable(recording)
-    assert "position" in PressureResponse(load_rig("single-rod-eha")).usable(recording)
+    for rig in ("servo-valve", "single-rod-eha"):
+        other = PressureResponse(load_rig(rig))
+        assert "position" in other.usable(recording)
+        assert other.reading(recording) is None
     assert "u" in DETECTOR.usable(recording.only(("p_A", "p_B")))
+    for name in ("u", "p_A"):
+        assert "counts" in DETECTOR.usable(replace(recording, units={**recording.units, name: "count"}))

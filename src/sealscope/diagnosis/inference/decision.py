@@ -38,7 +38,7 @@ from sealscope.diagnosis.verdict.evidence import (
 )
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.oil import oil_temperature
-from sealscope.recordings.recording import Array, Recording
+from sealscope.recordings.recording import Recording
 from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
@@ -276,27 +276,39 @@ class Question(NamedTuple):
 
 
 def _questions(balance: RecordedBalance, against: Rise | None, probability: float) -> list[Question]:
-    """Return the questions that can be asked, each with its share of the false-alarm probability."""
-    from scipy.special import ndtr, ndtri
-
-    questions, test = [], balance.test
+    """Return the questions that can be asked of a balance."""
     healthy = balance.rig.pump.G_healthy
     # a drive's droop with the load passes for a level of the leak
     measured = len(balance.columns) == 1 and balance.equations[0].drive is None
-    level = healthy > 0.0 and against is None and balance.size.stated and measured
-    second = SECOND * probability if test is not None and (against is not None or level) else 0.0
-    if against is not None:
-        share = probability - second
-        questions.append(Question(AGAINST, against.score, against.threshold(share), against.chance, share))
+    if not (healthy > 0.0 and against is None and balance.size.stated and measured):
+        return questions(balance.test, against, probability)
+    own = balance.level
+    deviation = float(np.hypot((own.high - own.low) / (2 * _95), own.value * balance.size.deviation))
+    level = (own.value - healthy) / max(deviation, np.finfo(float).tiny)
+    return questions(balance.test, against, probability, level)
+
+
+def questions(
+    test: StepTest | None, against: Rise | None, probability: float, level: float | None = None
+) -> list[Question]:
+    """Return the questions that can be asked, each with its share of the false-alarm probability.
+
+    `level`: that of the leak above a healthy machine's, in deviations.
+    """
+    from scipy.special import ndtr, ndtri
+
+    possible = []
+    second = SECOND * probability if test is not None and (against is not None or level is not None) else 0.0
     if test is not None:
         share = second if against is not None else probability - second
-        questions.insert(0, Question(WITHIN, test.score, test.threshold(share), test.chance, share))
-    if level:
-        own, share = balance.level, second or probability
-        deviation = float(np.hypot((own.high - own.low) / (2 * _95), own.value * balance.size.deviation))
-        score = (own.value - healthy) / max(deviation, np.finfo(float).tiny)
-        questions.append(Question(LEVEL, score, float(-ndtri(share)), float(ndtr(-score)), share))
-    return questions
+        possible.append(Question(WITHIN, test.score, test.threshold(share), test.chance, share))
+    if against is not None:
+        share = probability - second
+        possible.append(Question(AGAINST, against.score, against.threshold(share), against.chance, share))
+    if level is not None:
+        share = second or probability
+        possible.append(Question(LEVEL, level, float(-ndtri(share)), float(ndtr(-level)), share))
+    return possible
 
 
 def is_leak(causes: dict[Cause, float]) -> bool:
@@ -458,15 +470,9 @@ def _passage(balance: RecordedBalance, level: Interval, findable: float | None) 
 
 def _leak_course(balance: RecordedBalance, evidence: Evidence) -> LeakCourse:
     """Return the leak over the recording: what came with it, or what passes in all where none began."""
-    own = balance.whole if evidence.onset_s is None else balance.course(step=True)
-    time, value = balance.blocks.time, own.mean
-    deviation = np.sqrt(np.maximum(np.diag(own.covariance), 0.0))
-    onset, whole = evidence.onset_s, evidence.onset_s is None
-    if onset is not None:
-        before: Array = (time < onset).astype(float)
-        weights = np.eye(len(time)) - before / max(float(before.sum()), 1.0)
-        value = weights @ own.mean
-        deviation = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", weights, own.covariance, weights), 0.0))
+    whole, time = evidence.onset_s is None, balance.blocks.time
+    own = balance.whole if evidence.onset_s is None else balance.course(step=True).beyond(time < evidence.onset_s)
+    value, deviation = own.mean, np.sqrt(np.maximum(np.diag(own.covariance), 0.0))
     unit = balance.blocks.driving(balance.zero) * balance.size.scale / LITRE_PER_MINUTE
     half = _95 * np.hypot(deviation, value * balance.size.deviation)
     return LeakCourse(time, value * unit, (value - half) * unit, (value + half) * unit, whole=whole)

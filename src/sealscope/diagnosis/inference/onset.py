@@ -45,6 +45,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sealscope.recordings.recording import Array
 
@@ -141,19 +142,19 @@ class StepTest:
 
     def bound(self, probability: float = 0.95) -> float:
         """Return the step that is exceeded with probability 1 - `probability`, given that there is a step > 0."""
+        from scipy.optimize import brentq
         from scipy.special import ndtr
 
         deviation = np.maximum(self.deviation, np.finfo(float).tiny)
-        weights = self.weights
-        above = weights * ndtr(self.size / deviation)
-        low, high = 0.0, float(np.max(self.size + 12.0 * deviation))
-        if not above.sum() > 0.0 or not high > 0.0:
+        above = float(self.weights @ ndtr(self.size / deviation))
+        high = float(np.max(self.size + 12.0 * deviation))
+        if not above > 0.0 or not high > 0.0:
             return max(high, 0.0)
-        for _ in range(60):
-            middle = 0.5 * (low + high)
-            beyond = float((weights * ndtr((self.size - middle) / deviation)).sum())
-            low, high = (middle, high) if beyond > (1.0 - probability) * above.sum() else (low, middle)
-        return high
+
+        def beyond(share: float) -> float:
+            return float(self.weights @ ndtr((self.size - share * high) / deviation)) - (1.0 - probability) * above
+
+        return high * float(brentq(beyond, 0.0, 1.0)) if beyond(1.0) < 0.0 else high
 
     def findable(self, chance: float, power: float = 0.9) -> float:
         """Return the step that is found with probability `power` at a false-alarm probability, at the median onset."""
@@ -163,11 +164,12 @@ class StepTest:
 
     def threshold(self, chance: float) -> float:
         """Return the score that a coefficient without a step exceeds with a probability."""
-        low, high = 0.0, 1e4
-        for _ in range(60):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if self.law.chance(middle) > chance else (low, middle)
-        return high
+        from scipy.optimize import brentq
+
+        most = 1e4
+        if not self.law.chance(0.0) > chance > self.law.chance(most):
+            return 0.0 if self.law.chance(0.0) <= chance else most
+        return float(brentq(lambda score: self.law.chance(score) - chance, 0.0, most))
 
 
 class Course(NamedTuple):
@@ -181,6 +183,11 @@ class Course(NamedTuple):
         value = float(weights @ self.mean)
         half = 1.96 * float(np.sqrt(np.maximum(weights @ self.covariance @ weights, 0.0)))
         return Interval(value, value - half, value + half)
+
+    def beyond(self, before: NDArray[np.bool_]) -> Course:
+        """Return the coefficient beyond its mean over some blocks (K,)."""
+        turn = np.eye(len(before)) - before / max(int(np.count_nonzero(before)), 1)
+        return Course(turn @ self.mean, turn @ self.covariance @ turn.T)
 
 
 def course(information: Information, test: StepTest | None, step: bool) -> Course:
@@ -237,12 +244,17 @@ def step_test(information: Information, signs: Sequence[float] = (1.0,)) -> Step
 
     The chance of one of two is twice that stated.
     """
+    return max(step_tests(information, signs), key=lambda test: test.score, default=None)
+
+
+def step_tests(information: Information, signs: Sequence[float]) -> list[StepTest]:
+    """Return the tests of a step of each of the `signs`; none where too few blocks say anything."""
     time, precision, vector = _with_level(information)
     count = len(time)
     values, vectors = np.linalg.eigh(precision)
     kept = values > _RANK * max(float(values[-1]), 0.0)
     if count < FEWEST or np.count_nonzero(kept) < FEWEST:
-        return None
+        return []
     root = np.sqrt(values[kept])
     design = (vectors[:, kept] * root).T
     z = (vectors[:, kept].T @ vector) / root
@@ -260,8 +272,7 @@ def step_test(information: Information, signs: Sequence[float] = (1.0,)) -> Step
     steps = np.clip(index[:, None] + 1.0 - at, 0.0, 1.0)
     z, steps, eigen = basis.T @ (free @ z), basis.T @ (inner @ steps), np.maximum(eigen, 0.0)
     onsets, believed = _onset_times(time, at), -np.log1p(WALKS * unit * count / information.walk**2)
-    tests = [_scan(sign * z, steps, eigen, onsets, unit, believed) for sign in signs]
-    return max(tests, key=lambda test: test.score)
+    return [_scan(sign * z, steps, eigen, onsets, unit, believed) for sign in signs]
 
 
 def two_sided(information: Information) -> StepTest | None:

@@ -111,10 +111,7 @@ def _columns(recording: Recording, transformed: list[Details], bounds: IntArray)
     )
     with np.errstate(divide="ignore", over="ignore"):
         energies = np.concatenate([mean_squares(own, bounds) for own in transformed], axis=1)
-        log_rms, duty = (
-            0.5 * np.log(energies),
-            0.5 * np.log(_means(squares, bounds) + rest),
-        )
+        log_rms, duty = 0.5 * np.log(energies), 0.5 * np.log(_means(squares, bounds) + rest)
     return log_rms, np.vstack([duty, _means(load[None], bounds) / np.exp(duty[-1:])]).T
 
 

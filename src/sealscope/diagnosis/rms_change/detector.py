@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.beliefs import beliefs
-from sealscope.diagnosis.inference.onset import Interval, step_test
+from sealscope.diagnosis.inference.onset import Interval, step_tests
 from sealscope.diagnosis.learnt import Healthy, Lesson, lessons_of
 from sealscope.diagnosis.rms_change.blocks import JUDGED, RmsBlocks, columns_of, cut, whole
 from sealscope.diagnosis.rms_change.ringing import information, rises
@@ -110,12 +110,11 @@ def within(blocks: RmsBlocks, probability: float) -> Evidence:
     share = probability / (2 * len(JUDGED) * len(blocks.chambers))
     changes, moved = [], []
     for name, own, weight in zip(blocks.names, *information(blocks), strict=True):
-        tests = [(sign, step_test(own, (sign,))) for sign in (1.0, -1.0)]
-        stepped = [(sign, test) for sign, test in tests if test is not None]
-        if not stepped:
+        tests = step_tests(own, (1.0, -1.0))
+        if not tests:
             return Evidence("cannot tell", f"{name} says nothing in most blocks")
-        sign, test = min(stepped, key=lambda own: own[1].chance)
-        size, bound = sign * test.fitted[0], max(test.bound() for _, test in stepped)
+        test = min(tests, key=lambda each: each.chance)
+        size, bound = test.fitted[0] * (1.0 if test is tests[0] else -1.0), max(each.bound() for each in tests)
         changes.append(_Change(name, size, test.score, test.chance, test.threshold(share), bound, weight, test.onset()))
         if name.split()[0] in JUDGED:
             moved.append(test)

@@ -15,7 +15,6 @@ from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.detector import unusable
 from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.inference.pressures.detector import PressureResponse
-from sealscope.diagnosis.inference.pressures.evidence import priors
 from sealscope.diagnosis.inspection import inspected
 from sealscope.diagnosis.rms_change.blocks import JUDGED, QUANTITIES, whole
 from sealscope.diagnosis.trend.wear import DayToDay, Level
@@ -116,7 +115,9 @@ def scatter_of(basis: Basis, usual: float) -> DayToDay:
     if basis == "volume balance":
         scale = max(believed[basis] * abs(usual), float(np.finfo(float).tiny))
     else:
-        scale = priors("response")["G_level"].width if basis == "pressure response" else believed[basis]
+        scale = (
+            beliefs("inference.pressures")["conductance"]["level"] if basis == "pressure response" else believed[basis]
+        )
     return DayToDay(scale, believed["freedom"])
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.live.balance import FOLLOWS, BlockConductance, NotJudged, Shown
-from sealscope.diagnosis.inference.pressures.evidence import SLOWEST, flow_scale, priors, states_flow, unusable
+from sealscope.diagnosis.inference.pressures.evidence import BELIEVED, flow_scale, states_flow, unusable
 from sealscope.diagnosis.inference.pressures.response import LAWS, Follower, G, Machine, beliefs_of
 from sealscope.errors import InputError
 from sealscope.recordings.motion import moves
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 _BELIEVED = beliefs("inference.live")["response"]
 _SETTLING, _RESUMING, _PAUSE = _BELIEVED["settling"], _BELIEVED["resuming"], beliefs("inference.live")["watch"]["pause"]
-_READ = ("u", "p_A", "p_B")
+_SLOWEST, _READ = BELIEVED["blocks"]["slowest"], ("u", "p_A", "p_B")
 
 
 class PressureEstimator:
@@ -45,7 +45,7 @@ class PressureEstimator:
     """
 
     by, levels, cause = "pressures", False, "leak inside or outside"
-    size_error, orifice = flow_scale(), priors("ring_down")["orifice"].value
+    size_error, orifice = flow_scale(), BELIEVED["conductance"]["orifice_ring"]
     inside: float = beliefs("inference.live")["watch"]["inside"]
     block_seconds: float = _BELIEVED["seconds"]
     states_flow = staticmethod(states_flow)
@@ -111,8 +111,8 @@ class PressureEstimator:
         """Return what a block shows."""
         begin, end = float(block.t[0]), float(block.t[-1]) + 1.0 / block.rate
         if self._follower is None:
-            slow = f"sampled at less than {SLOWEST:g} Hz"
-            return _passed_over(end, slow if block.rate < SLOWEST else "needs a pump and two like areas")
+            slow = f"sampled at less than {_SLOWEST:g} Hz"
+            return _passed_over(end, slow if block.rate < _SLOWEST else "needs a pump and two like areas")
         if not all(np.isfinite(block[name]).all() for name in _READ):
             return _passed_over(end, "missing values")
         apart = self._resume(self._follower, begin - self._next, block.rate)
@@ -132,7 +132,7 @@ class PressureEstimator:
             self._lost, self._settling = 0, _SETTLING
             return _passed_over(end, "not described by the model", True)
         self._lost = 0
-        width = priors("response")["G"].width
+        width = BELIEVED["response"]["G"][1]
         g, sd = float(follower.theta[G]), math.sqrt(follower.covariance[G, G]) * float(follower.beliefs.unit[G])
         if settling or sd > width:
             return _passed_over(end, "settling" if settling else "at standstill", apart)

@@ -20,7 +20,6 @@ a coefficient more costs log K (G. Schwarz, Ann. Statist. 6 (1978) 461).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -34,19 +33,20 @@ from sealscope.recordings.recording import Array, Recording
 
 _RANK = 1e-9  # directions that carry less than this share of the largest carry nothing
 _TINY = float(np.finfo(float).tiny)
+A, B, HALF_A, HALF_B = np.eye(4)
 #: Oil that is lost lowers both levels; what raises them has many causes.
 CHARGE = "a loss of oil"
-
-
-class Pattern(NamedTuple):
-    """A hypothesis: which of (level A, level B, half A, half B) step together, and what that means.
-
-    `bases`: rows (m, 4) that span them; where a simpler pattern lies within, once with it first for each.
-    """
-
-    name: str
-    cause: Cause | None
-    bases: tuple[Array, ...]
+#: Name, what a step means, and rows that span it; where a simpler pattern lies within, once with it first for each.
+PATTERNS: tuple[tuple[str, Cause | None, list[list[Array]]], ...] = (
+    (CHARGE, "external leak", [[A + B]]),
+    ("friction", "friction change", [[A + B, HALF_A, HALF_B]]),
+    ("friction", "friction change", [[HALF_A - HALF_B]]),
+    ("friction", "friction change", [[A, B, HALF_A, HALF_B]]),
+    ("what feeds both chambers", None, [[A + B, HALF_A + HALF_B]]),
+    ("load", "changed duty", [[A, B], [B, A], [A + B, A]]),
+    ("zero of p_A", "sensor fault", [[A]]),
+    ("zero of p_B", "sensor fault", [[B]]),
+)
 
 
 class Level(NamedTuple):
@@ -129,21 +129,6 @@ def levels(recording: Recording) -> tuple[Array, Array] | None:
     return None
 
 
-def _patterns(mean: Array) -> Iterator[Pattern]:
-    """Yield the hypotheses about the four numbers, by their means (4,)."""
-    A, B, half_A, half_B = np.eye(4)
-    yield Pattern(CHARGE, "external leak", (np.array([A + B]),))
-    yield Pattern("friction", "friction change", (np.array([A + B, half_A, half_B]),))
-    yield Pattern("friction", "friction change", (np.array([half_A - half_B]),))
-    yield Pattern("friction", "friction change", (np.eye(4),))
-    yield Pattern("what feeds both chambers", None, (np.array([A + B, half_A + half_B]),))
-    yield Pattern("load", "changed duty", tuple(np.array(own) for own in ([A, B], [B, A], [A + B, A])))
-    yield Pattern("zero of p_A", "sensor fault", (A[None],))
-    yield Pattern("zero of p_B", "sensor fault", (B[None],))
-    yield Pattern("scale of p_A", "sensor fault", ((mean[0] * A + mean[2] * half_A)[None],))
-    yield Pattern("scale of p_B", "sensor fault", ((mean[1] * B + mean[3] * half_B)[None],))
-
-
 def level_tests(recording: Recording) -> tuple[Level, ...]:
     """Return the tests of all patterns, the most likely first."""
     made = levels(recording)
@@ -157,18 +142,20 @@ def level_tests(recording: Recording) -> tuple[Level, ...]:
     eigen, basis = np.linalg.eigh(covariance / np.outer(size, size))
     root = np.zeros((len(kept), 4))
     root[:, kept] = (basis / np.sqrt(np.maximum(eigen, _RANK))) @ basis.T / size
-    tested = []
-    for pattern in _patterns(values.mean(axis=0)):
-        tests = [_test(pattern, own @ root.T, values @ root.T, time) for own in pattern.bases]
+    mean, both, tested = values.mean(axis=0), values[:, :2].sum(axis=1), []
+    scales = (("scale of p_A", A + HALF_A), ("scale of p_B", B + HALF_B))
+    patterns = [*PATTERNS, *((name, "sensor fault", [[mean * own]]) for name, own in scales)]
+    for name, cause, bases in patterns:
+        tests = [_test(name, cause, np.array(own) @ root.T, values @ root.T, time) for own in bases]
         least = min((test for test in tests if test is not None), key=lambda test: test.rank, default=None)
         if least is not None:
-            after, both = time > least.onset, values[:, :2].sum(axis=1)
+            after = time > least.onset
             falls = after.any() and not after.all() and both[after].mean() <= both[~after].mean()
-            tested.append(least._replace(cause=None) if pattern.name == CHARGE and not falls else least)
+            tested.append(least._replace(cause=None) if name == CHARGE and not falls else least)
     return tuple(sorted(tested, key=lambda test: -test.rank))
 
 
-def _test(pattern: Pattern, rows: Array, whitened: Array, time: Array) -> Level | None:
+def _test(name: str, cause: Cause | None, rows: Array, whitened: Array, time: Array) -> Level | None:
     """Return the test of whitened blocks (K, c) by the steps of `rows` (m, c), the first of them as it is."""
     basis, size = np.linalg.qr(rows.T)
     basis = basis[:, np.abs(np.diag(size)) > _RANK * np.abs(size).max()]
@@ -184,4 +171,4 @@ def _test(pattern: Pattern, rows: Array, whitened: Array, time: Array) -> Level 
     chance = 2.0 * count * min(test.law.chance(score) for test in tests)
     rank = score - (count - 1) * float(np.log(len(time)))
     onset, block = float(tests[0].onsets[best]), float(time[1] - time[0])
-    return Level(pattern.name, pattern.cause, rank, score, min(1.0, chance), onset, block)
+    return Level(name, cause, rank, score, min(1.0, chance), onset, block)

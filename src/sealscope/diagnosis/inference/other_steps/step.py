@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.beliefs import beliefs
-from sealscope.diagnosis.inference.onset import StepTest, two_sided
-from sealscope.diagnosis.inference.other_steps.features import BLOCKS, DUTY, ORDER, features
+from sealscope.diagnosis.inference.onset import StepTest
+from sealscope.diagnosis.inference.other_steps.features import BLOCKS, ORDER, duty_tests, sensor_tests
 from sealscope.diagnosis.inference.other_steps.levels import level_tests
 from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.recordings.recording import Recording, remembered
@@ -44,14 +44,14 @@ def _other_step(recording: Recording, chance: float) -> OtherStep | None:
     if len(recording) < BLOCKS * max(ORDER + 2, shortest * recording.rate):
         return None
     try:
-        return _duty(recording, chance) or _feature(recording, chance) or _level(recording, chance)
+        return _duty(recording, chance) or _sensor(recording, chance) or _level(recording, chance)
     except (ArithmeticError, np.linalg.LinAlgError):  # numbers that cannot be computed with are no machine's
         return None
 
 
 def _duty(recording: Recording, chance: float) -> OtherStep | None:
     """Return a step of command and motion nearer to (1, 1) than to (1, 0) and (0, 1): not the answer to a leak."""
-    sizes = [test for _, own in features(recording, DUTY) if (test := two_sided(own)) is not None]
+    sizes = duty_tests(recording)
     steps = np.abs([test.fitted[0] for test in sizes])
     rare = bool(sizes) and max(2.0 * test.chance for test in sizes) < chance
     if not rare or not steps.min() > np.tan(np.pi / 8.0) * steps.max():
@@ -59,10 +59,10 @@ def _duty(recording: Recording, chance: float) -> OtherStep | None:
     return OtherStep.of("changed duty", "size of the duty", min(sizes, key=lambda test: test.score))
 
 
-def _feature(recording: Recording, chance: float) -> OtherStep | None:
-    tests = [(feature, test) for feature, own in features(recording) if (test := two_sided(own)) is not None]
-    rare = (own for own in tests if 2.0 * len(tests) * own[1].chance < chance)
-    return next((OtherStep.of(feature.cause, feature.name, test) for feature, test in rare), None)
+def _sensor(recording: Recording, chance: float) -> OtherStep | None:
+    tests = sensor_tests(recording)
+    rare = ((name, test) for name, test in tests if 2.0 * len(tests) * test.chance < chance)
+    return next((OtherStep.of("sensor fault", name, test) for name, test in rare), None)
 
 
 def _level(recording: Recording, chance: float) -> OtherStep | None:

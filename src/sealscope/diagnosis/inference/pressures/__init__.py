@@ -1,1 +1,1 @@
-"""Evidence from pressures and command in the inference's blocks; not yet what `diagnose` judges pressures by."""
+"""Evidence from pressures and command alone: two hypotheses of the machine, the response and the ring."""

@@ -1,45 +1,26 @@
-"""What the providers of evidence from pressures and command share: beliefs, blocks, elimination, and their result."""
+"""What the providers of evidence from pressures and command share: blocks, lines of the mains, and their result."""
 
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cache
-from importlib.resources import files
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.onset import FEWEST, Information
+from sealscope.diagnosis.beliefs import beliefs
+from sealscope.diagnosis.inference.onset import FEWEST, Information, StepTest, step_test
 from sealscope.recordings.recording import Array, Recording
 from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Most blocks of a recording, and their least length [s]; a wander is stated for so long [s].
-BLOCKS, SHORTEST_BLOCK, WANDER_TIME = 30, 2.0, 90.0
-#: Fewest samples a second: two and a half times the highest ring of the rigs.
-SLOWEST = 200.0
-
-
-class Prior(NamedTuple):
-    """A normal prior: its centre `value` and standard deviation `width`, both in `unit`, and the `source` of them."""
-
-    value: float
-    width: float
-    unit: str
-    source: str
-
-
-@cache
-def priors(table: str) -> Mapping[str, Prior]:
-    """Return the priors of a table of `pressures.toml`, by name."""
-    tree = tomllib.loads((files("sealscope.diagnosis.inference.pressures") / "pressures.toml").read_text("utf-8"))
-    return {name: Prior(**row) for name, row in tree[table].items()}
+BELIEVED = beliefs("inference.pressures")
+Provider = Literal["response", "ring"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,45 +29,69 @@ class PressureEvidence:
 
     Parameters
     ----------
+    by : {"response", "ring"}
+        The provider.
     information : Information
         What K blocks say of g, all nuisance parameters eliminated.
     pressure : array of float, shape (K,)
         Mean of abs(p_A - p_B) in each block [Pa], by which g is a flow.
-    scale : float
-        Standard deviation of the factor that all g share [1]: the ring shows flows beside M/A^2.
-    laws : tuple of two floats
-        Mean flow over g times `pressure`, of the law of leakage with the least and of that with the largest.
+    pump : float
+        Mean size of the pump's flow [m^3/s].
+    stated : bool
+        Whether the rig states what turns g into L/min.
+    others : mapping of str to Information
+        What they say of other parameters that may have stepped, by name.
     """
 
+    by: Provider
     information: Information
     pressure: Array
-    scale: float
-    laws: tuple[float, float]
+    pump: float
+    stated: bool
+    others: Mapping[str, Information] = field(default_factory=dict)
+
+    @staticmethod
+    def of(by: Provider, recording: Recording, rig: Rig, said: Mapping[str, Information]) -> PressureEvidence:
+        """Return it from what the blocks of a recording say of parameters, `said["G"]` of g."""
+        edges, dp = block_edges(recording), np.abs(recording["p_A"] - recording["p_B"])
+        pressure = np.add.reduceat(dp, edges[:-1]) / np.diff(edges)
+        speed = rig.motor.omega_per_volt * float(np.mean(np.abs(recording["u"])))
+        others = {name: own for name, own in said.items() if name != "G"}
+        pump = speed * rig.pump.q_b / (2.0 * np.pi)
+        return PressureEvidence(by, said["G"], pressure, pump, states_flow(rig), others)
+
+    @cached_property
+    def test(self) -> StepTest | None:
+        """Test of a step of g."""
+        return step_test(self.information)
+
+    @property
+    def level(self) -> tuple[float, float]:
+        """Level of g over the recording and its standard deviation [m^3/(s Pa)]."""
+        precision = max(float(self.information.precision.sum()), np.finfo(float).tiny)
+        return float(self.information.vector.sum()) / precision, precision**-0.5
+
+    @property
+    def orifice(self) -> float:
+        """Mean flow over g times `pressure` of an orifice; that of a worn seal is 1."""
+        return float(BELIEVED["conductance"][f"orifice_{self.by}"])
 
     def flow(self, step: float, deviation: float) -> tuple[float, tuple[float, float]]:
         """Return the mean flow [L/min] of a step of g [m^3/(s Pa)] with its `deviation`, and the 95 % interval.
 
-        The interval holds those of all `laws` and the doubt in the scale; the flow is that of their middle.
+        The interval holds those of a worn seal and of an orifice and the doubt in the scale; the flow is that of their
+        middle.
         """
         unit = float(self.pressure.mean()) / LITRE_PER_MINUTE
-        reach = 1.96 * math.hypot(deviation, self.scale * step)
-        least, most = self.laws
-        low, high = least * (step - reach) * unit, most * (step + reach) * unit
-        return 0.5 * (least + most) * step * unit, (max(0.0, low), max(0.0, high))
-
-
-def pressure_evidence(
-    recording: Recording, edges: NDArray[np.int64], information: Information, laws: tuple[float, float]
-) -> PressureEvidence:
-    """Return the evidence of blocks between the samples `edges` (K + 1,), from what they say of g."""
-    dp = np.abs(recording["p_A"] - recording["p_B"])
-    return PressureEvidence(information, np.add.reduceat(dp, edges[:-1]) / np.diff(edges), flow_scale(), laws)
+        reach = 1.96 * math.hypot(deviation, flow_scale() * step)
+        low, high = (step - reach) * unit, self.orifice * (step + reach) * unit
+        return 0.5 * (1.0 + self.orifice) * step * unit, (max(0.0, low), max(0.0, high))
 
 
 def flow_scale() -> float:
     """Return the standard deviation of the factor that all conductances share [1]: M/A^2 is not known closer."""
-    known = priors("ring_down")
-    return math.hypot(known["mass"].width, 2.0 * known["area"].width)
+    known = BELIEVED["scale"]
+    return math.hypot(known["mass"], 2.0 * known["area"])
 
 
 def states_flow(rig: Rig) -> bool:
@@ -94,14 +99,9 @@ def states_flow(rig: Rig) -> bool:
     return rig.states("cylinder.A_A", "cylinder.A_B", "cylinder.M_eq")
 
 
-def middles(recording: Recording, edges: NDArray[np.int64]) -> Array:
-    """Return the times (K,) of the middles of blocks between the samples `edges` (K + 1,) [s]."""
-    return np.asarray(recording.t[0] + 0.5 * (edges[1:] + edges[:-1]) / recording.rate)
-
-
 def wander_of_conductance(seconds: float) -> float:
     """Return how far a healthy machine's conductance wanders in so many seconds [m^3/(s Pa)]."""
-    return priors("response")["G_wander"].width * math.sqrt(seconds / WANDER_TIME)
+    return float(BELIEVED["conductance"]["wander"]) * math.sqrt(seconds / BELIEVED["blocks"]["wander"])
 
 
 def unusable(recording: Recording, rig: Rig) -> str | None:
@@ -109,6 +109,7 @@ def unusable(recording: Recording, rig: Rig) -> str | None:
 
     Else why not, in words.
     """
+    blocks = BELIEVED["blocks"]
     if rig.valve.spool != "absent":
         return "behind a servo valve a position is needed"
     if rig.cylinder.single_rod:
@@ -118,10 +119,11 @@ def unusable(recording: Recording, rig: Rig) -> str | None:
             return f"needs {name}"
         if recording.units[name] != unit:
             return f"needs {name} in a unit, got counts"
-    if recording.duration < FEWEST * SHORTEST_BLOCK:
-        return f"needs {FEWEST * SHORTEST_BLOCK:g} s or more, got {recording.duration:.3g} s"
-    if recording.rate < SLOWEST:
-        return f"needs {SLOWEST:g} Hz or more, got {recording.rate:.3g} Hz: the ringing after a reversal is not seen"
+    if recording.duration < FEWEST * blocks["shortest"]:
+        return f"needs {FEWEST * blocks['shortest']:g} s or more, got {recording.duration:.3g} s"
+    if recording.rate < blocks["slowest"]:
+        slow = f"got {recording.rate:.3g} Hz: the ringing after a reversal is not seen"
+        return f"needs {blocks['slowest']:g} Hz or more, {slow}"
     for name in ("u", "p_A", "p_B"):
         if not np.all(np.isfinite(recording[name])) or not np.ptp(recording[name]) > 0.0:
             return f"{name} is constant or has missing samples"
@@ -130,31 +132,23 @@ def unusable(recording: Recording, rig: Rig) -> str | None:
 
 def block_edges(recording: Recording) -> NDArray[np.int64]:
     """Return the samples (K + 1,) between which the blocks of a recording lie."""
-    count = max(1, min(BLOCKS, int(recording.duration / SHORTEST_BLOCK)))
+    count = max(1, min(BELIEVED["blocks"]["most"], int(recording.duration / BELIEVED["blocks"]["shortest"])))
     return np.round(np.linspace(0, len(recording), count + 1)).astype(np.int64)
 
 
-def mains_lines(total: Array, rate: float) -> Array:
-    """Return the frequencies (m,) [Hz] of the mains' lines, from p_A + p_B (n,), where the ring cancels."""
-    if not total.size:
-        return np.array([])
+def middles(recording: Recording, edges: NDArray[np.int64]) -> Array:
+    """Return the times (K,) of the middles of blocks between the samples `edges` (K + 1,) [s]."""
+    return np.asarray(recording.t[0] + 0.5 * (edges[1:] + edges[:-1]) / recording.rate)
+
+
+def mains_waves(total: Array, rate: float) -> Array:
+    """Return waves (2 m, n) of the mains' lines, whose frequencies p_A + p_B (n,) shows, where the ring cancels."""
     spectrum = np.abs(np.fft.rfft((total - total.mean()) * np.hanning(total.size), 4 * total.size))
     frequency = np.fft.rfftfreq(4 * total.size, 1.0 / rate)
-    known = priors("mains")
-    lines: list[float] = []
-    for mains in (known["mains_50"], known["mains_60"]):
-        near = np.abs(frequency - mains.value) <= 2.0 * mains.width
-        if np.any(near):
-            line = float(frequency[near][int(np.argmax(spectrum[near]))])
-            lines += [line * k for k in range(1, int(known["harmonics"].value) + 1)]
-    return np.array([line for line in lines if line < 0.5 * rate])
-
-
-def eliminated(H: Array, right: Array, kept: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Return precision and vector of the `kept` unknowns, from H (p, p) and right (p,), by a Schur complement."""
-    rest = np.setdiff1d(np.arange(len(H)), kept)
-    inner, cross = H[np.ix_(rest, rest)], H[np.ix_(kept, rest)]
-    size = 1.0 / np.sqrt(np.maximum(np.diag(inner), np.finfo(float).tiny))
-    inverse = np.linalg.pinv(inner * size[:, None] * size, rcond=1e-12, hermitian=True) * size[:, None] * size
-    precision = H[np.ix_(kept, kept)] - cross @ inverse @ cross.T
-    return 0.5 * (precision + precision.T), right[kept] - cross @ (inverse @ right[rest])
+    mains, lines = BELIEVED["mains"], []
+    for grid in mains["lines"]:
+        near = np.flatnonzero(np.abs(frequency - grid) <= mains["within"] * grid)
+        lines += [frequency[near[np.argmax(spectrum[near])]]] if near.size else []
+    waves = np.exp(2j * np.pi / rate * np.outer(lines, np.arange(total.size)))
+    shown = np.concatenate([waves[k * np.array(lines) < 0.5 * rate] ** k for k in range(1, mains["harmonics"] + 1)])
+    return np.concatenate([shown.real, shown.imag])
