@@ -18,7 +18,7 @@ import numpy as np
 import sealscope as ss
 
 DUTIES = {
-    "thesis": ({"command": "3 sin(4t)"}, {"command": "5 sin(2t)"}, {"command": "3 sin(4t)", "load": "2 kN"}),
+    "thesis": ({"command": "3 sin(4t)"}, {"command": "5 sin(2t)"}, {"command": "3 sin(4t)", "load": "100 N"}),
     "single-rod-eha": (
         {"command": "3 sin(4t)"},
         {"command": "position 50 mm sin(2t)", "load": "2 kN"},

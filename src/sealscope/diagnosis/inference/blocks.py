@@ -102,13 +102,15 @@ class Blocks:
         )
 
     def driving(self, zero: float | None = None, root: bool = False) -> Array:
-        """Return the mean of abs(p_A - p_B - zero) [Pa], or of the `root` about its zero, over each block, shape (K,).
+        """Return the mean of abs(p_A - p_B - zero) [Pa] over each block, shape (K,), by default about that of the sums.
 
-        A leak's coefficient times it is the leak's mean flow. The zero is by default that of the sums (`zero_of`).
+        With `root` that of the root of p_A - p_B, about the sums' zero and then about `zero` [Pa^0.5]. A leak's
+        coefficient times it is the leak's mean flow (`zero_of`).
         """
-        values = np.sign(self.pressures) * np.sqrt(np.abs(self.pressures)) if root else self.pressures
-        about = self.zero[:, None] * (not root) if zero is None else zero
-        return np.asarray(np.abs(values - about).mean(axis=1))
+        if not root:
+            return np.asarray(np.abs(self.pressures - (self.zero[:, None] if zero is None else zero)).mean(axis=1))
+        about = self.pressures - self.zero[:, None]
+        return np.asarray(np.abs(np.sign(about) * np.sqrt(np.abs(about)) - (zero or 0.0)).mean(axis=1))
 
     @classmethod
     def joined(cls, parts: Sequence[Blocks]) -> Blocks:
@@ -389,7 +391,7 @@ def cost_of_zero(zero: float) -> float:
 def zero_of(blocks: Blocks, columns: Sequence[Columns], test: int | None = None) -> float:
     """Return the zero of p_A - p_B [Pa] that a change of the leak shows, the equations' mean; near 0 without one.
 
-    `test`: the column of the leak through an orifice, then the zero is that of its root [Pa^0.5].
+    `test`: the column of the leak through an orifice, then the zero is that of its root [Pa^0.5], beside the sums'.
     """
     fits = [
         _fit(blocks.gram[:, e], blocks, own, test or own.leak, [k for k in own.nuisance if k != own.leak])

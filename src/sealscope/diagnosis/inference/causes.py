@@ -81,7 +81,11 @@ def hypotheses(
     stepped = []
     cost = cost_of_zero(zero_of(blocks, columns))
     root = 2.0 * float(np.mean(blocks.driving(root=True)))  # dp over d sqrt(p)
-    costs = {LEAK: cost, PUMP: cost, ORIFICE: cost_of_zero(root * zero_of(blocks, columns, orifice))}
+    costs = {
+        LEAK: cost,
+        PUMP: cost,
+        ORIFICE: cost_of_zero(root * zero_of(blocks, columns, orifice) + float(np.mean(blocks.zero))),
+    }
     for name, cause, own in tested:
         signs = (1.0,) if cause in (*LEAKS, "pump leak", "external leak") else (1.0, -1.0)
         best = step_test(own, signs)
