@@ -191,7 +191,8 @@ def test_a_detector_is_restored_with_the_same_bits_and_stays_small():
         detector.take(k, k + 1.0, value, 1.0)
     saved = json.dumps(detector.state(), allow_nan=False)
     assert len(saved) < 100_000
-    again = StepDetector.from_state(json.loads(saved))
+    again = StepDetector()
+    again.recall(json.loads(saved))
     for one in (detector, again):
         one.take(2500.0, 2501.0, 9.0, 1.0)
     assert json.dumps(again.state()) == json.dumps(detector.state())
@@ -208,5 +209,6 @@ def test_a_live_balance_is_restored_at_any_instant():
     for stop in (10, 900, 4000):
         live = LiveBalance(RIG, names)
         before = conductances(live, 0, stop)
-        again = LiveBalance.from_state(RIG, json.loads(json.dumps(live.state(), allow_nan=False)))
+        again = LiveBalance(RIG, names)
+        again.recall(json.loads(json.dumps(live.state(), allow_nan=False)))
         assert before + conductances(again, stop, len(WORN)) == whole

@@ -7,6 +7,7 @@ import json
 import os
 import random
 import signal
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -26,7 +27,7 @@ from ..diagnosis.balance_machine import machine, step
 Rows = dict[str, list[tuple[Any, ...]]]
 SETTINGS = """
 database = "{database}"
-lines = true
+lines = {lines}
 settle_s = 0.1
 [defaults]
 learn_hours = 0.02
@@ -34,17 +35,48 @@ warning_lpm = 0.0005
 error_lpm = 0.05
 [[actuator]]
 name = "press 1"
+{first}
 [[actuator]]
 name = "press 2"
+{second}
 {more}
 """
 CHANNELS = ("p_A", "p_B", "x", "theta")
 
 
-def settings_in(folder: Path, more: str = "", database: str = "monitor.db") -> MonitorSettings:
+def settings_in(folder: Path, more: str = "", database: str = "monitor.db", own: str = "") -> MonitorSettings:
+    """Settings of two actuators; `own`: of each, with its NAME, where their samples do not come as lines."""
+    first, second = (own.replace("NAME", name) for name in ("press 1", "press 2"))
+    values = {"database": database, "lines": "false" if own else "true", "more": more}
     file = folder / "monitor.toml"
-    file.write_text(SETTINGS.format(more=more, database=database), encoding="utf-8")
+    file.write_text(SETTINGS.format(first=first, second=second, **values), encoding="utf-8")
     return read_settings(file)
+
+
+def by_broker(folder: Path, port: int, more: str = "") -> MonitorSettings:
+    """Settings of two actuators whose samples come from a broker."""
+    mqtt = f'[mqtt]\nhost = "127.0.0.1"\nport = {port}\n{more}'
+    return settings_in(folder, mqtt, own='topic = "plant/NAME"')
+
+
+class Running:
+    """A service in a thread."""
+
+    def __init__(self, settings: MonitorSettings) -> None:
+        self.service = Service(settings, stdin=io.BytesIO(), stdout=io.StringIO())
+        self.thread = threading.Thread(target=self.service.run, daemon=True)
+        self.thread.start()
+
+    def until(self, blocks: int) -> None:
+        until(lambda: len(rows_of(self.service.settings.database)["blocks"]) >= blocks)
+
+    def end(self) -> None:
+        self.service.stop()
+        self.thread.join()
+
+
+def moved(recording: Recording, seconds: float) -> Recording:
+    return Recording(recording.t + seconds, recording.channels, recording.units, recording.rate)
 
 
 def message(actuator: str, samples: Recording) -> dict[str, Any]:

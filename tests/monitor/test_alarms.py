@@ -15,12 +15,14 @@ from hypothesis import strategies as st
 from scipy.special import ndtr
 
 from sealscope.errors import InputError
-from sealscope.monitor.alarms import MARKS, AlarmJudge, Thresholds
+from sealscope.monitor.alarms import MARKS, AlarmJudge
 from sealscope.monitor.memory.store import MonitorStore, StoredRows
-from sealscope.monitor.outputs.lines import EventLines
+from sealscope.monitor.outputs.events import EventLines
+from sealscope.monitor.settings import WatchSettings
 from sealscope.monitor.stream.estimates import BlockEstimate, WatchedLeak
+from sealscope.storage.plain_state import restored
 
-THRESHOLDS = Thresholds(warning_lpm=0.002, error_lpm=0.01, debounce=2, return_share=0.5)
+SETTINGS = WatchSettings(warning_lpm=0.002, error_lpm=0.01, debounce_blocks=2, return_share=0.5)
 LEAK = WatchedLeak(
     10.0, 9.0, (8.0, 10.0), 0.003, (0.002, 0.004), 1e-13, 1e-15, "step", "pump leak", "it rises", 50.0, 28.0
 )
@@ -32,7 +34,7 @@ def through(judge: AlarmJudge, flows: list[float | None], leak: WatchedLeak | No
     for number, lpm in enumerate(flows):
         interval = None if lpm is None else (lpm, lpm)
         change = judge.take(
-            BlockEstimate(number, 3.0 * number, "alarm", lpm, interval, lpm, interval), leak, 1, THRESHOLDS
+            BlockEstimate(number, 3.0 * number, "alarm", lpm, interval, lpm, interval), leak, 1, SETTINGS
         )
         if change is not None and change[1]:
             happened.append(change[1])
@@ -50,10 +52,12 @@ def test_one_block_is_no_alarm_two_are():
 
 def test_stronger_evidence_is_rarer_by_chance():
     """At the threshold it is the stated rate, then less, by the normal tail where the score is a level's."""
-    thresholds = Thresholds(false_alarms_per_1000_h=2.0)
 
     def chance(test: str, score: float) -> float:
-        return thresholds.by_chance(replace(LEAK, test=test, score=score, threshold=4.0))
+        leak = replace(LEAK, test=test, score=score, threshold=4.0)
+        block, judge = BlockEstimate(1, 3.0, "alarm"), AlarmJudge("a")
+        alarm, _ = judge.take(block, leak, 1, WatchSettings(false_alarms_per_1000_h=2.0, debounce_blocks=1))
+        return alarm.by_chance_per_1000_h
 
     assert chance("step", 4.0) == chance("level", 4.0) == 2.0
     assert chance("level", 5.0) == pytest.approx(2.0 * ndtr(-5.0) / ndtr(-4.0))
@@ -126,7 +130,7 @@ def test_an_invalid_alarm_has_a_reason():
 def test_its_state_is_plain_and_what_is_over_is_gone(steps: list[tuple[float, str]]):
     judge, over = AlarmJudge("a"), 0
     for lpm, mark in steps:
-        again = AlarmJudge.from_state(json.loads(json.dumps(judge.state())))
+        again = restored(AlarmJudge, json.loads(json.dumps(judge.state())), "alarm")
         assert again == judge
         through(judge, [lpm])
         if judge.alarm is not None and mark:
@@ -164,18 +168,8 @@ def test_a_shelved_alarm_keeps_its_changes_to_itself(tmp_path: Path):
 def test_an_actuator_s_latest_events_are_shown_however_many_there_are(tmp_path: Path) -> None:
     """The page took the last 200 of the first 1000: after these nothing new was seen."""
     store = MonitorStore(f"sqlite:///{tmp_path / 'memory.db'}")
-    rows = [
-        {
-            "actuator": ("press", "saw")[number % 2],
-            "t": float(number),
-            "kind": "alarm",
-            "alarm_id": "1",
-            "by_whom": "",
-            "text": "",
-            "alarm": "{}",
-        }
-        for number in range(2600)
-    ]
+    row = {"kind": "alarm", "alarm_id": "1", "by_whom": "", "text": "", "alarm": "{}"}
+    rows = [{**row, "actuator": ("press", "saw")[number % 2], "t": float(number)} for number in range(2600)]
     with store.writing() as connection:
         connection.execute(store.tables.events.insert(), rows)
     shown = store.last_events("saw")

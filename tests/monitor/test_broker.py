@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import json
 import random
 import sqlite3
-import threading
 import time
 from collections import Counter
 from pathlib import Path
@@ -17,57 +15,24 @@ from paho.mqtt.enums import MQTTProtocolVersion
 from starlette.testclient import TestClient
 
 from sealscope.monitor.page.site import site
-from sealscope.monitor.service import Service
-from sealscope.monitor.settings import MonitorSettings, PageSettings, read_settings
+from sealscope.monitor.settings import MonitorSettings, PageSettings
 from sealscope.monitor.sources.source_block import WRONG_ACTUATOR
 
-from .plant import LINES, rows_of, until
+from .plant import LINES, Running, by_broker, rows_of, until
 from .servers import MOSQUITTO, Broker
 from .test_hostile_service import BRIEF, FORGED, UNKNOWN
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(MOSQUITTO is None, reason="mosquitto is not installed")]
-SETTINGS = """
-database = "monitor.db"
-[mqtt]
-host = "127.0.0.1"
-port = {port}
-[defaults]
-learn_hours = 0.02
-warning_lpm = 0.0005
-error_lpm = 0.05
-[[actuator]]
-name = "press 1"
-topic = "plant/press 1"
-[[actuator]]
-name = "press 2"
-topic = "plant/press 2"
-"""
 
 
 @pytest.fixture
-def port(broker: Broker) -> int:
-    return broker.port
+def settings(broker: Broker, tmp_path: Path) -> MonitorSettings:
+    return by_broker(tmp_path, broker.port)
 
 
 def kept(broker: Broker) -> None:
-    """Let the broker keep what comes for the monitor of `SETTINGS` from now on."""
+    """Let the broker keep what comes for the monitor from now on."""
     broker.open_session("sealscope-monitor", ("plant/press 1", "plant/press 2"))
-
-
-class Running:
-    """A service in a thread."""
-
-    def __init__(self, settings: MonitorSettings) -> None:
-        self.service = Service(settings, stdin=io.BytesIO(), stdout=io.StringIO())
-        self.thread = threading.Thread(target=self.service.run, daemon=True)
-        self.thread.start()
-
-    def until(self, blocks: int) -> None:
-        until(lambda: len(rows_of(self.service.settings.database)["blocks"]) >= blocks)
-
-    def end(self) -> None:
-        self.service.stop()
-        self.thread.join()
 
 
 def send(port: int, lines: list[bytes]) -> None:
@@ -77,40 +42,36 @@ def send(port: int, lines: list[bytes]) -> None:
     publish.multiple(messages, hostname="127.0.0.1", port=port, protocol=MQTTProtocolVersion.MQTTv5)
 
 
-def test_what_comes_while_the_monitor_is_away_is_stored_once(undisturbed, broker: Broker, port: int, tmp_path: Path):
-    file = tmp_path / "monitor.toml"
-    file.write_text(SETTINGS.format(port=port))
-    settings, lines = read_settings(file), LINES.splitlines()
+def test_what_comes_while_the_monitor_is_away_is_stored_once(undisturbed, broker: Broker, settings: MonitorSettings):
+    lines = LINES.splitlines()
     third = len(lines) // 3
     kept(broker)
     first = Running(settings)
-    send(port, [b"not a block for press 1".join([b'{"actuator": "press 1", "x": "', b'"}'])])
-    send(port, lines[:third])
+    send(broker.port, [b"not a block for press 1".join([b'{"actuator": "press 1", "x": "', b'"}'])])
+    send(broker.port, lines[:third])
     first.until(third)
     first.end()
-    send(port, lines[third - 5 : 2 * third])  # five once more
+    send(broker.port, lines[third - 5 : 2 * third])  # five once more
     second = Running(settings)
     second.until(2 * third)
-    send(port, lines[2 * third :])
+    send(broker.port, lines[2 * third :])
     second.until(len(lines))
     until(lambda: second.service.store.position("mqtt") > 0)
     second.end()
     assert rows_of(settings.database) == undisturbed
-    retained = subscribe.simple("sealscope/press 1/alarm", hostname="127.0.0.1", port=port)
+    retained = subscribe.simple("sealscope/press 1/alarm", hostname="127.0.0.1", port=broker.port)
     alarm = json.loads(retained.payload)
     assert (alarm["id"], alarm["state"]) == ("press 1-1", "new")
-    for name, state in second.service.states().items():
-        message = subscribe.simple(f"sealscope/{name}/state", hostname="127.0.0.1", port=port)
-        assert json.loads(message.payload) == state
-    assert alarm["machine_state"] == second.service.states()["press 1"]
+    for name, summary in second.service.plain().items():
+        message = subscribe.simple(f"sealscope/{name}/state", hostname="127.0.0.1", port=broker.port)
+        assert json.loads(message.payload) == summary["state"]
+    assert alarm["machine_state"] == second.service.plain()["press 1"]["state"]
 
 
-def test_a_broker_that_restarts_loses_nothing(undisturbed, broker: Broker, tmp_path: Path):
-    file = tmp_path / "monitor.toml"
-    file.write_text(SETTINGS.format(port=broker.port))
+def test_a_broker_that_restarts_loses_nothing(undisturbed, broker: Broker, settings: MonitorSettings):
     lines = LINES.splitlines()
     kept(broker)
-    running = Running(read_settings(file))
+    running = Running(settings)
     for start in range(0, len(lines), 30):
         send(broker.port, lines[start : start + 30])
         if start == 0:
@@ -122,17 +83,15 @@ def test_a_broker_that_restarts_loses_nothing(undisturbed, broker: Broker, tmp_p
     running.end()
     assert rows_of(running.service.settings.database) == undisturbed
     assert set(running.service.actuators.counters) <= {"blocks stored already"}
-    reached, number, seconds = running.service.outages.totals()["broker"]
+    reached, number, seconds = running.service.supervisor.totals()["broker"]
     assert reached
     assert 1 <= number <= len(range(0, len(lines), 30))  # fewer, where it was back before it was tried again
     assert seconds > 0.2 * number
 
 
-def test_a_broker_that_is_away_stands_on_page_and_metrics(broker: Broker, tmp_path: Path, caplog):
-    file = tmp_path / "monitor.toml"
-    file.write_text(SETTINGS.format(port=broker.port))
+def test_a_broker_that_is_away_stands_on_page_and_metrics(broker: Broker, settings: MonitorSettings, caplog):
     kept(broker)
-    running = Running(read_settings(file))
+    running = Running(settings)
     page = TestClient(site(running.service.actuators, PageSettings(), None), base_url="http://localhost")
     try:
         send(broker.port, LINES.splitlines()[:1])
@@ -140,7 +99,7 @@ def test_a_broker_that_is_away_stands_on_page_and_metrics(broker: Broker, tmp_pa
         assert page.get("/api/fleet").json()["outages"] == []
         assert 'sealscope_reached{part="broker"} 1.0' in page.get("/metrics").text
         broker.stop()
-        until(running.service.outages.plain)
+        until(running.service.supervisor.outages)
         (outage,) = page.get("/api/fleet").json()["outages"]
         assert (outage["part"], outage["reason"][:27]) == ("broker", "the connection to 127.0.0.1")
         assert 'sealscope_reached{part="broker"} 0.0' in page.get("/metrics").text
@@ -153,14 +112,12 @@ def test_a_broker_that_is_away_stands_on_page_and_metrics(broker: Broker, tmp_pa
 
 
 def test_while_the_database_is_away_the_connection_stays_and_the_broker_keeps_the_rest(
-    undisturbed, broker: Broker, tmp_path: Path, monkeypatch
+    undisturbed, broker: Broker, settings: MonitorSettings, monkeypatch
 ):
     """A locked database stops the storing for longer than the broker would wait for a client that is silent."""
     monkeypatch.setattr("sealscope.monitor.sources.broker.KEEP_ALIVE_S", 2)
     monkeypatch.setattr("sealscope.monitor.service._WAITING", 8)
-    file = tmp_path / "monitor.toml"
-    file.write_text(SETTINGS.format(port=broker.port))
-    settings, lines = read_settings(file), LINES.splitlines()
+    lines = LINES.splitlines()
     kept(broker)
     running = Running(settings)
     lock = sqlite3.connect(settings.database, isolation_level=None)
@@ -169,14 +126,14 @@ def test_while_the_database_is_away_the_connection_stays_and_the_broker_keeps_th
     dropped, refused = "messages of QoS 0 that found no room", "messages that are no JSON or CBOR"
     try:
         send(broker.port, lines)  # more than the queue and those in flight
-        until(running.service.outages.plain)
+        until(running.service.supervisor.outages)
         flood = [{"topic": "plant/press 1", "payload": b"{", "qos": 0, "retain": False}] * 2000
         publish.multiple(flood, hostname="127.0.0.1", port=broker.port, protocol=MQTTProtocolVersion.MQTTv5)
-        until(lambda: counters.counters.get(dropped, 0) > 1000 and running.service.outages.plain())
+        until(lambda: counters.counters.get(dropped, 0) > 1000 and running.service.supervisor.outages())
         time.sleep(4.0)  # over what the broker would wait for
         assert running.service.waits()[0] >= 8  # and those at hand
-        assert [outage["part"] for outage in running.service.outages.plain()] == ["database"]
-        assert running.service.outages.totals()["broker"][:2] == (True, 0)
+        assert [outage["part"] for outage in running.service.supervisor.outages()] == ["database"]
+        assert running.service.supervisor.totals()["broker"][:2] == (True, 0)
     finally:
         lock.execute("rollback")
         lock.close()
@@ -186,13 +143,13 @@ def test_while_the_database_is_away_the_connection_stays_and_the_broker_keeps_th
     assert rows_of(settings.database) == undisturbed
 
 
-def test_a_broker_that_sends_more_than_agreed_is_asked_again(undisturbed, broker: Broker, tmp_path: Path, monkeypatch):
+def test_a_broker_that_sends_more_than_agreed_is_asked_again(
+    undisturbed, broker: Broker, settings: MonitorSettings, monkeypatch
+):
     """The room is less than what the broker is asked for at a time."""
     monkeypatch.setattr("sealscope.monitor.sources.broker._ASSURED_ROOM", 20)
     monkeypatch.setattr("sealscope.monitor.service._WAITING", 1)
-    file = tmp_path / "monitor.toml"
-    file.write_text(SETTINGS.format(port=broker.port))
-    settings, lines = read_settings(file), LINES.splitlines()
+    lines = LINES.splitlines()
     running = Running(settings)
     time.sleep(0.5)
     lock = sqlite3.connect(settings.database, isolation_level=None)
@@ -205,14 +162,12 @@ def test_a_broker_that_sends_more_than_agreed_is_asked_again(undisturbed, broker
     running.end()
     assert rows_of(settings.database) == undisturbed
     assert running.service.actuators.counters["messages of QoS 1 that found no room and were asked for again"] > 20
-    assert running.service.outages.totals()["broker"][:2] == (True, 0)
+    assert running.service.supervisor.totals()["broker"][:2] == (True, 0)
 
 
-def test_forged_messages_over_the_broker_are_counted(undisturbed, broker: Broker, tmp_path: Path):
+def test_forged_messages_over_the_broker_are_counted(undisturbed, broker: Broker, settings: MonitorSettings):
     """What names another actuator than its topic is refused; one that is too large does not come through."""
-    file = tmp_path / "monitor.toml"
-    file.write_text(SETTINGS.format(port=broker.port))
-    settings, lines = read_settings(file), LINES.splitlines()
+    lines = LINES.splitlines()
     chance, sent = random.Random(1), Counter()
     messages: list[bytes] = []
     for line in lines:
@@ -236,7 +191,7 @@ def test_forged_messages_over_the_broker_are_counted(undisturbed, broker: Broker
     until(lambda: sum(running.service.actuators.counters.values()) >= sum(sent.values()))
     running.end()
     assert running.service.actuators.counters == dict(sent)
-    assert running.service.outages.totals()["broker"][:2] == (True, 0)
+    assert running.service.supervisor.totals()["broker"][:2] == (True, 0)
     assert rows_of(settings.database) == undisturbed
 
 

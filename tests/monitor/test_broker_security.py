@@ -15,11 +15,8 @@ import pytest
 from paho.mqtt import publish, subscribe
 from paho.mqtt.enums import MQTTProtocolVersion
 
-from sealscope.monitor.settings import read_settings
-
-from .plant import LINES, rows_of, until
+from .plant import LINES, Running, by_broker, rows_of, until
 from .servers import MOSQUITTO, Broker
-from .test_broker import Running
 
 x509 = pytest.importorskip("cryptography.x509", reason="cryptography is not installed")
 PASSWD = shutil.which("mosquitto_passwd")
@@ -28,24 +25,11 @@ pytestmark = [
     pytest.mark.skipif(MOSQUITTO is None or PASSWD is None, reason="mosquitto is not installed"),
 ]
 SECRET = "correct horse"
-SETTINGS = """
-database = "monitor.db"
-[mqtt]
-host = "127.0.0.1"
-port = {port}
-user = "{user}"
-password_file = "{password}"
+GUARDED = """
+user = "monitor"
+password_file = "../{password}"
 tls = true
-ca_file = "{ca}"
-[defaults]
-learn_hours = 0.02
-warning_lpm = 0.0005
-[[actuator]]
-name = "press 1"
-topic = "plant/press 1"
-[[actuator]]
-name = "press 2"
-topic = "plant/press 2"
+ca_file = "../{ca}.pem"
 """
 
 
@@ -95,23 +79,20 @@ def test_tls_user_and_password_open_the_broker_and_nothing_less(undisturbed, gua
 
     def running(folder: str, ca: str = "authority", password: str = "right") -> Running:
         (tmp_path / folder).mkdir()
-        file = tmp_path / folder / "monitor.toml"
-        values = {"port": guarded.port, "user": "monitor", "password": f"../{password}", "ca": f"../{ca}.pem"}
-        file.write_text(SETTINGS.format(**values))
-        return Running(read_settings(file))
+        return Running(by_broker(tmp_path / folder, guarded.port, GUARDED.format(password=password, ca=ca)))
 
     for folder, options, reason in (
         ("ca", {"ca": "another"}, f"no connection to 127.0.0.1:{guarded.port}: its certificate is not trusted"),
         ("password", {"password": "wrong"}, "127.0.0.1 refuses the connection: Not authorized"),
     ):
         refused = running(folder, **options)
-        until(lambda of=refused: of.service.outages.plain())
-        (outage,) = refused.service.outages.plain()
+        until(lambda of=refused: of.service.supervisor.outages())
+        (outage,) = refused.service.supervisor.outages()
         refused.end()
         assert outage["reason"].startswith(reason)
         assert refused.service.actuators.counters == {}
     let_in = running("open")
-    until(lambda: let_in.service.outages.totals().get("broker", (False,))[0])
+    until(lambda: let_in.service.supervisor.totals().get("broker", (False,))[0])
     entry = {
         "hostname": "127.0.0.1",
         "port": guarded.port,

@@ -20,9 +20,9 @@ import numpy as np
 import pytest
 
 from sealscope.cli.app import arguments_of
-from sealscope.monitor.outputs.webhook import Webhook
+from sealscope.monitor.outputs.events import Webhook
 from sealscope.monitor.service import Service
-from sealscope.monitor.settings import ActuatorSettings, read_settings
+from sealscope.monitor.settings import ActuatorSettings
 from sealscope.monitor.sources.source_block import (
     REASONS,
     STALE_DEATH,
@@ -37,9 +37,9 @@ from sealscope.monitor.supervisor import PartAway
 from sealscope.recordings import write
 
 from ..recordings.test_packed_files import rows, workbook
-from .plant import CHANNELS, served, settings_in, until
+from .plant import CHANNELS, Running, by_broker, served, settings_in, until
 from .servers import MOSQUITTO, Broker
-from .test_broker import SETTINGS, Running, send
+from .test_broker import send
 from .test_outputs import LINES, WORN
 
 HEALTHY = WORN.between(0.0, 62.0)
@@ -79,8 +79,7 @@ def test_a_death_whose_number_is_an_array_is_stale():
 def test_a_message_that_cannot_be_decoded_is_acknowledged_and_kept(tmp_path: Path):
     """By a real broker: what comes after it is stored, and after a restart it does not come again."""
     broker = Broker(tmp_path)
-    (tmp_path / "monitor.toml").write_text(SETTINGS.format(port=broker.port))
-    settings = read_settings(tmp_path / "monitor.toml")
+    settings = by_broker(tmp_path, broker.port)
     broker.open_session("sealscope-monitor", ("plant/press 1", "plant/press 2"))
     try:
         valid = LINES.splitlines()[:6]
@@ -105,7 +104,7 @@ def test_a_message_that_cannot_be_decoded_is_acknowledged_and_kept(tmp_path: Pat
         finally:
             first.end()
         again = Running(settings)
-        until(lambda: again.service.outages.totals().get("broker", (False,))[0])
+        until(lambda: again.service.supervisor.totals().get("broker", (False,))[0])
         time.sleep(0.5)
         again.end()
         assert again.service.actuators.counters == {}
@@ -138,7 +137,7 @@ def test_names_are_bytes(tmp_path: Path):
         stored = blocks_of(service)
         assert [actuator for actuator, _ in stored] == ["press 3", "press 4"]
         assert stored[0][1].startswith("pr\\udce9sse.csv ")
-        assert service.outages.plain() == []
+        assert service.supervisor.outages() == []
 
 
 def test_a_file_that_cannot_be_read_is_named_once_and_not_read_again(tmp_path: Path, monkeypatch, caplog):
@@ -168,7 +167,7 @@ def test_a_file_that_cannot_be_read_is_named_once_and_not_read_again(tmp_path: P
 def watched_folder(folder: Path, settle_s: float = 0.0) -> Callable[[], list[SourceBlock | RefusedMessage]]:
     from sealscope.monitor.sources.folder import WatchedFolder
 
-    watched = WatchedFolder("press 3", folder, "*", settle_s, lambda *_: False)
+    watched = WatchedFolder(ActuatorSettings(name="press 3", folder=folder), settle_s, lambda *_: False)
     return lambda: list(watched.blocks())
 
 
@@ -228,13 +227,13 @@ def test_a_removed_folder_is_one_outage_and_the_others_go_on(tmp_path: Path, mon
     running = Running(settings)
     try:
         until(lambda: len(blocks_of(running.service)) == 1)
-        time.sleep(0.5)
-        (outage,) = running.service.outages.plain()
+        time.sleep(0.2)
+        (outage,) = running.service.supervisor.outages()
         assert outage["part"] == "folder of press 3"
         assert len([record for record in caplog.records if "press 3" in record.getMessage()]) == 1
         (tmp_path / "press 3").mkdir()
         write(HEALTHY.only(CHANNELS), tmp_path / "press 3" / "a.csv")
-        until(lambda: len(blocks_of(running.service)) == 2 and not running.service.outages.plain())
+        until(lambda: len(blocks_of(running.service)) == 2 and not running.service.supervisor.outages())
     finally:
         running.end()
 
@@ -280,9 +279,9 @@ def test_a_webhook_that_speaks_no_http_is_an_outage_and_asked_again(watched: Ser
     part = watched.supervisor.part("webhook")
     hook = Webhook(watched.store, server.url, timeout=2.0)
     assert not part.attempt(hook.pass_on)
-    assert [outage["part"] for outage in watched.outages.plain()] == ["webhook"]
+    assert [outage["part"] for outage in watched.supervisor.outages()] == ["webhook"]
     assert part.attempt(hook.pass_on, at_once=True)
-    assert watched.outages.plain() == []
+    assert watched.supervisor.outages() == []
     assert watched.store.position("webhook") == watched.store.events_since(0)[-1][0]
     assert server.got == 2
 
@@ -295,7 +294,8 @@ def test_a_webhook_that_drips_has_one_deadline(watched: Service):
     assert watched.store.position("webhook") == 0
 
 
-def test_the_monitor_ends_within_five_seconds_whatever_the_webhook_does(tmp_path: Path):
+def test_the_monitor_ends_in_its_time_whatever_the_webhook_does(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr("sealscope.monitor.service._END_S", 0.3)
     server = OddServer(*[DRIP] * 20)
     settings = settings_in(tmp_path, f'[webhook]\nurl = "{server.url}"\ntimeout_s = 60\n')
     service = Service(settings, stdin=io.BytesIO(LINES), stdout=io.StringIO(), sources=[lambda of: of.stopping.wait()])
@@ -324,7 +324,7 @@ def test_a_standard_output_that_takes_nothing_ends_nothing(tmp_path: Path, kind,
     with suppress(OSError), opened(kind) as out:
         service = Service(settings, once=True, stdin=io.BytesIO(LINES), stdout=out)
         service.run()
-        assert [outage["part"] for outage in service.outages.plain()] == ["standard output"]
+        assert [outage["part"] for outage in service.supervisor.outages()] == ["standard output"]
         assert "the standard output is not reached" in caplog.text
         assert service.store.position("lines") == 0
         kept = [number for number, _ in service.store.events_since(0)]
@@ -334,7 +334,7 @@ def test_a_standard_output_that_takes_nothing_ends_nothing(tmp_path: Path, kind,
 
 def test_a_line_that_was_written_in_part_is_finished(watched: Service, tmp_path: Path, monkeypatch):
     """The disk has room for a part of the lines, for none, and then for all."""
-    from sealscope.monitor.outputs.lines import EventLines
+    from sealscope.monitor.outputs.events import EventLines
     from sealscope.monitor.supervisor import PartAway
 
     watched.store.keep_position("lines", 0)
@@ -345,7 +345,7 @@ def test_a_line_that_was_written_in_part_is_finished(watched: Service, tmp_path:
             raise OSError(28, "No space left on device")
         return write_(file, data[:most])
 
-    monkeypatch.setattr("sealscope.monitor.outputs.lines.os.write", narrow)
+    monkeypatch.setattr("sealscope.monitor.outputs.events.os.write", narrow)
     with (tmp_path / "lines").open("w") as stream:
         lines = EventLines(watched.store, stream)
         for _ in range(2):
@@ -417,12 +417,13 @@ def test_a_broker_that_speaks_no_mqtt_is_tried_again(tmp_path: Path, monkeypatch
                     pass
 
     threading.Thread(target=answer, daemon=True).start()
-    (tmp_path / "monitor.toml").write_text(SETTINGS.format(port=server.getsockname()[1]))
-    running = Running(read_settings(tmp_path / "monitor.toml"))
+    running = Running(by_broker(tmp_path, server.getsockname()[1]))
     try:
         until(lambda: len(connections) >= 2, 20.0)
         assert running.thread.is_alive()
-        assert running.service.outages.totals()["broker"][1] + running.service.outages.totals()["MQTT client"][1] > 0
+        assert (
+            running.service.supervisor.totals()["broker"][1] + running.service.supervisor.totals()["MQTT client"][1] > 0
+        )
     finally:
         running.end()
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import http.client
 import json
-import threading
 from collections.abc import Iterator
 from itertools import pairwise
 
@@ -18,7 +17,6 @@ from sealscope.monitor.memory.store import MonitorStore
 from sealscope.monitor.page.live import MOST_ACTUATORS, MOST_SAMPLES, LiveSamples, machine_of
 from sealscope.monitor.page.site import PageServer
 from sealscope.monitor.settings import ActuatorSettings, PageSettings
-from sealscope.monitor.supervisor import Supervisor
 from sealscope.recordings.recording import Recording
 from sealscope.signals.streams import DetailStream
 from sealscope.signals.windows import RmsStream
@@ -88,7 +86,7 @@ def test_what_is_stored_never_takes_the_place_of_what_comes_meanwhile():
         assert live.picture("press")["t"] == newer.t[-1]
 
 
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=8)
 @given(st.lists(st.integers(1, len(SENT) - 1), max_size=8))
 def test_the_picture_does_not_depend_on_how_samples_are_cut(cuts: list[int]):
     edges = [0, *sorted({*cuts}), len(SENT)]
@@ -144,7 +142,7 @@ def page(tmp_path) -> Iterator[tuple[PageServer, LiveSamples]]:
     store = MonitorStore(str(tmp_path / "monitor.db"))
     actuators = WatchedActuators([ActuatorSettings(name="press <1>")], store)
     live = LiveSamples(store.last_samples)
-    server = PageServer(actuators, PageSettings(port=0), Supervisor(actuators.outages, threading.Event()), live=live)
+    server = PageServer(actuators, PageSettings(port=0), live=live)
     yield server, live
     server.close()
     store.engine.dispose()

@@ -161,16 +161,16 @@ def test_a_server_that_restarts_is_said_and_its_samples_become_estimates(undistu
 
     try:
         server.stop()
-        until(service.outages.plain)
-        (outage,) = service.outages.plain()
+        until(service.supervisor.outages)
+        (outage,) = service.supervisor.outages()
         assert outage["part"] == "OPC UA server"
         server = OpcUaServer(port)
-        until(lambda: not service.outages.plain())
+        until(lambda: not service.supervisor.outages())
         every = list(pieces())
         sent(every, blocks())
         until(lambda: blocks() >= len(every) - 2)
         server.stop()
-        until(service.outages.plain)
+        until(service.supervisor.outages)
     finally:
         service.stop()
         thread.join()

@@ -21,7 +21,7 @@ from sealscope.monitor.page.site import site
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import PageSettings
 from sealscope.monitor.sources.source_block import SourceBlock
-from sealscope.monitor.supervisor import BROKER, DATABASE, Outages
+from sealscope.monitor.supervisor import BROKER, DATABASE, Supervisor
 from sealscope.monitor.waiting import Waiting
 
 from .plant import LINES, rows_of, served, settings_in, until
@@ -34,21 +34,21 @@ REASON = "connection to server at 10.0.0.9 failed: Connection refused"
 
 def test_an_outage_is_said_once_and_measured(caplog):
     changes: list[int] = []
-    outages = Outages(lambda: changes.append(1))
-    outages.expect(DATABASE)
-    outages.back(DATABASE)
-    assert outages.plain() == [] == changes
-    outages.lost(BROKER, "gone\nwith the wind")
-    outages.lost(BROKER, "still gone")
-    (outage,) = outages.plain()
+    supervisor = Supervisor(changed=lambda: changes.append(1))
+    database, broker = (supervisor.part(name) for name in (DATABASE, BROKER))
+    database.back()
+    assert supervisor.outages() == [] == changes
+    broker.lost("gone\nwith the wind")
+    broker.lost("still gone")
+    (outage,) = supervisor.outages()
     assert (outage["part"], outage["reason"]) == ("broker", "gone")
-    reached, number, seconds = outages.totals()["broker"]
+    reached, number, seconds = supervisor.totals()["broker"]
     assert (reached, number, seconds >= 0.0) == (False, 1, True)
-    outages.back(BROKER)
-    outages.back(BROKER)
-    outages.lost(BROKER, "again")
-    assert outages.totals()["broker"][:2] == (False, 2)
-    assert outages.totals()["database"] == (True, 0, 0.0)
+    broker.back()
+    broker.back()
+    broker.lost("again")
+    assert supervisor.totals()["broker"][:2] == (False, 2)
+    assert supervisor.totals()["database"] == (True, 0, 0.0)
     assert len(changes) == 3
     assert [record.message[:30] for record in caplog.records] == [
         "the broker is not reached: gon",
@@ -77,7 +77,7 @@ def test_a_queue_holds_so_many_and_so_many_bytes():
 @pytest.fixture
 def service(tmp_path: Path) -> Iterator[Service]:
     service, _ = served(settings_in(tmp_path), LINES)
-    service.outages.expect(BROKER)
+    service.supervisor.part(BROKER)
     yield service
     service.store.engine.dispose()
 
@@ -147,7 +147,7 @@ def test_errors_of_another_kind_are_no_outage(service, monkeypatch):
 
     monkeypatch.setattr(MonitorStore, "summaries", fails)
     assert page.get("/api/fleet").status_code == 500
-    assert service.outages.plain() == []
+    assert service.supervisor.outages() == []
 
 
 def test_a_full_queue_makes_its_source_wait_and_says_so(undisturbed, tmp_path, monkeypatch, caplog):
@@ -173,7 +173,7 @@ def test_a_full_queue_makes_its_source_wait_and_says_so(undisturbed, tmp_path, m
     finally:
         other.execute("rollback")
         thread.join(60.0)
-    assert service.outages.totals()["database"][:2] == (True, 1)
+    assert service.supervisor.totals()["database"][:2] == (True, 1)
     assert service.waits()[2] > 0
     assert rows_of(settings.database) == undisturbed
 
@@ -189,4 +189,4 @@ def test_a_source_is_no_longer_than_the_service(tmp_path):
     thread.join(60.0)
     assert not thread.is_alive()
     service._hold.close()
-    assert json.loads(json.dumps(service.outages.plain())) == []
+    assert json.loads(json.dumps(service.supervisor.outages())) == []

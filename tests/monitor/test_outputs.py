@@ -12,9 +12,9 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 import pytest
 
 from sealscope.monitor.memory.export import ESTIMATE_COLUMNS, export_labels
+from sealscope.monitor.outputs.events import Webhook
 from sealscope.monitor.outputs.grafana import dashboard
 from sealscope.monitor.outputs.prometheus import metrics_text
-from sealscope.monitor.outputs.webhook import Webhook
 from sealscope.monitor.supervisor import PartAway
 
 from .plant import WORN, lines_of, served, settings_in

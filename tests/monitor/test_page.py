@@ -16,8 +16,8 @@ from starlette.testclient import TestClient
 
 from sealscope.diagnosis.verdict.states import state_of
 from sealscope.errors import InputError
+from sealscope.monitor.alarms import ranked
 from sealscope.monitor.page.live import LiveSamples
-from sealscope.monitor.page.ranking import ranked
 from sealscope.monitor.page.site import PageServer, site
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import MonitorSettings, PageSettings
@@ -172,9 +172,9 @@ def test_the_order_is_severity_new_then_evidence_then_the_sure_leak():
 
 
 def test_a_port_in_use_is_one_line(service: Service):
-    first = PageServer(service.actuators, PageSettings(port=0), service.supervisor)
+    first = PageServer(service.actuators, PageSettings(port=0))
     with pytest.raises(InputError, match=r"page.port must be free, got .* \(127.0.0.1:\d+\)"):
-        PageServer(service.actuators, PageSettings(port=first.port), service.supervisor)
+        PageServer(service.actuators, PageSettings(port=first.port))
     first.close()
     service.actuators.closed = False
 
@@ -216,7 +216,7 @@ def test_the_page_in_a_browser(service: Service, tmp_path: Path):
     if browser_path is None:
         pytest.skip("chromium is not installed")
     live = LiveSamples(service.store.last_samples)
-    server = PageServer(service.actuators, PageSettings(port=0), service.supervisor, live=live)
+    server = PageServer(service.actuators, PageSettings(port=0), live=live)
     try:
         with playwright.sync_playwright() as player:
             browser = player.chromium.launch(executable_path=browser_path, args=["--no-sandbox"])
@@ -261,11 +261,11 @@ def test_the_page_in_a_browser(service: Service, tmp_path: Path):
                 assert view.locator("#alarm").is_visible()
                 look_at_the_live_part(view, live)
                 assert errors == []
-                service.outages.lost("broker", "<b>gone</b>")
+                service.supervisor.part("broker").lost("<b>gone</b>")
                 view.locator("#outages", has_text="The broker is not reached").wait_for()
                 assert "<b>gone</b>" in (view.text_content("#outages") or "")
                 assert view.evaluate("document.documentElement.scrollWidth") <= width
-                service.outages.back("broker")
+                service.supervisor.part("broker").back()
                 view.locator("#outages").wait_for(state="hidden")
                 view.close()
             browser.close()
@@ -317,7 +317,7 @@ def test_silence_and_a_duty_that_is_not_known_have_delays_of_their_own(tmp_path:
         lines = io.BytesIO(lines_of({"a": samples}, 500))
         service = Service(MonitorSettings.model_validate(settings), once=True, stdin=lines, stdout=io.StringIO())
         service.run()
-        return service.states()["a"]
+        return service.plain()["a"]["state"]
 
     t, other = HEALTHY.t, HEALTHY.t > 90.0
     channels = {name: np.where(other, HEALTHY[name][0], HEALTHY[name]) for name in HEALTHY.channels}

@@ -222,8 +222,8 @@ def test_a_postgresql_that_hangs_is_said_and_costs_nothing(
             server.hang()
             try:
                 wire.write(b"".join(lines[10:]))
-                until(lambda: bool(service.outages.plain()))
-                (outage,) = service.outages.plain()
+                until(lambda: bool(service.supervisor.outages()))
+                (outage,) = service.supervisor.outages()
                 assert outage["part"] == "database"
                 assert outage["reason"] in ("connection timeout expired", "PostgreSQL has not answered for 1 s")
                 with pytest.raises(OperationalError, match="PostgreSQL has not answered for 1 s"):
@@ -235,12 +235,12 @@ def test_a_postgresql_that_hangs_is_said_and_costs_nothing(
                 assert page.get("/metrics").status_code == 503
             finally:
                 server.go_on()
-            until(lambda: not service.outages.plain() and service.waits()[0] == 0)
+            until(lambda: not service.supervisor.outages() and service.waits()[0] == 0)
         finally:
             wire.close()
             thread.join()
             before.close()
-    assert service.outages.totals()["database"][0]
+    assert service.supervisor.totals()["database"][0]
     assert "the database is not reached: " in caplog.text
     ours, theirs = rows_of(server.url), undisturbed
     for table in theirs:

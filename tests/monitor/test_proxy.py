@@ -8,7 +8,6 @@ import shutil
 import socket
 import ssl
 import subprocess
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,7 +16,6 @@ import pytest
 from sealscope.monitor.page.site import PageServer
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import PageSettings
-from sealscope.monitor.supervisor import Outages, Supervisor
 
 from .plant import settings_in, until
 from .servers import free_port
@@ -34,11 +32,7 @@ def proxy(tmp_path: Path) -> Iterator[http.client.HTTPSConnection]:
     signed(tmp_path, "page", signed(tmp_path, "authority"))
     (tmp_path / "token.txt").write_text("the token\n")
     service = Service(settings_in(tmp_path), once=True)
-    page = PageServer(
-        service.actuators,
-        PageSettings(port=0, token_file=tmp_path / "token.txt"),
-        Supervisor(Outages(lambda: None), threading.Event()),
-    )
+    page = PageServer(service.actuators, PageSettings(port=0, token_file=tmp_path / "token.txt"))
     port, (site,) = free_port(), re.findall(r"```nginx\n(.*?)```", GUIDE.read_text("utf-8"), re.DOTALL)
     for given, here in (
         ("listen 443", f"listen 127.0.0.1:{port}"),

@@ -69,7 +69,7 @@ def test_an_actuator_without_a_position_is_stored_alike_whatever_the_restarts(tm
     whole = settings_in(tmp_path / "whole")
     served(whole, lines)
     settings = settings_in(tmp_path)
-    for share in (0.88, 0.97, 1.0):
+    for share in (0.75, 0.93, 1.0):
         service, _ = served(settings, lines[: round(share * len(lines))])
     rows = rows_of(settings.database)
     assert rows == rows_of(whole.database)
@@ -146,7 +146,7 @@ def test_a_file_that_is_being_written_is_waited_for(tmp_path):
     settings = settings_in(tmp_path, more).model_copy(update={"lines": False, "settle_s": 0.4})
     from sealscope.monitor.sources.folder import WatchedFolder
 
-    folder = WatchedFolder("press 3", tmp_path / "press 3", "*", 0.4, lambda name, identity: False)
+    folder = WatchedFolder(settings.actuator[-1], 0.4, lambda name, identity: False)
     for share in (0.2, 0.5, 1.0):
         file.write_bytes(whole[: int(share * len(whole))])
         os.utime(file)
@@ -341,16 +341,17 @@ def test_monitors_that_share_are_no_primary_host(tmp_path: Path):
         settings_in(tmp_path, '[mqtt]\nhost_id = "a"\n[share]\nname = "a"\n', "postgresql://nowhere/monitor")
 
 
-def test_settings_that_nobody_edited_complain_once(tmp_path, caplog):
+def test_settings_that_nobody_edited_complain_once(tmp_path, monkeypatch, caplog):
     """The folder of the template's actuator is not there: one line, however often it is looked for."""
+    monkeypatch.setattr("sealscope.monitor.sources.folder._LOOK_S", 0.05)
     file = tmp_path / "monitor.toml"
     file.write_text(template().replace("8765", "0"), encoding="utf-8")
     service = Service(read_settings(file), stdin=io.BytesIO())
     running = threading.Thread(target=service.run)
     running.start()
-    until(service.outages.plain)
-    time.sleep(1.5)  # three times as long as between two looks at the folder
+    until(service.supervisor.outages)
+    time.sleep(0.4)  # longer than between two looks at the folder
     service.stop()
     running.join()
     assert [record.levelname for record in caplog.records] == ["ERROR"]
-    assert service.states()["press 1"]["condition"] == "no data"
+    assert service.plain()["press 1"]["state"]["condition"] == "no data"

@@ -19,33 +19,24 @@ from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 
 from sealscope.monitor.service import Service
-from sealscope.monitor.settings import read_settings
+from sealscope.monitor.settings import MonitorSettings
 
-from .plant import CHANNELS, HEALTHY, WORN, rows_of, until
+from .plant import CHANNELS, HEALTHY, WORN, Running, rows_of, settings_in, until
 from .servers import MOSQUITTO, NO_POSTGRESQL, Broker, PostgreSQL
-from .test_broker import Running
 
 spb = pytest.importorskip("pysparkplug")
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(MOSQUITTO is None, reason="mosquitto is not installed")]
-SETTINGS = """
-database = "monitor.db"
+MORE = """
 [mqtt]
 host = "127.0.0.1"
 port = {port}
-host_id = "sealscope"
+{host}
 [sparkplug]
 every_s = 0.2
-[defaults]
-learn_hours = 0.02
-warning_lpm = 0.0005
-error_lpm = 0.05
-[[actuator]]
-name = "press 1"
-sparkplug = "plant/edge/press 1"
-rate = 50.0
-[[actuator]]
-name = "press 2"
-sparkplug = "plant/edge/press 2"
+"""
+HOST = 'host_id = "sealscope"'
+OWN = """
+sparkplug = "plant/edge/NAME"
 rate = 50.0
 """
 
@@ -147,21 +138,18 @@ class EdgeNode:
 
 
 @pytest.fixture
-def settings_file(broker: Broker, tmp_path: Path) -> Path:
-    file = tmp_path / "monitor.toml"
-    file.write_text(SETTINGS.format(port=broker.port))
-    return file
+def settings(broker: Broker, tmp_path: Path) -> MonitorSettings:
+    return settings_in(tmp_path, MORE.format(port=broker.port, host=HOST), own=OWN)
 
 
 def test_samples_and_alarms_over_sparkplug(
     broker: Broker,
-    settings_file: Path,
+    settings: MonitorSettings,
     undisturbed,
 ):
     wire = Wire(broker.port)
     node = EdgeNode(wire)
     wire.on_message = lambda topic, payload: node.bear() if topic == "spBv1.0/plant/NCMD/edge" else None
-    settings = read_settings(settings_file)
     running = Running(settings)
     try:
         assert values(wire.until("plant/NCMD/edge", 1)[0]) == {"Node Control/Rebirth": True}
@@ -237,10 +225,8 @@ def test_monitors_that_share_actuators_hear_sparkplug_and_go_on_for_each_other(
     wire.on_message = lambda topic, payload: node.bear() if topic == "spBv1.0/plant/NCMD/edge" else None
     running = []
     for name in ("a", "b"):
-        file = tmp_path / f"{name}.toml"
-        shared = SETTINGS.replace('"monitor.db"', f'"{database.url}"').replace('host_id = "sealscope"\n', "")
-        file.write_text(shared.format(port=broker.port) + f'[share]\nname = "{name}"\nlease_s = 4.0\n')
-        running.append(Running(read_settings(file)))
+        more = MORE.format(port=broker.port, host="") + f'[share]\nname = "{name}"\nlease_s = 4.0\n'
+        running.append(Running(settings_in(tmp_path, more, database.url, OWN)))
     stays, ends = running
     try:
         until(lambda: all(each.service.actuators.held for each in running))
@@ -267,14 +253,14 @@ def test_monitors_that_share_actuators_hear_sparkplug_and_go_on_for_each_other(
 
 def test_a_monitor_that_is_killed_dies_by_its_will_and_is_born_with_the_next_number(
     broker: Broker,
-    settings_file: Path,
+    settings: MonitorSettings,
 ):
     wire = Wire(broker.port)
     for number in (1, 2):
         child = os.fork()
         if child == 0:
             try:
-                Service(read_settings(settings_file), stdin=io.BytesIO(), stdout=io.StringIO()).run()
+                Service(settings, stdin=io.BytesIO(), stdout=io.StringIO()).run()
             finally:
                 os._exit(1)
         births = wire.until("Sealscope/NBIRTH/monitor", number)
@@ -288,8 +274,8 @@ def test_a_monitor_that_is_killed_dies_by_its_will_and_is_born_with_the_next_num
     wire.close()
 
 
-def test_a_broker_that_restarts_sees_a_new_birth(broker: Broker, settings_file: Path):
-    running = Running(read_settings(settings_file))
+def test_a_broker_that_restarts_sees_a_new_birth(broker: Broker, settings: MonitorSettings):
+    running = Running(settings)
     try:
         first = Wire(broker.port)
         first.until("STATE/sealscope", 1)

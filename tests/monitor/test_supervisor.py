@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import logging
-import threading
 import time
 from itertools import pairwise
 from pathlib import Path
@@ -17,7 +16,7 @@ from sealscope.errors import InputError
 from sealscope.monitor.memory.store import away
 from sealscope.monitor.service import Service
 from sealscope.monitor.sources.source_block import BlockReceiver, decoded
-from sealscope.monitor.supervisor import DATABASE, LimitedLines, Outages, PartAway, Supervisor
+from sealscope.monitor.supervisor import DATABASE, LimitedLines, PartAway, Supervisor
 from sealscope.units import to_si
 
 from .plant import LINES, rows_of, served, settings_in, until
@@ -29,17 +28,12 @@ class Panic(BaseException):
     """What an extension in Rust raises: no Exception."""
 
 
-def supervisor(stopping: threading.Event) -> tuple[Supervisor, Outages]:
-    outages = Outages(lambda: None)
-    return Supervisor(outages, stopping, away), outages
-
-
 @pytest.mark.parametrize("error", [KeyError("no such thing"), RecursionError(), SystemExit(3), Panic("unwrap")])
 def test_a_part_that_fails_is_an_outage_and_starts_again(monkeypatch, caplog, error):
-    monkeypatch.setattr("sealscope.monitor.supervisor.FIRST_PAUSE_S", 0.05)
-    monkeypatch.setattr("sealscope.monitor.supervisor._WORKING_S", 1.0)
-    stopping = threading.Event()
-    supervised, outages = supervisor(stopping)
+    monkeypatch.setattr("sealscope.monitor.supervisor.FIRST_PAUSE_S", 0.03)
+    monkeypatch.setattr("sealscope.monitor.supervisor._WORKING_S", 0.3)
+    supervised = Supervisor(away)
+    stopping = supervised.stopping
     starts: list[float] = []
 
     def work() -> None:
@@ -50,15 +44,15 @@ def test_a_part_that_fails_is_an_outage_and_starts_again(monkeypatch, caplog, er
 
     thread = supervised.start("decoder", work)
     try:
-        assert outages.totals()["decoder"] == (True, 0, 0.0) or starts
-        until(outages.plain, 5.0)
-        (outage,) = outages.plain()
+        assert supervised.totals()["decoder"] == (True, 0, 0.0) or starts
+        until(supervised.outages, 5.0)
+        (outage,) = supervised.outages()
         assert outage["part"] == "decoder"
         assert type(error).__name__ in outage["reason"]
-        until(lambda: len(starts) == 4 and outages.totals()["decoder"][0], 10.0)
+        until(lambda: len(starts) == 4 and supervised.totals()["decoder"][0], 10.0)
         pauses = [after - before for before, after in pairwise(starts)]
-        assert all(pause >= least for pause, least in zip(pauses, (0.05, 0.1, 0.2), strict=True)), pauses
-        assert outages.totals()["decoder"][1] == 1
+        assert all(pause >= least for pause, least in zip(pauses, (0.03, 0.06, 0.12), strict=True)), pauses
+        assert supervised.totals()["decoder"][1] == 1
         assert len([record for record in caplog.records if record.levelno == logging.ERROR]) == 1
     finally:
         stopping.set()
@@ -67,16 +61,16 @@ def test_a_part_that_fails_is_an_outage_and_starts_again(monkeypatch, caplog, er
 
 
 def test_the_place_of_an_error_is_that_in_this_package():
-    supervised, outages = supervisor(threading.Event())
+    supervised = Supervisor(away)
     with pytest.raises(InputError):
         to_si([1.0], "furlong^2", "m", name="x")
     supervised.part("source").attempt(lambda: to_si([1.0], "furlong^2", "m", name="x"))
-    (outage,) = outages.plain()
+    (outage,) = supervised.outages()
     assert "units.py, line " in outage["reason"]
 
 
 def test_what_is_away_is_no_error_of_the_part():
-    supervised, outages = supervisor(threading.Event())
+    supervised = Supervisor(away)
     part = supervised.part("folder")
 
     def fails(error: Exception) -> bool:
@@ -86,17 +80,16 @@ def test_what_is_away_is_no_error_of_the_part():
         return part.attempt(work, at_once=True)
 
     assert not fails(PartAway("no such folder"))
-    assert [(each["part"], each["reason"]) for each in outages.plain()] == [("folder", "no such folder")]
+    assert [(each["part"], each["reason"]) for each in supervised.outages()] == [("folder", "no such folder")]
     assert part.attempt(lambda: None, at_once=True)
-    assert outages.plain() == []
+    assert supervised.outages() == []
     assert not fails(OperationalError("select", {}, ConnectionError("refused")))
-    assert [(each["part"], each["reason"]) for each in outages.plain()] == [(DATABASE, "refused")]
+    assert [(each["part"], each["reason"]) for each in supervised.outages()] == [(DATABASE, "refused")]
     assert not part.attempt(lambda: None)  # it pauses
 
 
 def test_a_step_is_taken_at_the_end_though_its_part_pauses():
-    stopping, steps = threading.Event(), []
-    supervised, _ = supervisor(stopping)
+    supervised, steps = Supervisor(away), []
 
     def step() -> None:
         steps.append(1)
@@ -104,7 +97,7 @@ def test_a_step_is_taken_at_the_end_though_its_part_pauses():
 
     thread = supervised.repeat("output", step, 0.01, last=step)
     until(lambda: steps, 5.0)
-    stopping.set()
+    supervised.stopping.set()
     thread.join(5.0)
     assert len(steps) >= 2
 
@@ -128,7 +121,7 @@ def test_a_source_that_ends_in_an_error_starts_again_and_the_others_go_on(tmp_pa
     service.run()
     assert len(starts) == 3
     assert rows_of(service.settings.database) == rows_of(str(plain / "monitor.db"))
-    assert service.outages.totals()["source 1"][1] == 1
+    assert service.supervisor.totals()["source 1"][1] == 1
     service.store.engine.dispose()
 
 
@@ -150,7 +143,7 @@ def test_an_error_while_blocks_are_at_hand_loses_and_repeats_none(tmp_path, monk
 
     monkeypatch.setattr(Service, "_store", failing)
     service, _ = served(settings_in(tmp_path), FEW)
-    assert service.outages.totals()["storage"][1] >= 1
+    assert service.supervisor.totals()["storage"][1] >= 1
     assert rows_of(service.settings.database) == rows_of(str(plain / "monitor.db"))
 
 

@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 
 import sealscope as ss
 from sealscope.errors import InputError
-from sealscope.monitor.stream.baseline import WatchBaseline
-from sealscope.monitor.stream.estimates import BlockEstimate
+from sealscope.monitor.stream.estimates import BlockEstimate, WatchBaseline
 from sealscope.monitor.stream.watch import Watch
 from sealscope.recordings.recording import Recording
 
 from ..diagnosis.balance_machine import machine, step
+from .plant import moved
 
 #: Conductance of the leak [m^3/(s Pa)], and the seconds from which it is open.
 LEAK, OPENS = 3.0e-13, 110.0
@@ -81,10 +81,6 @@ def test_a_restart_continues_with_the_same_bits(stop: int):
     assert before + after == WHOLE[1]
     assert again.leak == WHOLE[0].leak
     assert json.dumps(again.state()) == json.dumps(WHOLE[0].state())
-
-
-def moved(recording: Recording, seconds: float) -> Recording:
-    return Recording(recording.t + seconds, recording.channels, recording.units, recording.rate)
 
 
 def changed(recording: Recording, **channels: Any) -> Recording:

@@ -16,22 +16,24 @@ from typing import Any
 import numpy as np
 from sqlalchemy.exc import IntegrityError
 
-from sealscope.diagnosis.verdict.states import LEAKING, state_of
+from sealscope.diagnosis.verdict.states import LEAKING, MachineState, state_of
 from sealscope.errors import InputError
 from sealscope.monitor.alarms import Alarm, AlarmJudge
 from sealscope.monitor.memory.machine_files import pass_on
 from sealscope.monitor.memory.sharing import Share
-from sealscope.monitor.memory.store import KEPT_IDENTITIES, PENDING_BLOCKS, PENDING_BYTES, MonitorStore, StoredRows
+from sealscope.monitor.memory.store import KEPT_IDENTITIES, MonitorStore, StoredRows, away
 from sealscope.monitor.settings import ActuatorSettings
 from sealscope.monitor.sources.source_block import SourceBlock, bytes_of, nothing
 from sealscope.monitor.stream.estimates import BlockEstimate
 from sealscope.monitor.stream.watch import STATE_VERSION, Watch, watch
-from sealscope.monitor.supervisor import Outages
+from sealscope.monitor.supervisor import Supervisor
 from sealscope.recordings.recording import Recording
-from sealscope.storage.plain_state import part_of, plain_fields, restored
+from sealscope.storage.plain_state import part_of, restored, saved
 
 _log = logging.getLogger(__name__)
 _LONGEST_TEXT = 2000
+#: Blocks of samples between two checkpoints, and their bytes.
+PENDING_BLOCKS, PENDING_BYTES = 16, 400_000
 #: How long blocks of others' actuators are kept, in leases: until a takeover, with time to spare.
 _KEPT_LEASES = 4.0
 #: How long the samples of an alarm are kept [s].
@@ -42,8 +44,8 @@ _KEPT_S = 120.0
 class _Actuator:
     """What is in memory of an actuator.
 
-    `judged_s`: end of the last block that was judged [s]; `kept`: the last samples while there is an alarm, which a
-    machine's file may be taught.
+    `pending`, `bytes`: blocks since the checkpoint; `taken`: blocks so far; `judged_s`: end of the last block that was
+    judged [s]; `kept`: the last samples while there is an alarm, which a machine's file may be taught.
     """
 
     settings: ActuatorSettings
@@ -61,24 +63,21 @@ class _Actuator:
     def judged(self, samples: Recording, follows: bool) -> tuple[list[BlockEstimate], list[tuple[Alarm, str, float]]]:
         """Return the estimates of samples, and what happened to alarms: the same whenever it is gone through."""
         estimates, happened = [], []
+        self.pending += 1
+        self.bytes += bytes_of(samples)
         if "T_oil" in samples and samples.units["T_oil"] == "K":
             known = samples["T_oil"][np.abs(samples["T_oil"] - 373.15) < 200.0]  # that of oil
             if known.size:
                 self.oil_celsius = float(known.mean()) - 273.15
         for estimate, leak in self.watch.each(samples, follows=follows):
             version = 0 if self.watch.baseline is None else self.watch.baseline.version
-            change = self.judge.take(estimate, leak, version, self.settings.thresholds)
+            change = self.judge.take(estimate, leak, version, self.settings)
             estimates.append(estimate)
             self.last = estimate
             if estimate.judged or self.judged_s is None or self.judged_s > estimate.t:  # the clock may be set back
                 self.judged_s = estimate.t
             if change is not None:
                 happened.append((*change, estimate.t))
-        self._keep(samples, follows)
-        return estimates, happened
-
-    def _keep(self, samples: Recording, follows: bool) -> None:
-        """Keep the samples of the last `_KEPT_S` of an alarm."""
         alike = self.kept and (self.kept[0].units, self.kept[0].rate) == (samples.units, samples.rate)
         if self.judge.alarm is None or not (follows and alike):
             self.kept = []
@@ -87,40 +86,38 @@ class _Actuator:
             self.kept.append(samples.samples(slice(-most, None)))
             while sum(map(len, self.kept[1:])) > most:
                 del self.kept[0]
+        return estimates, happened
 
     def state(self) -> dict[str, Any]:
         """Return all that a checkpoint keeps, as plain values."""
-        last = None if self.last is None else plain_fields(self.last)
-        own = {"oil_celsius": self.oil_celsius, "judged_s": self.judged_s}
-        return {"watch": self.watch.state(), "judge": self.judge.state(), "last": last, **own}
+        return saved(self, ("watch", "judge", "last", "oil_celsius", "judged_s"))
 
-    def _machine_state(self) -> dict[str, Any]:
+    def _machine_state(self) -> MachineState:
         """Return the state of NE 107, as far as the samples tell."""
         alarm, baseline, over = self.judge.alarm, self.watch.baseline, self.judge.over_s
         if alarm is not None and alarm.active:
-            own = state_of(alarm.condition, alarm.cause, since_s=alarm.onset_s, action=alarm.next_check)
-        elif self.last is None or self.judged_s is None:
-            own = state_of("no data")
-        elif self.last.t - self.judged_s > self.settings.not_comparable_s:
-            own = state_of("not comparable", self.last.status, since_s=self.judged_s)
-        elif baseline is None:
-            own = state_of("learning", since_s=over)
-        else:
-            own = state_of("watched", since_s=max(baseline.learned_s, over or -math.inf))
-        return own.as_dict()
+            return state_of(alarm.condition, alarm.cause, since_s=alarm.onset_s, action=alarm.next_check)
+        if self.last is None or self.judged_s is None:
+            return state_of("no data")
+        if self.last.t - self.judged_s > self.settings.not_comparable_s:
+            return state_of("not comparable", self.last.status, since_s=self.judged_s)
+        if baseline is None:
+            return state_of("learning", since_s=over)
+        return state_of("watched", since_s=max(baseline.learned_s, over or -math.inf))
 
     def summary(self) -> dict[str, Any]:
         """Return what it shows now, as plain values."""
-        last, base, alarm = self.last, self.watch.baseline, self.judge.alarm
+        base, alarm = self.watch.baseline, self.judge.alarm
+        last = self.last or BlockEstimate(0, math.nan, "waits for samples")
         return {
             "blocks": self.watch.blocks,
-            "t": None if last is None else last.t,
-            "status": "waits for samples" if last is None else last.status,
-            "state": self._machine_state(),
+            "t": None if self.last is None else last.t,
+            "status": last.status,
+            "state": self._machine_state().as_dict(),
             "by": self.watch.by,
-            "total_lpm": None if last is None else last.total_lpm,
-            "leak_lpm": None if last is None else last.leak_lpm,
-            "leak_interval_lpm": None if last is None else last.leak_interval_lpm,
+            "total_lpm": last.total_lpm,
+            "leak_lpm": last.leak_lpm,
+            "leak_interval_lpm": last.leak_interval_lpm,
             "oil_celsius": self.oil_celsius,
             "baseline": None if base is None else {"version": base.version, "hours": base.hours, "lpm": base.lpm},
             "alarm": None if alarm is None else alarm.id,
@@ -149,57 +146,43 @@ class WatchedActuators:
         self._heard = dict.fromkeys(self.settings, time.monotonic())
         self._elsewhere = {name: deque[tuple[float, SourceBlock]]() for name in self.settings}
         self._keep_s = keep_days * 86_400.0
-        self._counters = Counter[str]()
-        self._counting = threading.Lock()
-        self._changes = itertools.count(1)
-        self.changed = 0
-        self.closed = False
-        self.outages = Outages(self._tell)
+        self._counters, self._counting = Counter[str](), threading.Lock()
+        self._changes, self.changed, self.closed = itertools.count(1), 0, False
+        self.supervisor = Supervisor(away, self._tell)
         self._lock = threading.RLock()
         self._actuators: dict[str, _Actuator] = {}
         if share is None:
             self._actuators = {name: self._restored(each) for name, each in self.settings.items()}
 
     def _restored(self, settings: ActuatorSettings) -> _Actuator:
-        """Return an actuator as its last transaction left it."""
+        """Return an actuator as its last transaction left it, or begun anew where it is new or the settings changed."""
         name, rate = settings.name, settings.false_alarms_per_1000_h
-        saved = self.store.checkpoint(name)
+        state, taken = self.store.checkpoint(name), self.store.last_number(self.store.tables.blocks, name)
         fresh = watch(settings.rig, false_alarms_per_1000_h=rate, learn_hours=settings.learn_hours)
-        if saved is None:
-            return self._begun_anew(_Actuator(settings, fresh, AlarmJudge(name)))
-        learned_with, state, pending = saved
-        judge = AlarmJudge.from_state(state["judge"])
-        if (version := part_of(state["watch"], "version", int)) != STATE_VERSION:
-            _log.warning("%s: its state has version %s, not %d, begins anew", name, version, STATE_VERSION)
-            learned = part_of(state["watch"], "baseline_version", int)
-            fresh.continue_from(self.store.last_number(self.store.tables.estimates, name), learned)
-            return self._begun_anew(_Actuator(settings, fresh, judge))
-        actuator = _Actuator(settings, Watch.from_state(state["watch"]), judge)
-        actuator.taken = self.store.last_number(self.store.tables.blocks, name)
-        if state["last"] is not None:
-            actuator.last = restored(BlockEstimate, state["last"], "last")
-        actuator.oil_celsius, actuator.judged_s = state.get("oil_celsius"), state.get("judged_s")
-        for samples, follows in pending:
-            actuator.judged(samples, follows)
-            actuator.pending += 1
-            actuator.bytes += bytes_of(samples)
-        if learned_with != settings.learned_with:
-            _log.warning("%s: learned with %s, begins anew with other settings", name, learned_with)
-            fresh.continue_from(actuator.watch.blocks, actuator.watch.baseline_version)
-            actuator.watch = fresh
-            return self._begun_anew(actuator)
-        if actuator.watch.false_alarms_per_1000_h != rate:
-            actuator.watch.false_alarms_per_1000_h = rate
-            return self._begun_anew(actuator)  # with the same baseline
-        return actuator
-
-    def _begun_anew(self, actuator: _Actuator) -> _Actuator:
-        """Return an actuator whose watch was changed by the settings, its state stored."""
-        actuator.taken = self.store.last_number(self.store.tables.blocks, actuator.settings.name)
-        rows = StoredRows()
-        self._checkpoint(actuator, rows)
-        with self.store.writing() as connection:
-            self.store.keep_rows(connection, rows)
+        actuator, anew = _Actuator(settings, fresh, AlarmJudge(name), taken=taken), True
+        if state is not None:
+            learned_with, own, pending = state
+            actuator.judge = restored(AlarmJudge, own["judge"], "alarm")
+            if (version := part_of(own["watch"], "version", int)) != STATE_VERSION:
+                _log.warning("%s: its state has version %s, not %d, begins anew", name, version, STATE_VERSION)
+                learned = part_of(own["watch"], "baseline_version", int)
+                fresh.continue_from(self.store.last_number(self.store.tables.estimates, name), learned)
+            else:
+                actuator.watch = Watch.from_state(own["watch"])
+                actuator.last = None if own["last"] is None else restored(BlockEstimate, own["last"], "last")
+                actuator.oil_celsius, actuator.judged_s = own.get("oil_celsius"), own.get("judged_s")
+                for samples, follows in pending:
+                    actuator.judged(samples, follows)
+                anew = actuator.watch.false_alarms_per_1000_h != rate
+                actuator.watch.false_alarms_per_1000_h = rate  # with the same baseline
+                if learned_with != settings.learned_with:
+                    _log.warning("%s: learned with %s, begins anew with other settings", name, learned_with)
+                    fresh.continue_from(actuator.watch.blocks, actuator.watch.baseline_version)
+                    actuator.watch, anew = fresh, True
+        if anew:
+            rows = StoredRows()
+            self._checkpoint(actuator, rows)
+            self.store.keep(rows)
         return actuator
 
     def count(self, reason: str, number: int = 1) -> None:
@@ -225,9 +208,9 @@ class WatchedActuators:
             for name in gained | lost:
                 self._actuators.pop(name, None)  # the database knows better
             for name in sorted(self._share.held & set(self.settings)):
-                self._taken_over(name)
+                self._take_over(name)
 
-    def _taken_over(self, name: str) -> None:
+    def _take_over(self, name: str) -> None:
         """Take the blocks that came while another monitor watched an actuator; those it stored are passed over."""
         waiting = self._elsewhere[name]
         for _ in range(len(waiting)):
@@ -243,10 +226,10 @@ class WatchedActuators:
         while waiting and waiting[0][0] < now - _KEPT_LEASES * self._share.lease_s:
             waiting.popleft()
 
-    def take(self, blocks: Sequence[SourceBlock]) -> list[BlockEstimate]:
+    def take(self, blocks: Sequence[SourceBlock]) -> None:
         """Take blocks in one transaction: samples, estimates, alarms and the blocks' identities, or nothing of it.
 
-        Return the estimates in their order. Raises what the database raises; the blocks can then be taken again.
+        Raises what the database raises; the blocks can then be taken again.
         """
         with self._lock:
             known, held = [block for block in blocks if block.actuator in self.settings], self.held
@@ -255,30 +238,29 @@ class WatchedActuators:
                 self._heard[name] = time.monotonic()
             if self._share is not None:
                 for name in {block.actuator for block in mine}:
-                    self._taken_over(name)
-            estimates = self._take(mine)
+                    self._take_over(name)
+            self._take(mine)
             for block in known:
                 if block.actuator not in held:
                     self._keep_elsewhere(block)
             self.count("blocks of an actuator that is not in the settings", len(blocks) - len(known))
-        return estimates
 
-    def _take(self, blocks: Sequence[SourceBlock]) -> list[BlockEstimate]:
+    def _take(self, blocks: Sequence[SourceBlock]) -> None:
         """Take blocks of actuators that are this monitor's to watch.
 
         None of them is likely to be stored: that is asked only where the database refuses to store one again.
         """
         if not blocks:
-            return []
+            return
         new = {(block.actuator, block.identity): block for block in reversed(blocks)}  # of two the first
         fresh = [block for block in blocks if new[block.actuator, block.identity] is block]
         try:
             try:
-                lost, estimates = self._stored(fresh)
+                lost = self._stored(fresh)
             except _Repeated:
                 known = self.store.known(new)
                 fresh = [block for block in fresh if (block.actuator, block.identity) not in known]
-                lost, estimates = self._stored(fresh)
+                lost = self._stored(fresh)
         except BaseException:
             # what the detectors took is not stored: the next blocks begin at the last transaction
             for name in {block.actuator for block in blocks}:
@@ -290,14 +272,13 @@ class WatchedActuators:
                 self._keep_elsewhere(block)
         self.count("blocks stored already", len(blocks) - len(fresh))
         self._tell()
-        return estimates
 
-    def _stored(self, blocks: Sequence[SourceBlock]) -> tuple[set[str], list[BlockEstimate]]:
-        """Take blocks in one transaction; return the actuators whose lease is another's, and the estimates.
+    def _stored(self, blocks: Sequence[SourceBlock]) -> set[str]:
+        """Take blocks in one transaction; return the actuators whose lease is another's.
 
         Raises _Repeated, and no detector has taken anything, where one of the blocks is stored already.
         """
-        rows, estimates, lost = StoredRows(), list[BlockEstimate](), set[str]()
+        rows, lost = StoredRows(), set[str]()
         with self.store.writing() as connection:
             if (share := self._share) is not None:
                 names = sorted({block.actuator for block in blocks})
@@ -313,30 +294,28 @@ class WatchedActuators:
             for block, actuator in mine:
                 actuator.taken += 1
                 if block.samples is not None:
-                    estimates += self._taken(rows, actuator, block.samples, block.follows)
+                    self._taken(rows, actuator, block.samples, block.follows)
             self.store.keep_rows(connection, rows)
-        return lost, estimates
+        return lost
 
     def _actuator(self, name: str) -> _Actuator:
         if name not in self._actuators:
             self._actuators[name] = self._restored(self.settings[name])
         return self._actuators[name]
 
-    def _taken(self, rows: StoredRows, actuator: _Actuator, samples: Recording, follows: bool) -> list[BlockEstimate]:
+    def _taken(self, rows: StoredRows, actuator: _Actuator, samples: Recording, follows: bool) -> None:
+        """Add to the rows what samples make of an actuator."""
         name = actuator.settings.name
         estimates, happened = actuator.judged(samples, follows)
         rows.add_estimates(name, estimates, actuator.oil_celsius)
         for alarm, kind, t in happened:
             rows.add_alarm(alarm, kind, t)
-        actuator.pending += 1
-        actuator.bytes += bytes_of(samples)
         turn = (actuator.taken + zlib.crc32(name.encode())) % PENDING_BLOCKS  # not all actuators at the same instant
         if turn == 0 or actuator.bytes >= PENDING_BYTES:
             self._checkpoint(actuator, rows)
         else:
             rows.add_pending(name, actuator.pending, samples, follows)
             self._show(actuator, rows)
-        return estimates
 
     def _checkpoint(self, actuator: _Actuator, rows: StoredRows) -> None:
         """Add the state to the rows, and what is old then."""
@@ -352,7 +331,8 @@ class WatchedActuators:
         """Add what an actuator shows to the rows, where it has changed."""
         summary = actuator.summary()
         if summary != actuator.shown:
-            rows.summaries[actuator.settings.name] = actuator.shown = summary
+            actuator.shown = summary
+            rows.add_summary(actuator.settings.name, summary)
 
     def mark(self, name: str, mark: str, *, by_whom: str = "", text: str = "", hours: float = 8.0) -> Alarm:
         """Keep what a person says of an actuator's alarm, in one transaction.
@@ -382,8 +362,7 @@ class WatchedActuators:
                     actuator.watch.relearn()
                 rows.add_alarm(alarm, mark, at, by_whom, text)
                 self._checkpoint(actuator, rows)
-                with self.store.writing() as connection:
-                    self.store.keep_rows(connection, rows)
+                self.store.keep(rows)
             except BaseException:  # the next one begins at the last transaction
                 self._actuators.pop(name, None)
                 raise
@@ -391,8 +370,7 @@ class WatchedActuators:
             rows = StoredRows()
             rows.add_alarm(alarm, "comment", at, "Sealscope", done)
             rows.alarms.clear()  # it may have changed meanwhile
-            with self.store.writing() as connection:
-                self.store.keep_rows(connection, rows)
+            self.store.keep(rows)
         self._tell()
         return alarm
 

@@ -7,14 +7,16 @@ what ISA-18.2, Management of Alarm Systems for the Process Industries, calls ret
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from sealscope.diagnosis.verdict.states import state_of
 from sealscope.errors import InputError
-from sealscope.monitor.stream.estimates import BlockEstimate, WatchedLeak
-from sealscope.storage.plain_state import plain_fields, restored
+from sealscope.monitor.settings import WatchSettings
+from sealscope.monitor.stream.estimates import BlockEstimate, Interval, WatchedLeak
+from sealscope.storage.plain_state import saved
 
 Level = Literal["warning", "error"]
 AlarmState = Literal["new", "acknowledged", "valid", "invalid", "closed"]
@@ -29,33 +31,14 @@ MARKS = ("acknowledged", "comment", "shelved", "valid", "invalid", "repaired")
 
 @dataclass(frozen=True)
 class Alarm:
-    """An alarm.
+    """An alarm of an actuator; clocks are those of the samples [s], intervals of 95 %.
 
-    Parameters
-    ----------
-    id : str
-        Actuator and a running number.
-    actuator : str
-    level : {"warning", "error"}
-    state : {"new", "acknowledged", "valid", "invalid", "closed"}
-    raised_s, updated_s : float
-        Clock of the samples when it was raised, and when it changed last [s].
-    onset_s, onset_interval_s : float and pair of floats
-        Since when it leaks, and its 95 % interval [s].
-    leak_lpm, leak_interval_lpm : float and pair of floats, optional
-        Leak and its 95 % interval [L/min].
-    cause, evidence, next_check : str
-        Where the oil goes, why that is believed, and what to look at.
-    baseline : int
-        Version of the baseline it is compared with.
-    returned_s : float, optional
-        Clock when its cause was over [s]; None while it lasts.
-    mark, reason : str
-        "valid", "invalid" or "repaired" as a person said last, "" before; and why it is invalid.
-    shelved_until_s : float
-        It is not announced before this clock [s].
-    by_chance_per_1000_h : float, optional
-        Alarms as strong as this that a healthy actuator raises per 1000 operating hours, at most.
+    `id`: actuator and a running number; `raised_s`, `updated_s`: when it was raised, and changed last; `onset_s`: since
+    when it leaks; `cause`, `evidence`, `next_check`: where the oil goes, why that is believed, and what to look at;
+    `baseline`: version of what it is compared with; `returned_s`: when its cause was over, None while it lasts; `mark`,
+    `reason`: "valid", "invalid" or "repaired" as a person said last, and why it is invalid; `shelved_until_s`: it is
+    not announced before; `by_chance_per_1000_h`: alarms as strong as this that a healthy actuator raises per 1000
+    operating hours, at most.
     """
 
     id: str
@@ -65,9 +48,9 @@ class Alarm:
     raised_s: float
     updated_s: float
     onset_s: float
-    onset_interval_s: tuple[float, float]
+    onset_interval_s: Interval
     leak_lpm: float | None
-    leak_interval_lpm: tuple[float, float] | None
+    leak_interval_lpm: Interval | None
     cause: str
     evidence: str
     next_check: str
@@ -106,40 +89,9 @@ class Alarm:
 
     def plain(self) -> dict[str, Any]:
         """Return it as plain values, with what follows from its fields."""
-        values = asdict(self)
-        for name in ("onset_interval_s", "leak_interval_lpm"):
-            values[name] = None if values[name] is None else list(values[name])
         own = state_of(self.condition, self.cause if self.active else None, since_s=self.onset_s)
         number = DIAGNOSTIC_NUMBERS[self.level]
-        return {**values, "diagnostic_number": number, "shelved": self.shelved, "machine_state": own.as_dict()}
-
-
-@dataclass(frozen=True)
-class Thresholds:
-    """What makes an alarm.
-
-    `warning_lpm`, `error_lpm`: leak from which it is one [L/min], None for no error level; `debounce`: successive
-    blocks that must say so; `return_share`: it returns, or an error becomes a warning, below this share of the
-    threshold; `false_alarms_per_1000_h`: the rate that the tests are set for.
-    """
-
-    warning_lpm: float = 0.0
-    error_lpm: float | None = None
-    debounce: int = 2
-    return_share: float = 0.7
-    false_alarms_per_1000_h: float = 1.0
-
-    def by_chance(self, leak: WatchedLeak) -> float:
-        """Return how many alarms as strong as a leak's a healthy machine raises per 1000 h, at most."""
-        return self.false_alarms_per_1000_h * leak.rarity
-
-    def level(self, leak: WatchedLeak | None, lpm: float | None) -> Level | None:
-        """Return the level of a leak, None for one below the thresholds; without L/min it is a warning."""
-        if leak is None:
-            return None
-        if lpm is not None and self.error_lpm is not None and lpm >= self.error_lpm:
-            return "error"
-        return "warning" if lpm is None or lpm >= self.warning_lpm else None
+        return {**vars(self), "diagnostic_number": number, "shelved": self.shelved, "machine_state": own.as_dict()}
 
 
 @dataclass
@@ -160,39 +112,61 @@ class AlarmJudge:
     over_s: float | None = None
 
     def take(
-        self, estimate: BlockEstimate, leak: WatchedLeak | None, baseline: int, thresholds: Thresholds
+        self, estimate: BlockEstimate, leak: WatchedLeak | None, baseline: int, settings: WatchSettings
     ) -> tuple[Alarm, str] | None:
         """Return the alarm and what happened to it ("raised", "error", "warning", "returned"), None for nothing.
 
-        Blocks that are not judged change nothing.
+        A leak without L/min is a warning; blocks that are not judged change nothing.
         """
         if not estimate.judged:
             return None
         lpm = estimate.leak_lpm if leak is not None else 0.0
-        level = thresholds.level(leak, lpm)
-        self.above = self.above + 1 if level is not None else 0
-        self.error = self.error + 1 if level == "error" else 0
+        above = leak is not None and (lpm is None or lpm >= settings.warning_lpm)
+        error = leak is not None and lpm is not None and lpm >= (settings.error_lpm or math.inf)
+        self.above = self.above + 1 if above or error else 0
+        self.error = self.error + 1 if error else 0
+        by_chance = None if leak is None else settings.false_alarms_per_1000_h * leak.rarity
         if self.alarm is None or not self.alarm.active:
-            return self._begun(estimate, leak, baseline, thresholds)
-        limit = thresholds.warning_lpm if self.alarm.level == "warning" else (thresholds.error_lpm or 0.0)
-        low = leak is None or (lpm is not None and lpm < thresholds.return_share * limit)
+            if leak is None or self.above < settings.debounce_blocks:
+                return None
+            self.raised, self.below = self.raised + 1, 0
+            level: Level = "error" if self.error >= settings.debounce_blocks else "warning"
+            self.alarm = Alarm(
+                id=f"{self.actuator}-{self.raised}",
+                actuator=self.actuator,
+                level=level,
+                state="new",
+                raised_s=estimate.t,
+                updated_s=estimate.t,
+                onset_s=leak.onset_s,
+                onset_interval_s=leak.onset_interval_s,
+                leak_lpm=estimate.leak_lpm,
+                leak_interval_lpm=estimate.leak_interval_lpm,
+                cause=leak.cause,
+                evidence=leak.reason,
+                next_check=state_of(_CONDITIONS[level], leak.cause).action,
+                baseline=baseline,
+                by_chance_per_1000_h=by_chance,
+            )
+            return self.alarm, "raised"
+        limit = settings.warning_lpm if self.alarm.level == "warning" else (settings.error_lpm or 0.0)
+        low = leak is None or (lpm is not None and lpm < settings.return_share * limit)
         self.below = self.below + 1 if low else 0
         now, happened = replace(self.alarm, updated_s=estimate.t), ""
-        if self.below >= thresholds.debounce:
+        if self.below >= settings.debounce_blocks:
             self.below = 0
-            if now.level == "error" and level == "warning":
+            if now.level == "error" and above and not error:
                 now, happened = replace(now, level="warning"), "warning"
             else:
                 over: AlarmState = "new" if now.state == "new" else "closed"
                 now, happened = replace(now, state=over, returned_s=estimate.t), "returned"
-        elif now.level == "warning" and self.error >= thresholds.debounce:
+        elif now.level == "warning" and self.error >= settings.debounce_blocks:
             # a higher level is a new call: it must be seen again, unless it is known to be a leak
             to_state: AlarmState = "valid" if now.state == "valid" else "new"
             now, happened = replace(now, level="error", state=to_state), "error"
         if leak is not None:
             leak_lpm, interval = estimate.leak_lpm, estimate.leak_interval_lpm
-            chance = thresholds.by_chance(leak)
-            now = replace(now, leak_lpm=leak_lpm, leak_interval_lpm=interval, by_chance_per_1000_h=chance)
+            now = replace(now, leak_lpm=leak_lpm, leak_interval_lpm=interval, by_chance_per_1000_h=by_chance)
         return self._kept(now), happened
 
     def _kept(self, alarm: Alarm) -> Alarm:
@@ -200,32 +174,6 @@ class AlarmJudge:
             self.over_s = alarm.updated_s
         self.alarm = None if alarm.over else alarm
         return alarm
-
-    def _begun(
-        self, estimate: BlockEstimate, leak: WatchedLeak | None, baseline: int, thresholds: Thresholds
-    ) -> tuple[Alarm, str] | None:
-        if leak is None or self.above < thresholds.debounce:
-            return None
-        self.raised, self.below = self.raised + 1, 0
-        level: Level = "error" if self.error >= thresholds.debounce else "warning"
-        self.alarm = Alarm(
-            f"{self.actuator}-{self.raised}",
-            self.actuator,
-            level,
-            "new",
-            estimate.t,
-            estimate.t,
-            leak.onset_s,
-            leak.onset_interval_s,
-            estimate.leak_lpm,
-            estimate.leak_interval_lpm,
-            leak.cause,
-            leak.reason,
-            state_of(_CONDITIONS[level], leak.cause).action,
-            baseline,
-            by_chance_per_1000_h=thresholds.by_chance(leak),
-        )
-        return self.alarm, "raised"
 
     def marked(self, mark: str, at: float, *, until: float = 0.0, reason: str = "") -> Alarm:
         """Return the alarm after a person's word, one of `MARKS`, at clock `at` [s].
@@ -256,10 +204,23 @@ class AlarmJudge:
         return self._kept(replace(alarm, updated_s=at, **by_mark[mark]))
 
     def state(self) -> dict[str, Any]:
-        """Return all of it as plain values."""
-        return {**vars(self), "alarm": None if self.alarm is None else plain_fields(self.alarm)}
+        """Return all of it as plain values, for `restored`."""
+        return saved(self, vars(self))
 
-    @classmethod
-    def from_state(cls, state: Mapping[str, Any]) -> AlarmJudge:
-        """Return what `state` was of; raises InputError where it does not fit."""
-        return restored(cls, dict(state), "alarm")
+
+def ranked(summaries: Mapping[str, Mapping[str, Any]], alarms: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the actuators with their open alarm: by severity of their state, new alarms first, then by evidence.
+
+    The alarm that healthy actuators raise least often comes first, so that all compete for one budget of false alarms;
+    among equals the one whose leak is larger for sure (the lower end of its interval), then the larger leak, then the
+    name. `alarms`: those that are not over.
+    """
+
+    def order(row: Mapping[str, Any]) -> tuple[Any, ...]:
+        low, chance = (row["leak_interval_lpm"] or (0.0,))[0], (row["alarm"] or {}).get("by_chance_per_1000_h")
+        evidence = math.inf if chance is None else chance, -low, -(row["leak_lpm"] or 0.0)
+        return -row["state"]["severity"], -(row["status_word"] & NEW_BIT), *evidence, row["name"]
+
+    by_actuator = {alarm["actuator"]: alarm for alarm in alarms}
+    rows = [{"name": name, **summary, "alarm": by_actuator.get(name)} for name, summary in summaries.items()]
+    return sorted(rows, key=order)

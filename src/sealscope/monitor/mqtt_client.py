@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
-from pathlib import Path
-from typing import TYPE_CHECKING
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
 
 from sealscope.errors import MissingExtra
+from sealscope.monitor.settings import BrokerSettings
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client
@@ -18,23 +19,21 @@ KEEP_ALIVE_S = 20
 
 
 def check_mqtt() -> None:
-    """Raise MissingExtra where the library for MQTT is not installed."""
-    try:
-        import paho.mqtt.client  # noqa: F401 (asked for before the service starts)
-    except ImportError:
-        raise MissingExtra("MQTT needs paho-mqtt: pip install 'sealscope[mqtt]'") from None
+    """Raise MissingExtra where the library for MQTT is not installed: before the service starts."""
+    if find_spec("paho") is None:
+        raise MissingExtra("MQTT needs paho-mqtt: pip install 'sealscope[mqtt]'")
 
 
-def client_of(client_id: str, user: str | None, password: str | None, tls: bool, ca_file: Path | None) -> Client:
+def client_of(broker: BrokerSettings, client_id: str, password: str | None) -> Client:
     """Return a client of MQTT 5 that is not connected yet; messages are acknowledged by hand."""
     from paho.mqtt.client import Client
     from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 
     client = Client(CallbackAPIVersion.VERSION2, client_id, protocol=MQTTProtocolVersion.MQTTv5, manual_ack=True)
-    if user is not None:
-        client.username_pw_set(user, password)
-    if tls:
-        client.tls_set(ca_certs=None if ca_file is None else str(ca_file))
+    if broker.user is not None:
+        client.username_pw_set(broker.user, password)
+    if broker.tls:
+        client.tls_set(ca_certs=None if broker.ca_file is None else str(broker.ca_file))
     client.reconnect_delay_set(1, 30)
     client.suppress_exceptions = True  # an error of a callback ends no connection; paho logs it
     client.enable_logger(_log)
@@ -47,11 +46,9 @@ def check_running(client: Client) -> None:
         raise RuntimeError("the thread of the connection to the broker has ended")
 
 
-def published(
-    client: Client, topic: str, payload: bytes | str, timeout_s: float, qos: int = 0, retain: bool = False
-) -> bool:
+def published(client: Client, topic: str, payload: bytes | str, timeout_s: float, **options: Any) -> bool:
     """Publish a message; return whether it went out in time, to the broker's knowledge with a `qos` of 1."""
-    message = client.publish(topic, payload, qos=qos, retain=retain)
+    message = client.publish(topic, payload, **options)
     try:
         message.wait_for_publish(timeout_s)
     except (RuntimeError, ValueError):  # the connection is lost, or its queue is full

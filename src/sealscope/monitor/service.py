@@ -11,7 +11,7 @@ from contextlib import ExitStack, suppress
 from functools import partial
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO, TextIO, TypeVar
+from typing import BinaryIO, TextIO, TypeVar
 
 from sqlalchemy.exc import SQLAlchemyError
 from threadpoolctl import threadpool_limits
@@ -20,34 +20,29 @@ from sealscope.errors import InputError
 from sealscope.monitor.actuators import WatchedActuators
 from sealscope.monitor.memory.sharing import Share
 from sealscope.monitor.memory.store import MonitorStore, away
-from sealscope.monitor.outputs.lines import EventLines
+from sealscope.monitor.outputs.events import EventLines, Webhook
+from sealscope.monitor.outputs.sparkplug_node import SparkplugNode
 from sealscope.monitor.page.live import LiveSamples
 from sealscope.monitor.page.site import PageServer
 from sealscope.monitor.settings import MonitorSettings, secret_of
+from sealscope.monitor.sources.broker import broker_of
 from sealscope.monitor.sources.folder import folders_of
 from sealscope.monitor.sources.lines import lines_of
-from sealscope.monitor.sources.source_block import (
-    UNREADABLE_FILE,
-    BlockReceiver,
-    RefusedMessage,
-    SourceBlock,
-    bytes_of,
-)
-from sealscope.monitor.supervisor import DATABASE, WEBHOOK, Supervisor
+from sealscope.monitor.sources.opcua import opcua_of
+from sealscope.monitor.sources.source_block import UNREADABLE_FILE, BlockReceiver, RefusedMessage, SourceBlock
+from sealscope.monitor.supervisor import DATABASE, WEBHOOK
 from sealscope.monitor.waiting import Waiting
 from sealscope.storage.folders import locked
 
 _log = logging.getLogger(__name__)
-#: Blocks that wait to be stored and their bytes, at most; sources wait beyond.
-_WAITING, _WAITING_BYTES = 512, 256_000_000
+#: Blocks that wait to be stored and their bytes, at most; a source that waits longer [s] is a line in the log.
+_WAITING, _WAITING_BYTES, _LONG_WAIT_S = 512, 256_000_000, 5.0
 #: How often outputs look for events [s], and how long what is under way at the end is waited for, all together.
 _LOOK_S, _END_S = 0.2, 2.5
 #: Blocks that are stored in one transaction, at most, and how long the first one waits for others [s].
 _TOGETHER, _GATHER_S = 256, 0.02
 #: What a block is counted under that raised an error.
 _DROPPED = "blocks that raised an error"
-#: A source that waits for longer [s] is a line in the log.
-_LONG_WAIT_S = 5.0
 #: Lines in the log about the same trouble before only each power of two gets one.
 _FIRST_LINES = 3
 
@@ -75,7 +70,6 @@ class Service:
         sources: Iterable[Source] = (),
     ) -> None:
         self.settings, self.once = settings, once
-        self.stopping = threading.Event()
         self._queue: Waiting[SourceBlock | RefusedMessage | None] = Waiting(_WAITING, _WAITING_BYTES)
         self._at_hand: list[SourceBlock | RefusedMessage | None] = []
         self._stdin = stdin or (sys.stdin.buffer if sys.stdin is not None else BytesIO())
@@ -90,22 +84,20 @@ class Service:
             self._hold.enter_context(locked(Path(settings.database + ".lock"), busy))
         try:
             self.store = MonitorStore(settings.database)
-            self._share = None
-            if (part := settings.share) is not None:
-                names = [actuator.name for actuator in settings.actuator]
-                self._share = Share(self.store, part.name, names, part.lease_s)
+            names, share = [actuator.name for actuator in settings.actuator], settings.share
+            self._share = None if share is None else Share(self.store, share, names)
             with threadpool_limits(limits=1):  # as in `run`: sums in another order end in other digits
                 self.actuators = WatchedActuators(settings.actuator, self.store, settings.keep_days, self._share)
-            self.outages = self.actuators.outages
-            self.outages.expect(DATABASE)
-            self.supervisor = Supervisor(self.outages, self.stopping, away)
+            own = self.actuators
+            self.supervisor, self.count, self.plain = own.supervisor, own.count, own.plain
+            self.stopping, self._database = self.supervisor.stopping, self.supervisor.part(DATABASE)
             if self._share is not None:
                 self.actuators.renew()
             self._live = LiveSamples(self.store.last_samples)
             self._lines = EventLines(self.store, stdout or sys.stdout)
             self.page: PageServer | None = None
             if settings.page is not None and not once:
-                self.page = PageServer(self.actuators, settings.page, self.supervisor, self.waits, self._live)
+                self.page = PageServer(self.actuators, settings.page, self.waits, self._live)
         except BaseException:
             self._hold.close()
             raise
@@ -113,7 +105,7 @@ class Service:
     def hand(self, block: SourceBlock | RefusedMessage) -> None:
         """Give the service a block, or the error of a message that holds none; waits while too many wait."""
         if isinstance(block, RefusedMessage):
-            self.actuators.count(block.reason)
+            self.count(block.reason)
             self._refused += 1
             if block.reason == UNREADABLE_FILE:
                 _log.warning("%s", block)
@@ -121,29 +113,21 @@ class Service:
                 _log.warning("%s (message %d without a block)", block, self._refused)
         else:
             self.supervisor.part("picture of samples").attempt(partial(self._live.take, block.actuator, block.samples))
-        if self._queue.put(block, _bytes(block)):
+        if self._queue.put(block, block.bytes):
             return
         self._waits += 1
         began, said = time.monotonic(), False
-        while not self.stopping.is_set() and not self._queue.put(block, _bytes(block), 0.5):
+        while not self.stopping.is_set() and not self._queue.put(block, block.bytes, 0.5):
             if not said and time.monotonic() - began > _LONG_WAIT_S:
                 said = True
                 blocks, waiting, _ = self.waits()
                 _log.warning("a source waits: %d blocks are to be stored, %.1f MB", blocks, waiting / 1e6)
 
-    def count(self, reason: str) -> None:
-        """Count something that was dropped."""
-        self.actuators.count(reason)
-
-    def states(self) -> dict[str, dict[str, Any]]:
-        """Return the state of NE 107 of each actuator as plain values."""
-        return {name: summary["state"] for name, summary in self.actuators.plain().items()}
-
     def waits(self) -> tuple[int, int, int]:
         """Return how many blocks are not stored yet, their bytes, and how often a source had to wait for them."""
         at_hand = [*self._at_hand]
         blocks, size = self._queue.waiting()
-        return blocks + len(at_hand), size + sum(map(_bytes, at_hand)), self._waits
+        return blocks + len(at_hand), size + sum(block.bytes for block in at_hand if block is not None), self._waits
 
     def run(self) -> None:
         """Take blocks until the sources have ended and there is no page, or `stop` is called.
@@ -153,11 +137,13 @@ class Service:
         """
         self._hold.enter_context(threadpool_limits(limits=1))
         sources, ending = self._all_sources(), list[threading.Thread]()
-        storing = self.supervisor.part("storage")
+        storing, start = self.supervisor.part("storage"), self.supervisor.start
+        ended = partial(self._queue.put, None, 0, always=True)
         self._left = len(sources)
         try:
             ending += self._outputs()
-            ending += [self._started(name, source) for name, source in sources]
+            for name, source in sources:
+                ending.append(start(name, partial(source, self), again=not self.once, ended=ended))
             while (self._left or self.page is not None) and not self.stopping.is_set():
                 if not storing.attempt(self._store_next):
                     self.stopping.wait(storing.pause_s)
@@ -184,22 +170,10 @@ class Service:
         if any(actuator.folder is not None for actuator in self.settings.actuator):
             sources.append(("folders", partial(folders_of, once=self.once)))
         if self.settings.mqtt is not None:
-            from sealscope.monitor.sources.broker import broker_of
-
             sources.append(("MQTT client", broker_of(self.settings.mqtt)))
         if self.settings.opcua is not None:
-            from sealscope.monitor.sources.opcua import opcua_of
-
             sources.append(("OPC UA source", opcua_of(self.settings.opcua)))
         return sources
-
-    def _started(self, name: str, source: Source) -> threading.Thread:
-        """Start a source, which says when it has ended."""
-
-        def end() -> None:
-            self._queue.put(None, 0, always=True)
-
-        return self.supervisor.start(name, partial(source, self), again=not self.once, ended=end)
 
     def _outputs(self) -> list[threading.Thread]:
         """Start what sends, and what renews the share in the actuators."""
@@ -208,14 +182,10 @@ class Service:
         if self._share is not None:
             repeat("share", self.actuators.renew, self._share.lease_s / 4.0)
         if (settings := self.settings.sparkplug) is not None and (broker := self.settings.mqtt) is not None:
-            from sealscope.monitor.outputs.sparkplug_node import SparkplugNode
-
             password = secret_of(broker.password_file, "mqtt.password_file")
-            node = SparkplugNode(self.store, self.actuators.plain, self.count, broker, settings, password)
+            node = SparkplugNode(self.store, self.plain, self.count, broker, settings, password)
             threads.append(repeat("Sparkplug node", node.pass_on, _LOOK_S, last=node.end))
         if (hook := self.settings.webhook) is not None:
-            from sealscope.monitor.outputs.webhook import Webhook
-
             token = secret_of(hook.token_file, "webhook.token_file")
             webhook = Webhook(self.store, hook.url, token, hook.timeout_s)
             threads.append(repeat(WEBHOOK, webhook.pass_on, _LOOK_S, last=webhook.pass_on))
@@ -262,7 +232,7 @@ class Service:
                 _log.exception("a block is dropped: %s", str(getattr(blocks[0], "actuator", blocks[0]))[:60])
         else:
             self._blocked = False
-            self.outages.back(DATABASE)
+            self._database.back()
         stored = set(map(id, blocks))
         self._at_hand = [block for block in self._at_hand if id(block) not in stored]
         for block in blocks:
@@ -271,11 +241,7 @@ class Service:
     def _pass_on(self) -> None:
         self._lines.pass_on()
         if not self._blocked:  # what can be read may still refuse to be written
-            self.outages.back(DATABASE)
-
-
-def _bytes(block: SourceBlock | RefusedMessage | None) -> int:
-    return bytes_of(block.samples) if isinstance(block, SourceBlock) else 0 if block is None else len(block.beginning)
+            self._database.back()
 
 
 def _worth_a_line(number: int) -> bool:

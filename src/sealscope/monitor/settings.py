@@ -6,31 +6,25 @@ import os
 from collections import Counter
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, model_validator
 
 from sealscope.errors import InputError
-from sealscope.monitor.alarms import Thresholds
 from sealscope.monitor.stream.joining import CHANNELS
+from sealscope.storage.plain_values import one_line
 from sealscope.storage.toml_file import read_toml
 
+_Place = TypeVar("_Place", Path, str)
 _Text = Annotated[str, Field(min_length=1, max_length=100)]
 _Level = Annotated[str, Field(pattern=r"^[^/+#\x00]+$", max_length=100)]  # of a topic
 _Words = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
-def _in_folder(path: Path, info: ValidationInfo) -> Path:
-    """Return a path as taken from the folder of the file of settings, where there is one."""
-    return Path(info.context["folder"]) / path if info.context else path
-
-
-def _database(name: str, info: ValidationInfo) -> str:
-    return name if "://" in name else str(_in_folder(Path(name), info))
-
-
-def _rig(rig: str, info: ValidationInfo) -> str:
-    return str(_in_folder(Path(rig), info)) if rig.endswith(".toml") else rig
+def _in_folder(place: _Place, info: ValidationInfo) -> _Place:
+    """Return a path as taken from the folder of the file of settings, where there is one; names and URLs stay."""
+    name = isinstance(place, str) and ("://" in place or (info.field_name == "rig" and not place.endswith(".toml")))
+    return place if name or not info.context else type(place)(Path(info.context["folder"]) / place)
 
 
 _File = Annotated[Path, AfterValidator(_in_folder)]
@@ -43,7 +37,7 @@ class _Part(BaseModel):
 class WatchSettings(_Part):
     """How an actuator is watched."""
 
-    rig: Annotated[_Text, AfterValidator(_rig)] = "thesis"
+    rig: Annotated[_Text, AfterValidator(_in_folder)] = "thesis"
     false_alarms_per_1000_h: float = Field(default=1.0, gt=0)
     learn_hours: float = Field(default=8.0, gt=0, le=1000)
     warning_lpm: float = Field(default=0.0, ge=0, allow_inf_nan=False)
@@ -52,12 +46,6 @@ class WatchSettings(_Part):
     return_share: float = Field(default=0.7, gt=0, lt=1)
     no_data_s: float = Field(default=3600.0, gt=0)
     not_comparable_s: float = Field(default=3600.0, gt=0)
-
-    @property
-    def thresholds(self) -> Thresholds:
-        """What makes an alarm."""
-        rate = self.false_alarms_per_1000_h
-        return Thresholds(self.warning_lpm, self.error_lpm, self.debounce_blocks, self.return_share, rate)
 
     @property
     def learned_with(self) -> str:
@@ -155,7 +143,7 @@ class ShareSettings(_Part):
 class MonitorSettings(_Part):
     """All settings of a monitor."""
 
-    database: Annotated[str, AfterValidator(_database)] = Field(default="monitor.db", validate_default=True)
+    database: Annotated[str, AfterValidator(_in_folder)] = Field(default="monitor.db", validate_default=True)
     lines: bool = False
     settle_s: float = Field(default=5.0, ge=0, le=3600)
     keep_days: float = Field(default=90.0, gt=0)
@@ -235,11 +223,7 @@ def read_settings(path: Path) -> MonitorSettings:
     try:
         return MonitorSettings.model_validate(values, context={"folder": path.resolve().parent})
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = ".".join(map(str, first["loc"])) or "settings"
-        message = first["msg"].removeprefix("Value error, ")
-        value = "" if first["type"] in ("value_error", "missing") else f", got {str(first['input'])[:60]!r}"
-        raise InputError(f"{place}: {message}{value} ({path})") from None
+        raise InputError(f"{one_line(error, 'settings')} ({path})") from None
 
 
 def template() -> str:

@@ -1,14 +1,14 @@
 """Sparkplug B payloads: named values with types and times, as protobuf messages; topics and sequence numbers.
 
-The field numbers are those of the published schema (Eclipse Sparkplug 3.0, chapter 6, payloads). What a monitor has no
-use for (data sets, templates, files, metadata) is passed over when it is read.
+Field numbers: Eclipse Sparkplug 3.0, chapter 6. Data sets, templates, files and metadata are passed over.
 """
 
 from __future__ import annotations
 
-import math
+import tomllib
 from dataclasses import dataclass, replace
 from functools import cache
+from importlib.resources import files
 from typing import Any
 
 import numpy as np
@@ -35,17 +35,6 @@ _FIELD_OF_TYPE = {
 _MOST_METRICS = 100_000
 #: Property that names the unit of a metric.
 _UNIT = "engUnit"
-#: Message -> its fields: number, name, type (of `FieldDescriptorProto`, or another message), R repeated or V a value.
-_SCHEMA = {
-    "PropertyValue": """1 type UINT32, 2 is_null BOOL, 3 int_value UINT32 V, 4 long_value UINT64 V,
-        5 float_value FLOAT V, 6 double_value DOUBLE V, 7 boolean_value BOOL V, 8 string_value STRING V""",
-    "PropertySet": "1 keys STRING R, 2 values PropertyValue R",
-    "Metric": """1 name STRING, 2 alias UINT64, 3 timestamp UINT64, 4 datatype UINT32, 5 is_historical BOOL,
-        6 is_transient BOOL, 7 is_null BOOL, 9 properties PropertySet, 10 int_value UINT32 V, 11 long_value UINT64 V,
-        12 float_value FLOAT V, 13 double_value DOUBLE V, 14 boolean_value BOOL V, 15 string_value STRING V,
-        16 bytes_value BYTES V""",
-    "Payload": "1 timestamp UINT64, 2 metrics Metric R, 3 seq UINT64",
-}
 
 
 @dataclass(frozen=True)
@@ -98,14 +87,15 @@ def payload_class() -> Any:
         from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
     except ImportError:
         raise MissingExtra("Sparkplug B needs protobuf: pip install 'sealscope[sparkplug]'") from None
+    schema = tomllib.loads((files("sealscope.monitor") / "sparkplug.toml").read_text("utf-8"))
     file = descriptor_pb2.FileDescriptorProto(name="sealscope/sparkplug_b.proto", package="sparkplug", syntax="proto2")
     kinds = descriptor_pb2.FieldDescriptorProto
-    for message, fields in _SCHEMA.items():
+    for message, fields in schema.items():
         entry = file.message_type.add(name=message)
         for number, name, kind, *roles in map(str.split, fields.split(",")):
             label = kinds.LABEL_REPEATED if "R" in roles else kinds.LABEL_OPTIONAL
             field = entry.field.add(name=name, number=int(number), label=label)
-            if kind in _SCHEMA:
+            if kind in schema:
                 field.type, field.type_name = kinds.TYPE_MESSAGE, f".sparkplug.{kind}"
             else:
                 field.type = kinds.Type.Value(f"TYPE_{kind}")
@@ -148,16 +138,16 @@ def decoded_payload(data: bytes) -> SparkplugPayload:
         message.ParseFromString(data)
         if len(message.metrics) > _MOST_METRICS:
             raise ValueError(f"got {len(message.metrics)} metrics")
-        seq = _stated(message, "seq")
+        timestamp, seq = _stated(message, "timestamp", "seq")
         if seq is not None and seq > 255:
             raise ValueError(f"seq must be 0 to 255, got {seq}")
-        return SparkplugPayload(_stated(message, "timestamp"), tuple(map(_metric, message.metrics)), seq)
+        return SparkplugPayload(timestamp, tuple(map(_metric, message.metrics)), seq)
     except (DecodeError, ValueError, RecursionError) as error:  # UnicodeDecodeError is a ValueError
         raise ValueError(f"it must be a payload of Sparkplug B: {' '.join(str(error).split())[:80]}") from None
 
 
-def _stated(message: Any, field: str) -> Any:
-    return getattr(message, field) if message.HasField(field) else None
+def _stated(message: Any, *names: str) -> list[Any]:
+    return [getattr(message, name) if message.HasField(name) else None for name in names]
 
 
 def _metric(entry: Any) -> SparkplugMetric:
@@ -167,18 +157,9 @@ def _metric(entry: Any) -> SparkplugMetric:
         raise ValueError("a text must be UTF-8")  # damaged text is returned as bytes
     properties = zip(entry.properties.keys, entry.properties.values, strict=False)
     unit = next((str(value.string_value)[:40] for key, value in properties if key == _UNIT), None)
-    alias, timestamp = _stated(entry, "alias"), _stated(entry, "timestamp")
-    metric = SparkplugMetric(_stated(entry, "name"), value, 0, alias, timestamp, unit or None)
+    name, alias, timestamp = _stated(entry, "name", "alias", "timestamp")
+    metric = SparkplugMetric(name, value, 0, alias, timestamp, unit or None)
     return metric.typed(int(entry.datatype)) if entry.datatype else metric
-
-
-def number_of(value: Any) -> float:
-    """Return a value as a number, NaN where it is null; raises ValueError for texts and arrays."""
-    if value is None:
-        return math.nan
-    if isinstance(value, (int, float)):
-        return float(value)
-    raise ValueError(f"a number is needed, got {type(value).__name__}")
 
 
 def topic_of(group: str, kind: str, node: str, device: str | None = None) -> str:

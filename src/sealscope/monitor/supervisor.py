@@ -1,8 +1,8 @@
 """The supervisor: every source, decoder and output of a monitor runs under it, and starts again after an error.
 
-What a part needs and does not reach, such as the database or the broker, and an error of the part itself are outages:
-each is said once in the log when it begins and once when it ends, and stands on page and metrics while it lasts. A part
-starts again after a pause that doubles. An error of the database is the database's outage.
+What a part needs and does not reach, and an error of the part itself, are outages: said once in the log when each
+begins and ends, shown on page and metrics while it lasts. A part starts again after a pause that doubles. An error of
+the database is the database's outage.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -27,90 +26,55 @@ _WORKING_S = 2.0
 #: Lines in a minute from one place in the code: of this package, and of the libraries that it uses.
 _OWN_LINES, _LIBRARY_LINES, _MINUTE_S, _MOST_PLACES = 300, 10, 60.0, 1000
 _PACKAGE = Path(__file__).resolve().parents[1]
-Away = Callable[[BaseException], str | None]
 
 
 class PartAway(Exception):  # noqa: N818 (says what happened)
     """What a part needs is not there, such as a folder: an outage with this reason, and nothing to trace."""
 
 
-@dataclass
-class _Outage:
-    """How one part is: `since` is the clock of its outage [s], None while it is reached."""
+class SupervisedPart:
+    """What a monitor runs, or needs and can be without: whether it is reached, and its pause after errors.
 
-    since: float | None = None
-    began: float = 0.0
-    reason: str = ""
-    count: int = 0
-    seconds: float = 0.0
-
-
-class Outages:
-    """The parts of a monitor that can be away; may be used by several threads.
-
-    `changed`: called when an outage begins or ends.
+    Several threads may say how it is; one at a time attempts it. `since`: clock of its outage [s], None while it is
+    reached; `count`, `seconds`: outages so far, and how long those that are over lasted.
     """
 
-    def __init__(self, changed: Callable[[], None]) -> None:
-        self._changed = changed
-        self._lock = threading.Lock()
-        self._parts: dict[str, _Outage] = {}
-
-    def expect(self, part: str) -> None:
-        """State that the monitor needs a part, which is counted as reached until it is lost."""
-        with self._lock:
-            self._parts.setdefault(part, _Outage())
-
-    def lost(self, part: str, reason: object) -> None:
-        """State that a part is not reached; the first reason of an outage is kept."""
-        line = " ".join(str(reason).splitlines()[:1])[:200]
-        with self._lock:
-            entry = self._parts.setdefault(part, _Outage())
-            if entry.since is not None:
-                return
-            entry.since, entry.began, entry.reason = time.time(), time.monotonic(), line
-            entry.count += 1
-        _log.error("the %s is not reached: %s", part, line)
-        self._changed()
-
-    def back(self, part: str) -> None:
-        """State that a part is reached."""
-        with self._lock:
-            entry = self._parts.setdefault(part, _Outage())
-            if entry.since is None:
-                return
-            lasted = time.monotonic() - entry.began
-            entry.since, entry.seconds = None, entry.seconds + lasted
-        _log.warning("the %s is reached again after %.1f s", part, lasted)
-        self._changed()
-
-    def plain(self) -> list[dict[str, Any]]:
-        """Return the outages that last: part, clock of its begin [s] and reason."""
-        with self._lock:
-            lasting = [(part, entry) for part, entry in self._parts.items() if entry.since is not None]
-            return [{"part": part, "since": entry.since, "reason": entry.reason} for part, entry in lasting]
-
-    def totals(self) -> dict[str, tuple[bool, int, float]]:
-        """Return of each part whether it is reached, how many outages it had and how long they lasted [s]."""
-        now = time.monotonic()
-        with self._lock:
-            return {
-                part: (each.since is None, each.count, each.seconds + (0.0 if each.since is None else now - each.began))
-                for part, each in self._parts.items()
-            }
-
-
-class SupervisedPart:
-    """A source, a decoder or an output; `attempt` runs it. Of one thread at a time."""
-
-    def __init__(self, name: str, outages: Outages, away: Away) -> None:
-        self.name, self._outages, self._away = name, outages, away
+    def __init__(self, name: str, supervisor: Supervisor) -> None:
+        self.name, self._supervisor = name, supervisor
+        self.since: float | None = None
+        self.reason, self.count, self.seconds, self._began = "", 0, 0.0, 0.0
         self._pause = self._due = 0.0
-        self._out = False
+        self._lock = threading.Lock()
+
+    def lost(self, reason: object) -> None:
+        """State that it is not reached; the first reason of an outage is kept."""
+        with self._lock:
+            if self.since is not None:
+                return
+            self.since, self._began, self.count = time.time(), time.monotonic(), self.count + 1
+            self.reason = " ".join(str(reason).splitlines()[:1])[:200]
+        _log.error("the %s is not reached: %s", self.name, self.reason)
+        self._supervisor.changed()
+
+    def back(self) -> None:
+        """State that it is reached."""
+        with self._lock:
+            self._pause = 0.0
+            if self.since is None:
+                return
+            lasted = self.lasting_s
+            self.since, self.seconds = None, self.seconds + lasted
+        _log.warning("the %s is reached again after %.1f s", self.name, lasted)
+        self._supervisor.changed()
+
+    @property
+    def lasting_s(self) -> float:
+        """How long its present outage lasts [s]."""
+        return 0.0 if self.since is None else time.monotonic() - self._began
 
     @property
     def pause_s(self) -> float:
-        """How long the part still pauses [s]."""
+        """How long it still pauses [s]."""
         return max(0.0, self._due - time.monotonic())
 
     def attempt(self, work: Callable[[], object], *, at_once: bool = False) -> bool:
@@ -122,51 +86,54 @@ class SupervisedPart:
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # a panic of an extension in Rust and an exit of uvicorn are no Exception
-            self._note(error)
+            reason = self._supervisor.away(error)
+            longest = LONGEST_PAUSE_S if reason is None else DATABASE_PAUSE_S
+            self._pause = min(max(2.0 * self._pause, FIRST_PAUSE_S), longest)
+            self._due = time.monotonic() + self._pause
+            if reason is not None:
+                self._supervisor.part(DATABASE).lost(reason)
+            else:
+                self.lost(error if isinstance(error, PartAway) else place_of(error))
+                _log.debug("the %s raised an error", self.name, exc_info=error)
             return False
-        self.works()
+        self.back()
         return True
-
-    def works(self) -> None:
-        """State that the part is reached."""
-        self._pause = 0.0
-        if self._out:
-            self._out = False
-            self._outages.back(self.name)
-
-    def _note(self, error: BaseException) -> None:
-        """Set the pause after an error, and state the outage."""
-        reason = self._away(error)
-        longest = LONGEST_PAUSE_S if reason is None else DATABASE_PAUSE_S
-        self._pause = min(max(2.0 * self._pause, FIRST_PAUSE_S), longest)
-        self._due = time.monotonic() + self._pause
-        if reason is not None:
-            self._outages.lost(DATABASE, reason)
-            return
-        self._out = True
-        self._outages.lost(self.name, error if isinstance(error, PartAway) else place_of(error))
-        _log.debug("the %s raised an error", self.name, exc_info=error)
 
 
 class Supervisor:
-    """The parts of a monitor that run in threads of their own until `stopping` is set.
+    """The parts of a monitor; those that run in threads of their own do so until `stopping` is set.
 
-    `away`: returns of an error why the database does not answer, None for one of another kind.
+    `away`: returns of an error why the database does not answer, None for one of another kind; `changed`: called when
+    an outage begins or ends.
     """
 
-    def __init__(self, outages: Outages, stopping: threading.Event, away: Away = lambda error: None) -> None:
-        self.outages, self._stopping, self._away = outages, stopping, away
+    def __init__(
+        self,
+        away: Callable[[BaseException], str | None] = lambda error: None,
+        changed: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.away, self.changed, self.stopping = away, changed, threading.Event()
         self._parts: dict[str, SupervisedPart] = {}
+        self._lock = threading.Lock()
 
     def part(self, name: str) -> SupervisedPart:
-        """Return the part of a name, which counts as reached until it fails."""
-        if name not in self._parts:
-            self.outages.expect(name)
-            self._parts[name] = SupervisedPart(name, self.outages, self._away)
-        return self._parts[name]
+        """Return the part of a name, which counts as reached until it is lost."""
+        with self._lock:
+            if name not in self._parts:
+                self._parts[name] = SupervisedPart(name, self)
+            return self._parts[name]
+
+    def outages(self) -> list[dict[str, Any]]:
+        """Return the outages that last: part, clock of its begin [s] and reason."""
+        known = [*self._parts.values()]
+        return [{"part": of.name, "since": of.since, "reason": of.reason} for of in known if of.since is not None]
+
+    def totals(self) -> dict[str, tuple[bool, int, float]]:
+        """Return of each part whether it is reached, how many outages it had and how long they lasted [s]."""
+        return {of.name: (of.since is None, of.count, of.seconds + of.lasting_s) for of in [*self._parts.values()]}
 
     def start(
-        self, name: str, work: Callable[[], object], *, again: bool = True, ended: Callable[[], None] = lambda: None
+        self, name: str, work: Callable[[], object], *, again: bool = True, ended: Callable[[], object] = lambda: None
     ) -> threading.Thread:
         """Start a thread that runs work, again after each error, until it ends without one, then `ended`.
 
@@ -175,7 +142,7 @@ class Supervisor:
         part = self.part(name)
 
         def lasting() -> None:
-            timer = threading.Timer(_WORKING_S, part.works)
+            timer = threading.Timer(_WORKING_S, part.back)
             timer.daemon = True
             timer.start()
             try:
@@ -184,7 +151,7 @@ class Supervisor:
                 timer.cancel()
 
         def attempts() -> None:
-            while not part.attempt(lasting) and again and not self._stopping.wait(part.pause_s):
+            while not part.attempt(lasting) and again and not self.stopping.wait(part.pause_s):
                 pass
             ended()
 
@@ -197,7 +164,7 @@ class Supervisor:
         part = self.part(name)
 
         def attempts() -> None:
-            while not self._stopping.wait(max(every_s, part.pause_s)):
+            while not self.stopping.wait(max(every_s, part.pause_s)):
                 part.attempt(step)
             if last is not None:
                 part.attempt(last, at_once=True)

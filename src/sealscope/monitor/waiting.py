@@ -26,16 +26,18 @@ class Waiting(Generic[_Item]):
         with self._changed:
             return len(self._items), self._bytes
 
-    def _room(self, size: int) -> bool:
-        return not self._items or (len(self._items) < self._most and self._bytes + size <= self._most_bytes)
-
     def put(self, item: _Item, size: int, timeout: float = 0.0, *, always: bool = False) -> bool:
         """Append something of `size` bytes; return False where there was no room for `timeout` [s].
 
         `always`: beyond the bounds, for what somebody else bounds.
         """
+
+        def has_room() -> bool:
+            fits = len(self._items) < self._most and self._bytes + size <= self._most_bytes
+            return always or not self._items or fits
+
         with self._changed:
-            if not always and not self._changed.wait_for(lambda: self._room(size), timeout):
+            if not self._changed.wait_for(has_room, timeout):
                 return False
             self._items.append((item, size))
             self._bytes += size

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from base64 import b64decode, b64encode
 from collections.abc import Iterable, Mapping
+from dataclasses import is_dataclass
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import numpy as np
@@ -83,23 +85,30 @@ def numbers_of(state: Any, name: str, shape: tuple[int, ...]) -> NDArray[np.floa
 
 
 def saved(owner: Any, names: Iterable[str]) -> dict[str, Any]:
-    """Return attributes as plain values, for `recall`: arrays, numbers, texts, tuples; null for what is not finite."""
-    state = {}
-    for name in names:
-        value = getattr(owner, name)
-        if isinstance(value, np.ndarray):
-            value = plain_array(value)
-        elif isinstance(value, float) and not np.isfinite(value):
-            value = None
-        state[name.lstrip("_")] = list(value) if isinstance(value, tuple) else value
-    return state
+    """Return attributes as plain values, for `recall`: numbers, texts, lists, arrays, dataclasses, what has a `state`.
+
+    A number that is not finite is null.
+    """
+    return {name.lstrip("_"): _plain(getattr(owner, name)) for name in names}
 
 
-def recall(owner: Any, names: Iterable[str], state: Any) -> None:
-    """Set the attributes that `saved` returned; null leaves what is there. Arrays of a tuple are written to.
+def _plain(value: Any) -> Any:
+    if callable(getattr(value, "state", None)):
+        return value.state()
+    if is_dataclass(value):
+        return plain_fields(value)
+    if isinstance(value, np.ndarray):
+        return plain_array(value)
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return list(value) if isinstance(value, tuple | list) else dict(value) if isinstance(value, dict) else value
 
-    Raises InputError where one is missing or unlike what is there: in its type, or in the shape of an array but for
-    axes that are empty.
+
+def recall(owner: Any, names: Iterable[str], state: Any, kinds: Mapping[str, Any] = MappingProxyType({})) -> None:
+    """Set the attributes that `saved` returned; null leaves a number, or None. Arrays of a tuple are written to.
+
+    `kinds`: types of attributes that may be None, or hold others. Raises InputError where one is missing or unlike what
+    is there: in its type, or in the shape of an array but for axes that are empty.
     """
     for name in names:
         plain, there = name.lstrip("_"), getattr(owner, name)
@@ -108,8 +117,11 @@ def recall(owner: Any, names: Iterable[str], state: Any) -> None:
             value = array_of(value, plain)
             if value.ndim != there.ndim or any(b not in (a, 0) for a, b in zip(value.shape, there.shape, strict=True)):
                 raise InputError(f"saved state's {plain} must have the shape {there.shape}, got {value.shape}")
-        elif value is not None:
-            value = restored(type(there), value, plain)
+        elif hasattr(there, "recall"):
+            there.recall(value)
+            continue
+        elif value is not None or not isinstance(there, float | None):
+            value = restored(kinds.get(name, type(there)), value, plain)
         if isinstance(owner, tuple):
             there[:] = value
         elif value is not None:

@@ -7,7 +7,10 @@ import math
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
+
+if TYPE_CHECKING:
+    from pydantic import ValidationError
 
 _T = TypeVar("_T")
 #: Largest whole number: beyond it, doubles are no longer exact.
@@ -56,9 +59,15 @@ def as_type(kind: type[_T], value: Any) -> _T:
     try:
         return _adapter(kind).validate_python(value)  # type: ignore[no-any-return, arg-type]
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = ".".join(map(str, first["loc"])) or "value"
-        raise ValueError(f"{place}: {first['msg']}, got {str(first['input'])[:60]!r}") from None
+        raise ValueError(one_line(error)) from None
+
+
+def one_line(error: ValidationError, whole: str = "value") -> str:
+    """Return what pydantic says first of values: place (`whole` for all of them), rule and value."""
+    first = error.errors(include_url=False)[0]
+    place, rule = ".".join(map(str, first["loc"])) or whole, first["msg"].removeprefix("Value error, ")
+    value = "" if first["type"] in ("value_error", "missing") else f", got {str(first['input'])[:60]!r}"
+    return f"{place}: {rule}{value}"
 
 
 def plain(value: Any) -> Any:

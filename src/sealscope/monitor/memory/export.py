@@ -28,28 +28,27 @@ def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
     An estimate is labelled `leak` from the start of an alarm's onset interval on until it was marked `repaired` or
     `valid`, and `healthy` until it was marked `invalid`; what nobody said anything of has no label.
     """
-    events = defaultdict[str, list[dict[str, Any]]](list)
-    number = 0
+    events, number = defaultdict[str, list[dict[str, Any]]](list), 0
     while batch := store.events_since(number):
         number = batch[-1][0]
         for _, event in batch:
             events[event["alarm"]["id"]].append(event)
     rows, labelled = [], defaultdict[str, list[tuple[float, float, dict[str, str]]]](list)
     for alarm in reversed(store.alarms()):
-        said = [event for event in events[alarm["id"]] if event["by"]]
-        judged = [event for event in events[alarm["id"]] if event["event"] in _LABELS][-1:]
+        own = events[alarm["id"]]
+        judged = next((event for event in reversed(own) if event["event"] in _LABELS), None)
         onset, leak = alarm["onset_interval_s"] or (None, None), alarm["leak_interval_lpm"] or (None, None)
         row = {
-            "marked_by": judged[0]["by"] if judged else None,
-            "marked_s": judged[0]["t"] if judged else None,
-            "comments": "; ".join(f"{event['by']}: {event['text']}" for event in said if event["text"]),
+            "marked_by": None if judged is None else judged["by"],
+            "marked_s": None if judged is None else judged["t"],
+            "comments": "; ".join(f"{event['by']}: {event['text']}" for event in own if event["by"] and event["text"]),
             **dict(zip(("onset_low_s", "onset_high_s"), onset, strict=True)),
             **dict(zip(("leak_low_lpm", "leak_high_lpm"), leak, strict=True)),
         }
         rows.append({**alarm, **row})
-        for event in judged:
-            start, label = alarm["onset_s"] if onset[0] is None else onset[0], _LABELS[event["event"]]
-            labelled[alarm["actuator"]].append((start, event["t"], {"label": label, "alarm": alarm["id"]}))
+        if judged is not None:
+            start, label = alarm["onset_s"] if onset[0] is None else onset[0], _LABELS[judged["event"]]
+            labelled[alarm["actuator"]].append((start, judged["t"], {"label": label, "alarm": alarm["id"]}))
 
     def estimates() -> Iterator[dict[str, Any]]:
         for row in store.estimates():

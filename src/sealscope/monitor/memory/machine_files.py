@@ -39,8 +39,7 @@ def pass_on(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording]) -> 
             shift = 0.0 if alarm.onset_s > _DATED else time.time() - alarm.updated_s
             leak = None if mark == "invalid" else alarm.leak_lpm
             said = JudgedAlarm(alarm.id, mark, time.time(), alarm.onset_s + shift, leak, alarm.reason)
-            machine = load_machine(path)
-            done = "written down"
+            machine, done = load_machine(path), "written down"
             if mark == "invalid":
                 try:
                     machine = machine.with_healthy(_recording(samples, shift), file=alarm.id)

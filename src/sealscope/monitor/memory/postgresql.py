@@ -1,16 +1,14 @@
 """Connections to PostgreSQL that do not wait for ever: for a server that is gone, that hangs, or that waits for a lock.
 
-A server that is gone without a word is noticed by TCP, at both ends. One that hangs (a stopped process, a disk that
-does not answer) still confirms every packet, so its answers have a deadline here: the connection is then closed, and
-whatever was under way is tried again by who asked. A statement that waits for a lock is ended by the server itself
-before that deadline, or else each new try would leave one more process waiting in the server.
+A server that is gone is noticed by TCP, at both ends. One that hangs still confirms every packet: its answers have a
+deadline here, after which the connection is closed and what was under way is tried again. The server itself ends a
+statement before that, or else each new try would leave one more process waiting in it.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Generator
-from functools import cache
 from typing import Any
 
 from sqlalchemy import URL, Engine, event
@@ -20,39 +18,28 @@ CONNECT_S, ANSWER_S, STATEMENT_S = 5, 10.0, 8.0
 #: How long the server keeps a transaction in which nothing happens, such as that of a monitor that is gone [s].
 _IDLE_S = 20.0
 _DRIVERS = ("postgresql", "postgresql+psycopg", "postgresql+psycopg2")
-#: Limits of a connection (libpq): what nobody confirms [ms], and signs of life [s].
-_LIMITS = {"keepalives_idle": 5, "keepalives_interval": 2, "keepalives_count": 3, "tcp_user_timeout": 10_000}
 
 
 def engine_options(url: URL) -> dict[str, Any]:
     """Return options of an engine for a URL, {} where it is no PostgreSQL; what its query states is left as it is."""
     if url.drivername not in _DRIVERS:
         return {}
+    signs = {"keepalives_idle": 5, "keepalives_interval": 2, "keepalives_count": 3}
     server = {
         "statement_timeout": round(1000.0 * STATEMENT_S),
         "idle_in_transaction_session_timeout": round(1000.0 * _IDLE_S),
-        "tcp_keepalives_idle": _LIMITS["keepalives_idle"],
-        "tcp_keepalives_interval": _LIMITS["keepalives_interval"],
-        "tcp_keepalives_count": _LIMITS["keepalives_count"],
+        **{f"tcp_{name}": value for name, value in signs.items()},
     }
-    limits: dict[str, Any] = {
-        **_LIMITS,
-        "connect_timeout": CONNECT_S,
-        "options": " ".join(f"-c {name}={value}" for name, value in server.items()),
-    }
+    options = " ".join(f"-c {name}={value}" for name, value in server.items())
+    limits = {**signs, "tcp_user_timeout": 10_000, "connect_timeout": CONNECT_S, "options": options}
     arguments = {name: value for name, value in limits.items() if name not in url.query}
     return {"pool_pre_ping": True, "pool_timeout": 5.0, "connect_args": arguments}
 
 
 def limit_answers(engine: Engine) -> None:
     """Give each answer of PostgreSQL to an engine's connections a deadline, where the driver is psycopg 3."""
-    if engine.dialect.driver == "psycopg":
-        event.listen(engine, "do_connect", lambda *of: _connection_class().connect(*of[2], **of[3]))
-
-
-@cache
-def _connection_class() -> Any:
-    """Return the class of connections whose answers have a deadline."""
+    if engine.dialect.driver != "psycopg":
+        return
     from psycopg import Connection, OperationalError
 
     class LimitedConnection(Connection[Any]):
@@ -78,4 +65,4 @@ def _connection_class() -> Any:
                     self.pgconn.finish()
                     raise OperationalError(f"PostgreSQL has not answered for {ANSWER_S:g} s")
 
-    return LimitedConnection
+    event.listen(engine, "do_connect", lambda *of: LimitedConnection.connect(*of[2], **of[3]))

@@ -1,8 +1,8 @@
 """Several monitors over one database: which actuators are whose, by leases that lapse when a monitor is gone.
 
-Every monitor hears every actuator. It stores the blocks of those whose lease it holds; of the others it keeps the last
-ones in memory, so that nothing is missing when it takes one over. A lease is looked at in the very transaction that
-stores a block, so a monitor that was held up and lost its lease stores nothing. Times are those of the database.
+Every monitor hears every actuator. It stores the blocks of those whose lease it holds, and keeps the last ones of the
+others in memory for a takeover. A lease is looked at in the very transaction that stores a block, so a monitor that was
+held up and lost its lease stores nothing. Times are those of the database.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from sqlalchemy import Connection, delete, func, select, text, update
 from sqlalchemy.exc import IntegrityError
 
 from sealscope.monitor.memory.store import MonitorStore
+from sealscope.monitor.settings import ShareSettings
 
 _log = logging.getLogger(__name__)
 #: The lease of what goes out (lines, messages, posts): one monitor sends for all.
@@ -23,13 +24,10 @@ OUTPUTS = ""
 
 
 class Share:
-    """The share of the monitor `name` in the `actuators` of a database.
+    """The share of a monitor in the `actuators` of a database, which it loses where it says nothing for `lease_s`."""
 
-    `lease_s`: how long a monitor that says nothing keeps its actuators [s].
-    """
-
-    def __init__(self, store: MonitorStore, name: str, actuators: Sequence[str], lease_s: float) -> None:
-        self._store, self.name, self.lease_s = store, name, lease_s
+    def __init__(self, store: MonitorStore, settings: ShareSettings, actuators: Sequence[str]) -> None:
+        self._store, self.name, self.lease_s = store, settings.name, settings.lease_s
         self._names = sorted({*actuators, OUTPUTS})
         self.held: frozenset[str] = frozenset()
         leases = store.tables.leases

@@ -27,8 +27,6 @@ from sealscope.monitor.memory.postgresql import engine_options, limit_answers
 from sealscope.monitor.stream.estimates import BlockEstimate
 from sealscope.recordings.recording import Recording
 
-#: Blocks of samples between two checkpoints, and their bytes.
-PENDING_BLOCKS, PENDING_BYTES = 16, 400_000
 #: Identities of blocks that are kept for each actuator: more than a day of messages of 1 s.
 KEPT_IDENTITIES = 100_000
 #: Refused messages that are kept, the last ones.
@@ -41,15 +39,15 @@ _ATTEMPTS = 10
 class StoredRows:
     """Rows that a transaction adds to the tables beside the blocks themselves, gathered to be stored at once.
 
-    By actuator: `checkpoints`, settings and state; `summaries`; and `old`, the numbers up to which blocks and estimates
-    are deleted.
+    `estimates`, `pending`, `events`: new ones; `alarms` by id, `actuators` (their checkpoints) and `summaries` by
+    actuator: changed ones; `old`: by actuator the numbers up to which blocks and estimates are deleted.
     """
 
     estimates: list[dict[str, Any]] = field(default_factory=list)
     pending: list[dict[str, Any]] = field(default_factory=list)
     events: list[dict[str, Any]] = field(default_factory=list)
-    alarms: dict[str, Alarm] = field(default_factory=dict)
-    checkpoints: dict[str, tuple[str, dict[str, Any]]] = field(default_factory=dict)
+    alarms: dict[str, dict[str, Any]] = field(default_factory=dict)
+    actuators: dict[str, dict[str, Any]] = field(default_factory=dict)
     summaries: dict[str, dict[str, Any]] = field(default_factory=dict)
     old: dict[str, tuple[int, int]] = field(default_factory=dict)
 
@@ -67,15 +65,21 @@ class StoredRows:
 
     def add_alarm(self, alarm: Alarm, kind: str, t: float, by_whom: str = "", text: str = "") -> None:
         """Add an alarm as it is now, and what happened to it, or what a person said of it, unless `kind` is empty."""
-        self.alarms[alarm.id] = alarm
+        own, plain = {"actuator": alarm.actuator}, json.dumps(alarm.plain())
+        self.alarms[alarm.id] = {**own, "id": alarm.id, "state": alarm.state, "alarm": plain}
         if kind:
-            own = {"actuator": alarm.actuator, "alarm_id": alarm.id, "alarm": json.dumps(alarm.plain())}
-            self.events.append({"t": t, "kind": kind, "by_whom": by_whom, "text": text, **own})
+            said = {"kind": kind, "by_whom": by_whom, "text": text}
+            self.events.append({**own, **said, "t": t, "alarm_id": alarm.id, "alarm": plain})
 
     def add_checkpoint(self, actuator: str, settings: str, state: dict[str, Any]) -> None:
         """Add the state of an actuator, which takes the place of the samples since the last one."""
         self.pending = [row for row in self.pending if row["actuator"] != actuator]
-        self.checkpoints[actuator] = settings, state
+        plain = json.dumps(state, allow_nan=False)
+        self.actuators[actuator] = {"actuator": actuator, "settings": settings, "checkpoint": plain}
+
+    def add_summary(self, actuator: str, summary: dict[str, Any]) -> None:
+        """Add what an actuator shows."""
+        self.summaries[actuator] = {"actuator": actuator, "summary": json.dumps(summary)}
 
 
 class MonitorStore:
@@ -93,29 +97,28 @@ class MonitorStore:
             limit_answers(self.engine)
             if self.engine.dialect.name == "sqlite":
                 sa.event.listen(self.engine, "connect", _prepare_sqlite)
-            for attempt in range(_ATTEMPTS):
-                try:
-                    known = self._prepared()
-                    break
-                except (IntegrityError, ProgrammingError):
-                    if attempt == _ATTEMPTS - 1:
-                        raise
-                    time.sleep(0.2)  # another monitor makes the tables at this moment
+            known = self._prepared(_ATTEMPTS)
         except (SQLAlchemyError, ImportError, ValueError) as error:
             reason = str(getattr(error, "orig", None) or error).splitlines()[0]
             raise InputError(f"the monitor's database must be a file of SQLite or a URL, got: {reason}") from None
-        if known not in (None, str(tables.SCHEMA)):
+        if known != str(tables.SCHEMA):
             raise InputError(f"the monitor's database must have version {tables.SCHEMA}, got {known} ({database})")
 
-    def _prepared(self) -> str | None:
-        """Make the tables where they are missing, and return the version of those that were there."""
+    def _prepared(self, attempts: int) -> str:
+        """Make the tables where they are missing, and return their version."""
         facts = tables.facts
-        with self.engine.begin() as connection:
-            tables.metadata.create_all(connection)
-            known = connection.execute(select(facts.c.value).where(facts.c.name == "schema")).scalar()
-            if known is None:
-                connection.execute(facts.insert().values(name="schema", value=str(tables.SCHEMA)))
-        return None if known is None else str(known)
+        try:
+            with self.engine.begin() as connection:
+                tables.metadata.create_all(connection)
+                known = connection.execute(select(facts.c.value).where(facts.c.name == "schema")).scalar()
+                if known is None:
+                    connection.execute(facts.insert().values(name="schema", value=str(tables.SCHEMA)))
+        except (IntegrityError, ProgrammingError):
+            if attempts == 1:
+                raise
+            time.sleep(0.2)  # another monitor makes the tables at this moment
+            return self._prepared(attempts - 1)
+        return str(known or tables.SCHEMA)
 
     @contextmanager
     def writing(self) -> Iterator[sa.Connection]:
@@ -135,14 +138,14 @@ class MonitorStore:
     def known(self, blocks: Iterable[tuple[str, str]]) -> set[tuple[str, str]]:
         """Return which of some blocks are stored; a block is an actuator and an identity."""
         # a query for each: SQLite goes through the whole table for a list of pairs
-        table = tables.blocks
-        chosen = (table.c.actuator == bindparam("of")) & (table.c.identity == bindparam("identity"))
-        query = select(table.c.number).where(chosen)
+        of = tables.blocks.c
+        query = select(of.number).where(of.actuator == bindparam("of"), of.identity == bindparam("identity"))
         with self.engine.connect() as connection:
-            rows = {
-                block: connection.execute(query, {"of": block[0], "identity": block[1]}).first() for block in blocks
+            return {
+                (actuator, identity)
+                for actuator, identity in blocks
+                if connection.execute(query, {"of": actuator, "identity": identity}).first() is not None
             }
-        return {block for block, row in rows.items() if row is not None}
 
     def is_known(self, actuator: str, identity: str) -> bool:
         """Return whether a block is stored."""
@@ -159,28 +162,24 @@ class MonitorStore:
     def keep_rows(self, connection: sa.Connection, rows: StoredRows) -> None:
         """Store rows, each table's at once."""
         of = bindparam("of", type_=sa.String)
-        states = [
-            {"actuator": name, "settings": settings, "checkpoint": json.dumps(state, allow_nan=False)}
-            for name, (settings, state) in rows.checkpoints.items()
-        ]
-        if states:
+        if rows.actuators:
             before = tables.pending.delete().where(tables.pending.c.actuator == of)
-            connection.execute(before, [{"of": row["actuator"]} for row in states])
-        for name in ("estimates", "pending", "events"):
-            if values := getattr(rows, name):
-                connection.execute(getattr(tables, name).insert(), values)
-        shown = [{"actuator": name, "summary": json.dumps(summary)} for name, summary in rows.summaries.items()]
-        alarms = [
-            {"id": each.id, "actuator": each.actuator, "state": each.state, "alarm": json.dumps(each.plain())}
-            for each in rows.alarms.values()
-        ]
-        for table, changed in ((tables.actuators, states), (tables.summaries, shown), (tables.alarms, alarms)):
-            self.put(connection, table, changed)
-        for table, place in ((tables.blocks, 0), (tables.estimates, 1)):
+            connection.execute(before, [{"of": name} for name in rows.actuators])
+        for new in (tables.estimates, tables.pending, tables.events):
+            if values := getattr(rows, new.name):
+                connection.execute(new.insert(), values)
+        for changed in (tables.actuators, tables.summaries, tables.alarms):
+            self.put(connection, changed, [*getattr(rows, changed.name).values()])
+        for place, table in enumerate((tables.blocks, tables.estimates)):
             old = [{"of": name, "last": numbers[place]} for name, numbers in rows.old.items() if numbers[place] > 0]
             if old:
                 chosen = (table.c.actuator == of) & (table.c.number <= bindparam("last"))
                 connection.execute(table.delete().where(chosen), old)
+
+    def keep(self, rows: StoredRows) -> None:
+        """Store rows in a transaction of their own."""
+        with self.writing() as connection:
+            self.keep_rows(connection, rows)
 
     def put(self, connection: sa.Connection, table: sa.Table, rows: list[dict[str, Any]]) -> None:
         """Change rows of a table by its primary key, or insert those that are missing."""
@@ -189,50 +188,45 @@ class MonitorStore:
         key = table.primary_key.columns.keys()
         chosen = [table.c[name] == bindparam(f"of_{name}") for name in key]
         values = [{f"of_{name}" if name in key else name: value for name, value in row.items()} for row in rows]
-        changed = connection.execute(table.update().where(*chosen), values)
-        if changed.rowcount == len(rows):
-            return
-        if len(rows) == 1:
-            connection.execute(table.insert(), rows)
-        else:
-            for row in rows:
-                self.put(connection, table, [row])
+        if connection.execute(table.update().where(*chosen), values).rowcount < len(rows):
+            if len(rows) == 1:
+                connection.execute(table.insert(), rows)
+            else:
+                for row in rows:
+                    self.put(connection, table, [row])
 
     def keep_refused(self, rows: Sequence[dict[str, Any]]) -> None:
         """Store what was refused, `KEPT_REFUSED` at most with those before, in a transaction of its own."""
-        table = tables.refused
+        table, of = tables.refused, tables.refused.c
         with self.writing() as connection:
             connection.execute(table.insert(), rows[-KEPT_REFUSED:])
-            last = int(connection.execute(select(func.max(table.c.number))).scalar() or 0)
-            connection.execute(table.delete().where(table.c.number <= last - KEPT_REFUSED))
+            last = int(connection.execute(select(func.max(of.number))).scalar() or 0)
+            connection.execute(table.delete().where(of.number <= last - KEPT_REFUSED))
 
     def refused(self, most: int = KEPT_REFUSED) -> list[dict[str, Any]]:
         """Return what was refused, the last one first."""
-        table = tables.refused
-        return [dict(row._mapping) for row in self._rows(select(table).order_by(table.c.number.desc()).limit(most))]
+        rows = self._rows(select(tables.refused).order_by(tables.refused.c.number.desc()).limit(most))
+        return [dict(row._mapping) for row in rows]
 
     def last_number(self, table: sa.Table, actuator: str) -> int:
         """Return the number of an actuator's last row of a table, `tables.blocks` or `tables.estimates`."""
         return self._value(select(func.max(table.c.number)).where(table.c.actuator == actuator))
 
     def checkpoint(self, actuator: str) -> tuple[str, dict[str, Any], list[tuple[Recording, bool]]] | None:
-        """Return settings and state as of the checkpoint, and the samples since then; None where there is none."""
-        states = tables.actuators
+        """Return settings and state as of the checkpoint, and the samples since then; None where there is none.
+
+        Of the samples of each block, whether they follow those before.
+        """
+        states, pending = tables.actuators, tables.pending
+        samples = select(pending.c.samples).where(pending.c.actuator == actuator).order_by(pending.c.number)
         with self.engine.connect() as connection:
             row = connection.execute(select(states).where(states.c.actuator == actuator)).first()
-            samples = self._pending(connection, actuator)
-        return None if row is None else (row.settings, json.loads(row.checkpoint), samples)
-
-    @staticmethod
-    def _pending(connection: sa.Connection, actuator: str) -> list[tuple[Recording, bool]]:
-        pending = tables.pending
-        query = select(pending.c.samples).where(pending.c.actuator == actuator).order_by(pending.c.number)
-        return [_unpacked(data) for (data,) in connection.execute(query)]
+            blocks = [_unpacked(data) for (data,) in connection.execute(samples)]
+        return None if row is None else (row.settings, json.loads(row.checkpoint), blocks)
 
     def last_samples(self, actuator: str) -> list[Recording]:
         """Return the samples of an actuator since its last checkpoint."""
-        with self.engine.connect() as connection:
-            return [samples for samples, _ in self._pending(connection, actuator)]
+        return [samples for samples, _ in (self.checkpoint(actuator) or ("", {}, []))[2]]
 
     def summaries(self) -> dict[str, dict[str, Any]]:
         """Return what each actuator showed last."""
@@ -240,25 +234,25 @@ class MonitorStore:
 
     def alarms(self, *, open_only: bool = False, actuator: str | None = None) -> list[dict[str, Any]]:
         """Return alarms as plain values, the latest first."""
-        alarms = tables.alarms
-        query = select(alarms.c.alarm)
+        of = tables.alarms.c
+        query = select(of.alarm)
         if open_only:
-            query = query.where(alarms.c.state.not_in(("closed", "invalid")))
+            query = query.where(of.state.not_in(("closed", "invalid")))
         if actuator is not None:
-            query = query.where(alarms.c.actuator == actuator)
+            query = query.where(of.actuator == actuator)
         values = [json.loads(text) for (text,) in self._rows(query)]
         return sorted(values, key=lambda alarm: -float(alarm["raised_s"]))
 
     def events_since(self, number: int, most: int = 1000) -> list[tuple[int, dict[str, Any]]]:
         """Return events beyond a number with their own numbers, in their order."""
-        events = tables.events
-        query = select(events).where(events.c.number > number).order_by(events.c.number).limit(most)
-        return [(row.number, _event(row)) for row in self._rows(query)]
+        of = tables.events.c
+        rows = self._rows(select(tables.events).where(of.number > number).order_by(of.number).limit(most))
+        return [(row.number, _event(row)) for row in rows]
 
     def last_events(self, actuator: str, most: int = 200) -> list[dict[str, Any]]:
         """Return the latest events of an actuator, the last one first."""
-        events = tables.events
-        query = select(events).where(events.c.actuator == actuator).order_by(events.c.number.desc()).limit(most)
+        of = tables.events.c
+        query = select(tables.events).where(of.actuator == actuator).order_by(of.number.desc()).limit(most)
         return [_event(row) for row in self._rows(query)]
 
     def course(self, actuator: str, most: int = 600, seconds: float | None = None) -> list[dict[str, Any]]:
@@ -266,20 +260,18 @@ class MonitorStore:
 
         `seconds`: only the last of them.
         """
-        estimates = tables.estimates
-        chosen = estimates.c.actuator == actuator
+        of = tables.estimates.c
+        chosen = of.actuator == actuator
         if seconds is not None:
-            chosen &= estimates.c.t >= select(func.max(estimates.c.t)).where(chosen).scalar_subquery() - seconds
+            chosen &= of.t >= select(func.max(of.t)).where(chosen).scalar_subquery() - seconds
         every = max(1, -(-self._value(select(func.count()).where(chosen)) // most))
-        group = estimates.c.number - estimates.c.number % every
-        columns = [func.avg(estimates.c[name]).label(name) for name in ("t", *tables.FIGURES)]
-        query = select(*columns).where(chosen).group_by(group).order_by(group)
-        return [dict(row._mapping) for row in self._rows(query)]
+        group = of.number - of.number % every
+        query = select(*(func.avg(of[name]).label(name) for name in ("t", *tables.FIGURES)))
+        return [dict(row._mapping) for row in self._rows(query.where(chosen).group_by(group).order_by(group))]
 
     def estimates(self) -> Iterator[dict[str, Any]]:
         """Yield the estimates that are kept, by actuator in their order."""
-        table = tables.estimates
-        query = select(table).order_by(table.c.actuator, table.c.number)
+        query = select(tables.estimates).order_by(tables.estimates.c.actuator, tables.estimates.c.number)
         with self.engine.connect() as connection:
             for row in connection.execution_options(yield_per=10_000).execute(query):
                 yield dict(row._mapping)
@@ -329,13 +321,10 @@ def _unpacked(data: bytes) -> tuple[Recording, bool]:
 
 
 def _event(row: Any) -> dict[str, Any]:
-    alarm = json.loads(row.alarm)
     values = {"number": row.number, "event": row.kind, "t": row._mapping["t"], "by": row.by_whom, "text": row.text}
-    return {**values, "alarm": alarm}
+    return {**values, "alarm": json.loads(row.alarm)}
 
 
 def _prepare_sqlite(connection: Any, record: object) -> None:
-    cursor = connection.cursor()
     for setting in ("journal_mode=WAL", "synchronous=FULL", "busy_timeout=5000", "foreign_keys=ON"):
-        cursor.execute(f"PRAGMA {setting}")
-    cursor.close()
+        connection.execute(f"PRAGMA {setting}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 from sqlalchemy import Column, Float, Index, Integer, LargeBinary, MetaData, String, Table, Text
 from sqlalchemy.types import TypeEngine
@@ -15,62 +15,41 @@ FIGURES = (
     *("total_lpm", "total_low_lpm", "total_high_lpm"),
     *("leak_lpm", "leak_low_lpm", "leak_high_lpm", "oil_celsius"),
 )
+_TYPES: dict[str, TypeEngine[Any]] = {"text": Text(), "int": Integer(), "double": Float(53), "bytes": LargeBinary()}
 
 
-def _key(name: str, kind: TypeEngine[Any]) -> Column[Any]:
-    return Column(name, kind, primary_key=True, autoincrement=False)
+def _table(name: str, columns: str, *more: Index) -> Table:
+    """Return a table of columns: name, type or most letters, and whether it is of the key, indexed or may be null."""
+    made: list[Column[Any]] = []
+    for own, kind, *roles in map(str.split, columns.split(",")):
+        known = _TYPES[kind] if kind in _TYPES else String(int(kind))
+        key, null, index = "key" in roles or "counted" in roles, "null" in roles, "indexed" in roles
+        counts: Literal["auto"] | bool = "auto" if "counted" in roles else False
+        made.append(Column(own, known, primary_key=key, autoincrement=counts, nullable=null, index=index))
+    return Table(name, metadata, *made, *more)
 
 
-def _stated(name: str, kind: TypeEngine[Any], *, index: bool = False) -> Column[Any]:
-    return Column(name, kind, nullable=False, index=index)
-
-
-_Name, _Long, _Double = String(120), String(160), Float(53)
-facts = Table("facts", metadata, _key("name", String(40)), _stated("value", Text()))
+facts = _table("facts", "name 40 key, value text")
 #: Blocks that are stored, by identity.
-blocks = Table(
-    "blocks",
-    metadata,
-    *(_key("actuator", _Name), _key("identity", _Name), _stated("number", Integer())),
-    Index("blocks_in_order", "actuator", "number"),
+blocks = _table(
+    "blocks", "actuator 120 key, identity 120 key, number int", Index("blocks_in_order", "actuator", "number")
 )
 #: Samples since the checkpoint, which a restart goes through once more.
-pending = Table(
-    "pending", metadata, _key("actuator", _Name), _key("number", Integer()), _stated("samples", LargeBinary())
-)
+pending = _table("pending", "actuator 120 key, number int key, samples bytes")
 #: State of the detector and of the alarm, as of the checkpoint, in JSON.
-actuators = Table(
-    "actuators", metadata, _key("actuator", _Name), _stated("settings", Text()), _stated("checkpoint", Text())
-)
+actuators = _table("actuators", "actuator 120 key, settings text, checkpoint text")
 #: What each actuator shows now: a row of its own, for one is written whole, and a state is large.
-summaries = Table("summaries", metadata, _key("actuator", _Name), _stated("summary", Text()))
-estimates = Table(
-    "estimates",
-    metadata,
-    *(_key("actuator", _Name), _key("number", Integer()), _stated("t", _Double), _stated("status", _Long)),
-    *(Column(name, _Double) for name in FIGURES),
-)
-alarms = Table(
-    "alarms",
-    metadata,
-    *(_key("id", _Long), _stated("actuator", _Name, index=True), _stated("state", String(20), index=True)),
-    _stated("alarm", Text()),
-)
+summaries = _table("summaries", "actuator 120 key, summary text")
+_FIGURES = ", ".join(f"{name} double null" for name in FIGURES)
+estimates = _table("estimates", f"actuator 120 key, number int key, t double, status 160, {_FIGURES}")
+alarms = _table("alarms", "id 160 key, actuator 120 indexed, state 20 indexed, alarm text")
 #: What happened to alarms, and what persons said of them, in order; outputs keep how far they are.
-events = Table(
+events = _table(
     "events",
-    metadata,
-    *(Column("number", Integer, primary_key=True), _stated("actuator", _Name, index=True), _stated("t", _Double)),
-    *(_stated("kind", String(20)), _stated("alarm_id", _Long), _stated("by_whom", String(80))),
-    *(_stated("text", Text()), _stated("alarm", Text())),
+    "number int counted, actuator 120 indexed, t double, kind 20, alarm_id 160, by_whom 80, text text, alarm text",
 )
 #: The last messages and files that could not be taken: when [s], from where, why, their size and how they begin.
-refused = Table(
-    "refused",
-    metadata,
-    *(Column("number", Integer, primary_key=True), _stated("at", _Double), _stated("reason", _Name)),
-    *(_stated("message", Text()), _stated("size", Integer()), _stated("beginning", LargeBinary())),
-)
+refused = _table("refused", "number int counted, at double, reason 120, message text, size int, beginning bytes")
 #: Monitors that share the database, and whose each actuator is, until when [s].
-monitors = Table("monitors", metadata, _key("name", _Name), _stated("until", _Double))
-leases = Table("leases", metadata, _key("actuator", _Name), _stated("holder", _Name), _stated("until", _Double))
+monitors = _table("monitors", "name 120 key, until double")
+leases = _table("leases", "actuator 120 key, holder 120, until double")

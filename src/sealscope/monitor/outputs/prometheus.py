@@ -16,13 +16,21 @@ _OF_ACTUATORS = {
     "sealscope_total_lpm": ("Flow past pump and piston together [L/min]", "total_lpm"),
     "sealscope_oil_temperature_celsius": ("Oil temperature as recorded [deg C]", "oil_celsius"),
     "sealscope_status_word": ("Bits: 1 warning, 2 error, 4 new", "status_word"),
-    "sealscope_health": (
-        "State of NE 107: 0 good, 1 failure, 2 check, 3 off spec, 4 maintenance",
-        "state.health",
-    ),
+    "sealscope_health": ("State of NE 107: 0 good, 1 failure, 2 check, 3 off spec, 4 maintenance", "state.health"),
     "sealscope_severity": ("Severity of the state, 0 to 1000", "state.severity"),
     "sealscope_blocks_total": ("Blocks since the beginning", "blocks"),
     "sealscope_block_time_seconds": ("Clock at the end of the last block", "t"),
+}
+#: Metric of a part of the monitor, or of what waits -> help.
+_OF_PARTS = {
+    "sealscope_reached": "1 while a part of the monitor or what it needs is reached, 0 in an outage",
+    "sealscope_outages_total": "Outages since the start",
+    "sealscope_outage_seconds_total": "How long outages lasted since the start",
+}
+_OF_WAITING = {
+    "sealscope_waiting_blocks": "Blocks that wait to be stored",
+    "sealscope_waiting_bytes": "Bytes of the blocks that wait to be stored",
+    "sealscope_source_waits_total": "How often a source had to wait because too many blocks waited",
 }
 
 
@@ -57,16 +65,11 @@ def metrics_text(
             add("sealscope_passed_over_total", text, count, actuator=actuator, reason=reason)
     for reason, count in counters.items():
         add("sealscope_dropped_blocks_total", "Messages dropped by reason", count, reason=reason)
-    for part, (reached, outages, seconds) in (parts or {}).items():
-        text = "1 while a part of the monitor or what it needs is reached, 0 in an outage"
-        add("sealscope_reached", text, reached, part=part)
-        add("sealscope_outages_total", "Outages since the start", outages, part=part)
-        add("sealscope_outage_seconds_total", "How long outages lasted since the start", seconds, part=part)
-    blocks, size, waits = waiting
-    add("sealscope_waiting_blocks", "Blocks that wait to be stored", blocks)
-    add("sealscope_waiting_bytes", "Bytes of the blocks that wait to be stored", size)
-    text = "How often a source had to wait because too many blocks waited"
-    add("sealscope_source_waits_total", text, waits)
+    for part, measured in (parts or {}).items():
+        for (name, text), value in zip(_OF_PARTS.items(), measured, strict=True):
+            add(name, text, value, part=part)
+    for (name, text), value in zip(_OF_WAITING.items(), waiting, strict=True):
+        add(name, text, value)
     registry = CollectorRegistry(auto_describe=False)
     registry.register(type("Families", (), {"collect": lambda self: families.values()})())
     return generate_latest(registry).decode()

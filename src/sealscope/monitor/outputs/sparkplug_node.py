@@ -1,9 +1,8 @@
 """Alarms as an edge node of Sparkplug B: a device for each actuator, with births, data, a death as the will.
 
 Births state everything as it is; data state each event of an alarm at once, in order, and of the rest what has changed
-every few seconds. Sequence numbers begin at 0 with each birth of the node; its bdSeq is one more with each connection,
-also after a restart. A host that asks for a rebirth gets it. Messages have QoS 0, as Sparkplug has it: what a host
-misses it learns from the next birth, which it asks for when a number is missing.
+every few seconds. bdSeq is one more with each connection, also after a restart. Messages have QoS 0: what a host misses
+it learns from the birth that it asks for when a number is missing.
 """
 
 from __future__ import annotations
@@ -11,7 +10,10 @@ from __future__ import annotations
 import logging
 import threading
 import time
+import tomllib
 from collections.abc import Callable, Mapping
+from functools import cache
+from importlib.resources import files
 from typing import Any
 
 from sealscope.monitor import sparkplug as spb
@@ -23,48 +25,6 @@ _log = logging.getLogger(__name__)
 _NAME, _BIRTHS = "sparkplug", "sparkplug bdSeq"
 #: How long a message is waited for [s].
 _SENT_S = 5.0
-_Table = dict[str, tuple[int, str | None, tuple[str, ...]]]
-#: Metric of a device -> type, unit, and where it is in the summary of an actuator.
-_STATE: _Table = {
-    "Status": (spb.STRING, None, ("status",)),
-    "Status Word": (spb.UINT32, None, ("status_word",)),
-    "State": (spb.STRING, None, ("state", "name")),
-    "State/Health": (spb.UINT32, None, ("state", "health")),
-    "State/Severity": (spb.UINT32, None, ("state", "severity")),
-    "State/Since": (spb.DOUBLE, "s", ("state", "since_s")),
-    "State/Cause": (spb.STRING, None, ("state", "cause")),
-    "State/Action": (spb.STRING, None, ("state", "action")),
-    "Leak": (spb.DOUBLE, "L/min", ("leak_lpm",)),
-    "Leak Low": (spb.DOUBLE, "L/min", ("leak_interval_lpm", "0")),
-    "Leak High": (spb.DOUBLE, "L/min", ("leak_interval_lpm", "1")),
-    "Total": (spb.DOUBLE, "L/min", ("total_lpm",)),
-    "Blocks": (spb.UINT64, None, ("blocks",)),
-    "Block Time": (spb.DOUBLE, "s", ("t",)),
-    "Baseline Version": (spb.UINT32, None, ("baseline", "version")),
-}
-#: ... in its alarm.
-_ALARM: _Table = {
-    "Alarm/Id": (spb.STRING, None, ("id",)),
-    "Alarm/Level": (spb.STRING, None, ("level",)),
-    "Alarm/State": (spb.STRING, None, ("state",)),
-    "Alarm/Diagnostic Number": (spb.UINT32, None, ("diagnostic_number",)),
-    "Alarm/Leak": (spb.DOUBLE, "L/min", ("leak_lpm",)),
-    "Alarm/Leak Low": (spb.DOUBLE, "L/min", ("leak_interval_lpm", "0")),
-    "Alarm/Leak High": (spb.DOUBLE, "L/min", ("leak_interval_lpm", "1")),
-    "Alarm/Onset": (spb.DOUBLE, "s", ("onset_s",)),
-    "Alarm/Raised": (spb.DOUBLE, "s", ("raised_s",)),
-    "Alarm/Cause": (spb.STRING, None, ("cause",)),
-    "Alarm/Evidence": (spb.STRING, None, ("evidence",)),
-    "Alarm/Next Check": (spb.STRING, None, ("next_check",)),
-    "Alarm/Mark": (spb.STRING, None, ("mark",)),
-    "Alarm/Reason": (spb.STRING, None, ("reason",)),
-    "Alarm/Shelved": (spb.BOOLEAN, None, ("shelved",)),
-}
-#: ... in an event.
-_EVENT: _Table = {
-    "Alarm/Event": (spb.STRING, None, ("event",)),
-    "Alarm/Event Number": (spb.UINT64, None, ("number",)),
-}
 
 
 class SparkplugNode:
@@ -87,8 +47,7 @@ class SparkplugNode:
         spb.payload_class()
         self._store, self._summaries, self._count = store, summaries, count
         self._settings, self._broker = settings, broker
-        name = f"{broker.client_id}-{settings.group}-{settings.node}"
-        self._client = client_of(name, broker.user, password, broker.tls, broker.ca_file)
+        self._client = client_of(broker, f"{broker.client_id}-{settings.group}-{settings.node}", password)
         self._client.on_pre_connect = self._before_connection
         self._client.on_connect = self._connected
         self._client.on_message = self._message
@@ -114,8 +73,26 @@ class SparkplugNode:
         except RuntimeError:
             self.close()
             raise
-        if self._client.is_connected():
-            self._send_what_is_due()
+        if not self._client.is_connected():
+            return
+        if self._due.is_set():
+            self._due.clear()
+            try:
+                self._bear()
+            except BaseException:
+                self._due.set()
+                raise
+        self._store.pass_on(_NAME, self._sent_event)
+        if time.monotonic() >= self._next:
+            self._next = time.monotonic() + self._settings.every_s
+            for actuator, summary in self._summaries().items():
+                if actuator not in self._shown:
+                    self._bear_device(actuator, summary, {})
+                    continue
+                shown, now = self._shown[actuator], _values("summary", summary)
+                changed = {name: value for name, value in now.items() if value != shown[name]}
+                if changed and self._send("DDATA", _metrics("summary", changed, _clock(summary["t"])), actuator):
+                    shown.update(changed)
 
     def end(self) -> None:
         """Send what is left, and end."""
@@ -140,7 +117,7 @@ class SparkplugNode:
         return spb.SparkplugMetric(spb.BIRTH_SEQUENCE, self._birth_number, spb.INT64)
 
     def _death(self) -> bytes:
-        return spb.encoded(spb.SparkplugPayload(_now(), (self._number(),)))
+        return spb.encoded(spb.SparkplugPayload(_clock(None), (self._number(),)))
 
     def _before_connection(self, client: Any, userdata: Any) -> None:
         """Set the will of the connection to come; its number is the one after that of the last birth."""
@@ -166,32 +143,11 @@ class SparkplugNode:
         if asked is not None and asked.value is True:
             self._due.set()
 
-    def _send_what_is_due(self) -> None:
-        """Send the births that are due, the events, and what has changed."""
-        if self._due.is_set():
-            self._due.clear()
-            try:
-                self._bear()
-            except BaseException:
-                self._due.set()
-                raise
-        self._store.pass_on(_NAME, self._sent_event)
-        if time.monotonic() >= self._next:
-            self._next = time.monotonic() + self._settings.every_s
-            for actuator, summary in self._summaries().items():
-                if actuator not in self._shown:
-                    self._bear_device(actuator, summary, {})
-                    continue
-                shown = self._shown[actuator]
-                changed = {name: value for name, value in _values(_STATE, summary).items() if value != shown[name]}
-                if changed and self._send("DDATA", _metrics(_STATE, changed, _clock(summary["t"])), actuator):
-                    shown.update(changed)
-
     def _sent_event(self, event: dict[str, Any]) -> bool:
         alarm, at = event["alarm"], _clock(event["t"])
         if alarm["actuator"] not in self._shown:  # it is no longer in the settings
             return True
-        metrics = _metrics(_ALARM, _values(_ALARM, alarm), at) + _metrics(_EVENT, _values(_EVENT, event), at)
+        metrics = _metrics("alarm", _values("alarm", alarm), at) + _metrics("event", _values("event", event), at)
         return self._send("DDATA", metrics, alarm["actuator"])
 
     def _bear(self) -> None:
@@ -206,46 +162,51 @@ class SparkplugNode:
             self._bear_device(actuator, summary, latest.get(actuator, {}))
 
     def _bear_device(self, actuator: str, summary: dict[str, Any], alarm: dict[str, Any]) -> None:
-        shown = _values(_STATE, summary)
-        metrics = _metrics(_STATE, shown, _clock(summary["t"]))
-        metrics += _metrics(_ALARM, _values(_ALARM, alarm), _clock(alarm.get("updated_s")))
-        metrics += _metrics(_EVENT, _values(_EVENT, {}), _now())
-        self._send("DBIRTH", metrics, actuator)
+        shown = _values("summary", summary)
+        metrics = _metrics("summary", shown, _clock(summary["t"]))
+        metrics += _metrics("alarm", _values("alarm", alarm), _clock(alarm.get("updated_s")))
+        self._send("DBIRTH", metrics + _metrics("event", _values("event", {}), _clock(None)), actuator)
         self._shown[actuator] = shown
 
     def _send(self, kind: str, metrics: list[spb.SparkplugMetric], actuator: str | None = None) -> bool:
         """Send a message with the next sequence number; return whether it went out."""
         self._seq = (self._seq + 1) % 256
         topic = self._topic(kind, None if actuator is None else topic_part(actuator))
-        payload = spb.SparkplugPayload(_now(), tuple(metrics), self._seq)
+        payload = spb.SparkplugPayload(_clock(None), tuple(metrics), self._seq)
         return published(self._client, topic, spb.encoded(payload), _SENT_S)
 
 
-def _now() -> int:
-    return round(1000.0 * time.time())
+@cache
+def _table(name: str) -> Mapping[str, Mapping[str, str]]:
+    """Return a table of metrics by name: type, unit and place of each."""
+    tables: dict[str, Any] = tomllib.loads(
+        (files("sealscope.monitor.outputs") / "sparkplug_node.toml").read_text("utf-8")
+    )
+    table: dict[str, dict[str, str]] = tables[name]
+    return table
 
 
 def _clock(t: float | None) -> int:
     """Return a clock of samples [s] in [ms]; where it does not count from 1970, the present."""
-    return round(1000.0 * t) if t is not None and 1e8 < t < 1e11 else _now()
+    return round(1000.0 * (t if t is not None and 1e8 < t < 1e11 else time.time()))
 
 
-def _values(table: _Table, values: Mapping[str, Any]) -> dict[str, Any]:
+def _values(table: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values of a table's metrics, None where there is none."""
     known: dict[str, Any] = {}
-    for name, (_, _, path) in table.items():
+    for name, row in _table(table).items():
         value: Any = values
-        for part in path:
+        for part in row["at"].split("."):
             if value is not None:
                 value = value.get(part) if isinstance(value, Mapping) else value[int(part)]
         known[name] = value
     return known
 
 
-def _metrics(table: _Table, values: Mapping[str, Any], at: int) -> list[spb.SparkplugMetric]:
+def _metrics(table: str, values: Mapping[str, Any], at: int) -> list[spb.SparkplugMetric]:
     """Return metrics of a table with their values, of the time `at` [ms]."""
-    kinds = {name: table[name] for name in values}
+    rows = {name: _table(table)[name] for name in values}
     return [
-        spb.SparkplugMetric(name, values[name], kind, timestamp=at, unit=unit)
-        for name, (kind, unit, _) in kinds.items()
+        spb.SparkplugMetric(name, values[name], getattr(spb, row["type"]), timestamp=at, unit=row.get("unit"))
+        for name, row in rows.items()
     ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -81,28 +82,28 @@ class LiveSamples:
     def looked_at(self, name: str) -> Iterator[bool]:
         """Keep the samples of an actuator meanwhile; False where too many others are looked at."""
         with self._lock:
-            if name not in self._windows and len(self._windows) >= MOST_ACTUATORS:
-                admitted = False
-            else:
-                admitted = True
+            first = name not in self._windows
+            admitted = not first or len(self._windows) < MOST_ACTUATORS
+            if admitted:
                 self._lookers[name] += 1
-                first = name not in self._windows
                 window = self._windows.setdefault(name, _Window())
+        if not admitted:
+            yield False
+            return
         try:
-            if admitted and first:
+            if first:
                 with suppress(Exception):  # what comes from now on is shown without what is stored
                     stored = self._recall(name)
                     with self._lock:
                         if not window.version:  # else newer samples have come meanwhile
                             for samples in stored:
                                 window.add(samples)
-            yield admitted
+            yield True
         finally:
-            if admitted:
-                with self._lock:
-                    self._lookers[name] -= 1
-                    if not self._lookers[name]:
-                        del self._lookers[name], self._windows[name]
+            with self._lock:
+                self._lookers[name] -= 1
+                if not self._lookers[name]:
+                    del self._lookers[name], self._windows[name]
 
     def take(self, name: str, samples: Recording | None) -> None:
         """Take samples of an actuator as they come; nothing is done where nobody looks."""
@@ -146,9 +147,8 @@ class LiveSamples:
 
 def _plain(values: Array, digits: int = 3) -> list[float | None]:
     """Return numbers of so many decimals, None for what is none."""
-    known = np.isfinite(values)
-    rounded = np.round(np.where(known, values, 0.0), digits).tolist()
-    return rounded if known.all() else [value if kept else None for value, kept in zip(rounded, known, strict=True)]
+    rounded = np.round(values, digits)
+    return [value if math.isfinite(value) else None for value in rounded.tolist()]
 
 
 def _envelope(t: Array, series: dict[str, Array]) -> dict[str, list[float | None]]:
@@ -157,14 +157,12 @@ def _envelope(t: Array, series: dict[str, Array]) -> dict[str, list[float | None
     if size <= 2:
         return {"t": _plain(t, 4), **{name: _plain(values) for name, values in series.items()}}
     count = t.size // size
-    cut = slice(t.size - count * size, None)
-    times = t[cut].reshape(count, size)[:, [0, size // 2]].ravel()
-    drawn: dict[str, list[float | None]] = {"t": _plain(times, 4)}
-    for name, values in series.items():
-        bins = values[cut].reshape(count, size)
-        low, high = bins.min(axis=1), bins.max(axis=1)
-        rising = (bins.argmin(axis=1) < bins.argmax(axis=1))[:, None]
-        drawn[name] = _plain(np.where(rising, np.stack([low, high], 1), np.stack([high, low], 1)).ravel())
+    bins = {name: values[t.size - count * size :].reshape(count, size) for name, values in {**series, "t": t}.items()}
+    drawn = {"t": _plain(bins.pop("t")[:, [0, size // 2]].ravel(), 4)}
+    for name, values in bins.items():
+        ends = np.stack([values.min(axis=1), values.max(axis=1)], axis=1)
+        rising = (values.argmin(axis=1) < values.argmax(axis=1))[:, None]
+        drawn[name] = _plain(np.where(rising, ends, ends[:, ::-1]).ravel())
     return drawn
 
 

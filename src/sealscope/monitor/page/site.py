@@ -11,7 +11,7 @@ import math
 import re
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from importlib import resources
 from typing import Any
 from urllib.parse import parse_qs
@@ -28,19 +28,18 @@ from starlette.routing import Route
 
 from sealscope.errors import InputError
 from sealscope.monitor.actuators import WatchedActuators
+from sealscope.monitor.alarms import ranked
 from sealscope.monitor.memory.store import away
 from sealscope.monitor.outputs.prometheus import CONTENT_TYPE, metrics_text
-from sealscope.monitor.page.admission import Admission
-from sealscope.monitor.page.connections import BACKLOG, limited_protocol, most_connections
+from sealscope.monitor.page.guard import BACKLOG, Admission, limited_protocol, most_connections
 from sealscope.monitor.page.live import DRAWN, PRESSURES, LiveSamples, machine_of
-from sealscope.monitor.page.ranking import ranked
 from sealscope.monitor.settings import PageSettings, secret_of
-from sealscope.monitor.supervisor import DATABASE, Supervisor
+from sealscope.monitor.supervisor import DATABASE
 from sealscope.reporting.template import packaged
 from sealscope.storage.plain_values import parse_json
 
-#: Largest body of a request [bytes], and most listeners at a time.
-_LARGEST_BODY, _MOST_LISTENERS = 10_000, 200
+#: Largest body of a request [bytes], how long it may take to come [s], and most listeners at a time.
+_LARGEST_BODY, _BODY_S, _MOST_LISTENERS = 10_000, 10.0, 200
 #: How often listeners are served [s], those who look at an actuator with its last samples too, and how often they get a
 #: sign of life without news.
 _LOOK_S, _ALIVE_S = 0.3, 15.0
@@ -52,8 +51,6 @@ _HEADERS = {
     "Cache-Control": "no-store",
 }
 _HOURS = re.compile(r"[0-9]{1,8}(\.[0-9]{1,8})?")
-#: How long a request may take to send its body [s].
-_BODY_S = 10.0
 #: When to ask again [s].
 _LATER = {"Retry-After": "5"}
 _COOKIE = "sealscope"
@@ -61,11 +58,8 @@ _LOCAL = ("127.0.0.1", "localhost", "::1")
 #: Address -> file and kind of what the page is made of.
 _FILES = {
     "/": ("page.html", "text/html"),
-    "/page.js": ("page.js", "text/javascript"),
-    "/live.js": ("live.js", "text/javascript"),
-    "/twin.js": ("twin.js", "text/javascript"),
-    "/page.css": ("page.css", "text/css"),
-    "/login.css": ("page.css", "text/css"),
+    **{f"/{name}": (name, "text/javascript") for name in ("page.js", "live.js", "twin.js")},
+    **dict.fromkeys(("/page.css", "/login.css"), ("page.css", "text/css")),
     "/uPlot.js": ("vendor/uPlot.iife.min.js", "text/javascript"),
     "/uPlot.css": ("vendor/uPlot.min.css", "text/css"),
 }
@@ -108,6 +102,7 @@ class _Pages:
 
     def __init__(self, actuators: WatchedActuators, token: str | None, waits: Waits, live: LiveSamples) -> None:
         self._actuators, self._store, self._waits, self._live = actuators, actuators.store, waits, live
+        self._supervisor = actuators.supervisor
         self._machines = {name: machine_of(settings.rig) for name, settings in actuators.settings.items()}
         self._listeners, self._most_listeners = 0, min(_MOST_LISTENERS, most_connections() // 2)
         self._admission = None if token is None else Admission(token)
@@ -118,8 +113,8 @@ class _Pages:
 
     def _known(self) -> dict[str, Any]:
         """Return what is known without the database."""
-        own = self._actuators
-        return {"counters": own.counters, "waiting": self._waits()[0], "outages": own.outages.plain()}
+        counters, outages = self._actuators.counters, self._supervisor.outages()
+        return {"counters": counters, "waiting": self._waits()[0], "outages": outages}
 
     def fleet(self, request: Request) -> Response:
         rows = ranked(self._actuators.plain(), self._store.alarms(open_only=True))
@@ -131,12 +126,18 @@ class _Pages:
         summary = self._actuators.plain().get(name)
         if summary is None:
             return _refusal("no such actuator", 404)
-        seconds = float(span) * 3600.0 if _HOURS.fullmatch(span) else None
-        life: dict[str, Any] = {"name": name, "summary": summary, "machine": self._machines[name]}
-        life |= {"course": self._store.course(name, seconds=seconds), "events": self._store.last_events(name)}
         settings = self._actuators.settings[name]
-        life["limit_lpm"] = settings.error_lpm or settings.warning_lpm or None
-        return JSONResponse({**life, "alarms": self._store.alarms(actuator=name)[:50]})
+        seconds = float(span) * 3600.0 if _HOURS.fullmatch(span) else None
+        life = {
+            "name": name,
+            "summary": summary,
+            "machine": self._machines[name],
+            "course": self._store.course(name, seconds=seconds),
+            "events": self._store.last_events(name),
+            "limit_lpm": settings.error_lpm or settings.warning_lpm or None,
+            "alarms": self._store.alarms(actuator=name)[:50],
+        }
+        return JSONResponse(life)
 
     async def mark(self, request: Request) -> Response:
         if request.headers.get("x-sealscope") != "mark":  # no form of another site can send it
@@ -191,15 +192,14 @@ class _Pages:
         return Response(self._measured(self._actuators.plain()), media_type=CONTENT_TYPE)
 
     def _measured(self, summaries: Mapping[str, Mapping[str, Any]]) -> str:
-        own = self._actuators
-        return metrics_text(summaries, own.counters, own.outages.totals(), self._waits())
+        return metrics_text(summaries, self._actuators.counters, self._supervisor.totals(), self._waits())
 
     async def not_answering(self, request: Request, error: Exception) -> Response:
         """Say in the form that was asked for that the database is away, and what is known without it."""
         reason = away(error)
         if reason is None:
             raise error
-        self._actuators.outages.lost(DATABASE, reason)
+        self._supervisor.part(DATABASE).lost(reason)
         text = f"the database does not answer: {reason}"
         if request.url.path == "/metrics":
             return Response(f"# {text}\n{self._measured({})}", 503, {**_LATER, "Content-Type": CONTENT_TYPE})
@@ -210,10 +210,9 @@ class _Pages:
         if request.method == "POST" and admission is not None:
             if wait := admission.pause_s(address):
                 return _later(wait)
-            try:
+            given = ""
+            with suppress(InputError, TimeoutError):
                 given = parse_qs((await _body(request)).decode("utf-8", "replace")).get("token", [""])[0]
-            except (InputError, TimeoutError):
-                given = ""
             if admission.admits(address, given):
                 answer = RedirectResponse("/", 303)
                 secure, longest = request.url.scheme == "https", 30 * 86_400
@@ -300,7 +299,6 @@ class PageServer:
         self,
         actuators: WatchedActuators,
         settings: PageSettings,
-        supervisor: Supervisor,
         waits: Waits = lambda: (0, 0, 0),
         live: LiveSamples | None = None,
     ) -> None:
@@ -311,7 +309,7 @@ class PageServer:
         self.port = int(self._socket.getsockname()[1])
         self.address = f"http://{settings.host}:{self.port}/"
         self._server: uvicorn.Server | None = None
-        self._thread = supervisor.start("page", self._serve)
+        self._thread = actuators.supervisor.start("page", self._serve)
 
     def _opened(self) -> socket.socket:
         try:

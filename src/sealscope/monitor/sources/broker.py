@@ -1,14 +1,9 @@
 """Blocks from an MQTT 5 broker, acknowledged when they are stored; alarms to it, retained.
 
-The session outlives the connection (QoS 1, no clean start), so the broker keeps what comes while the monitor is away.
-A message is acknowledged after its block is in the database: what was in flight at a crash comes again, and is known by
-its identity.
-
-The thread of the connection only takes messages in; another one decodes them and hands them over, and waits where the
-service does. So the connection stays alive while the database is away. Of QoS 0 those messages are dropped and counted
-for which there is no room. Of QoS 1 the broker sends no more than agreed and keeps the rest; where it sends more (as
-mosquitto 2.0.11 does after an acknowledgement) and there is no room, that one and all after it are left to the broker,
-which sends them again, in their order, over a new connection.
+The session outlives the connection (QoS 1, no clean start): what was in flight at a crash comes again, and is known by
+its identity. The thread of the connection only takes messages in; another one decodes them and waits where the service
+does. Of QoS 0 those are dropped and counted for which there is no room. Where a broker sends more of QoS 1 than agreed
+(as mosquitto 2.0.11 does), that one and all after it are left to it, and come again in order over a new connection.
 """
 
 from __future__ import annotations
@@ -26,7 +21,7 @@ from typing import Any
 
 from sealscope.monitor.mqtt_client import KEEP_ALIVE_S, check_mqtt, check_running, client_of, published
 from sealscope.monitor.settings import BrokerSettings, secret_of, topic_part
-from sealscope.monitor.sources.source_block import BlockReceiver, RefusedMessage, SourceBlock, decoded
+from sealscope.monitor.sources.source_block import BlockReceiver, RefusedMessage, decoded
 from sealscope.monitor.sources.sparkplug_host import SparkplugHost
 from sealscope.monitor.sparkplug import NAMESPACE
 from sealscope.monitor.supervisor import BROKER
@@ -59,16 +54,15 @@ class _Connection:
     """The connection of a service to its broker."""
 
     def __init__(self, settings: BrokerSettings, password: str | None, service: BlockReceiver) -> None:
-        self._settings, self._service = settings, service
+        self._settings, self._service, share = settings, service, service.settings.share
+        self._broker = service.supervisor.part(BROKER)
         self._names = {actuator.topic: actuator.name for actuator in service.settings.actuator if actuator.topic}
-        share = service.settings.share
         name = settings.client_id if share is None else f"{settings.client_id}-{share.name}"  # a session of its own
-        self._client = client_of(name, settings.user, password, settings.tls, settings.ca_file)
+        self._client = client_of(settings, name, password)
         self._host: SparkplugHost | None = None
         if any(actuator.sparkplug is not None for actuator in service.settings.actuator):
-            self._host = SparkplugHost(service.settings.actuator, self._send, service.count)
-        self._online = 0
-        self._connection = 0
+            self._host = SparkplugHost(service.settings.actuator, self._client.publish, service.count)
+        self._online = self._connection = 0
         self._refusing = -1  # the connection whose further messages are left to the broker
         self._to_close: Any = None  # the line of that connection
         self._ended = threading.Event()
@@ -91,13 +85,10 @@ class _Connection:
         properties.SessionExpiryInterval = _SESSION_S
         properties.ReceiveMaximum = _IN_FLIGHT
         properties.MaximumPacketSize = _LARGEST
-        self._service.outages.expect(BROKER)
-        self._client.connect_async(
-            self._settings.host, self._settings.port, KEEP_ALIVE_S, clean_start=False, properties=properties
-        )
-        supervisor = self._service.supervisor
-        decoding = supervisor.start("MQTT decoder", self._decode)
-        alarms = supervisor.part("MQTT alarms")
+        place = self._settings.host, self._settings.port
+        self._client.connect_async(*place, KEEP_ALIVE_S, clean_start=False, properties=properties)
+        decoding = self._service.supervisor.start("MQTT decoder", self._decode)
+        alarms = self._service.supervisor.part("MQTT alarms")
         self._client.loop_start()
         try:
             while not self._service.stopping.wait(0.2):
@@ -116,18 +107,15 @@ class _Connection:
     def _connected(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
         self._connection += 1
         if reason.is_failure:
-            self._service.outages.lost(BROKER, f"{self._settings.host} refuses the connection: {reason}")
+            self._broker.lost(f"{self._settings.host} refuses the connection: {reason}")
             return
-        self._service.outages.back(BROKER)
+        self._broker.back()
         self._states.clear()
-        for topic in self._names:
-            client.subscribe(topic, qos=1)
         if self._settings.host_id is not None:
             self._say_state(online=True)
-        if self._host is not None:
-            for topic in self._host.topics:
-                client.subscribe(topic, qos=1)
-            self._arrived.put((self._connection, None), 0, always=True)
+        for topic in (*self._names, *(self._host.topics if self._host is not None else ())):
+            client.subscribe(topic, qos=1)
+        self._arrived.put((self._connection, None), 0, always=True)
 
     def _before_connection(self, client: Any, userdata: Any) -> None:
         """Set the will of a primary host of Sparkplug; it has the time of the connection to come."""
@@ -142,16 +130,16 @@ class _Connection:
     def _say_state(self, *, online: bool) -> None:
         self._client.publish(*self._state(online=online), qos=1, retain=True)
 
-    def _send(self, topic: str, payload: bytes) -> None:
-        self._client.publish(topic, payload, qos=0)
-
     def _lost(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
         if not self._service.stopping.is_set() and self._refusing != self._connection:
-            self._service.outages.lost(BROKER, f"the connection to {self._settings.host} is lost: {reason}")
+            self._broker.lost(f"the connection to {self._settings.host} is lost: {reason}")
 
     def _unreached(self, client: Any, userdata: Any) -> None:
-        place = f"no connection to {self._settings.host}:{self._settings.port}"
-        self._service.outages.lost(BROKER, place + _why(sys.exc_info()[1]))  # paho calls while it handles the error
+        error = sys.exc_info()[1]  # paho calls while it handles the error
+        reason = " ".join(str(getattr(error, "strerror", None) or error or "").split())[:120]
+        if isinstance(error, ssl.SSLCertVerificationError):
+            reason = f"its certificate is not trusted ({error.verify_message})"
+        self._broker.lost(f"no connection to {self._settings.host}:{self._settings.port}: {reason}".removesuffix(": "))
 
     def _message(self, client: Any, userdata: Any, message: Any) -> None:
         """Take a message in; must not wait, for the connection would be lost meanwhile."""
@@ -191,22 +179,18 @@ class _Connection:
             if qos and connection == self._connection:
                 self._client.ack(number, qos)
 
+        topic, block = "", None
         try:
-            topic = message.topic
-        except UnicodeDecodeError:
-            topic = ""
-        block: SourceBlock | RefusedMessage | None
-        try:
+            with suppress(UnicodeDecodeError):
+                topic = message.topic
             if self._host is None or not topic.startswith(f"{NAMESPACE}/"):
                 block = decoded(message.payload, self._names.get(topic), done)
             else:
                 block = self._host.taken(topic, message.payload, done)
         except RefusedMessage as error:  # it would be no better a second time: it is kept, and acknowledged
-            block = RefusedMessage(error.reason, f"{topic[:100]}: {error}", message.payload, done)
-        if block is None:
-            done()
+            self._service.hand(RefusedMessage(error.reason, f"{topic[:100]}: {error}", message.payload, done))
         else:
-            self._service.hand(block)
+            done() if block is None else self._service.hand(block)
 
     def _pass_on(self) -> None:
         """Publish the alarms of new events, and the states that have changed, each retained."""
@@ -218,8 +202,8 @@ class _Connection:
         )
         if time.monotonic() >= self._states_due:
             self._states_due = time.monotonic() + _STATES_S
-            for name, values in self._service.states().items():
-                state = json.dumps(values)
+            for name, summary in self._service.plain().items():
+                state = json.dumps(summary["state"])
                 if self._states.get(name) != state and self._published(name, "state", state):
                     self._states[name] = state
 
@@ -227,11 +211,3 @@ class _Connection:
         """Publish a retained message of an actuator; return whether the broker has it."""
         topic = f"{self._settings.alarms_topic}/{topic_part(actuator)}/{what}"
         return published(self._client, topic, message, _SENT_S, qos=1, retain=True)
-
-
-def _why(error: BaseException | None) -> str:
-    """Return the reason of an error in a few words after a colon, "" where there is none."""
-    if isinstance(error, ssl.SSLCertVerificationError):
-        return f": its certificate is not trusted ({error.verify_message})"
-    reason = " ".join(str(getattr(error, "strerror", None) or error or "").split())[:120]
-    return f": {reason}" if reason else ""

@@ -13,11 +13,11 @@ from stat import S_ISREG
 import numpy as np
 
 from sealscope.errors import SealscopeError
+from sealscope.monitor.settings import ActuatorSettings
 from sealscope.monitor.sources.source_block import UNREADABLE_FILE, BlockReceiver, RefusedMessage, SourceBlock
 from sealscope.monitor.supervisor import DATABASE, PartAway, place_of
 from sealscope.parameters import load_rig
 from sealscope.recordings import Recording, read
-from sealscope.recordings.formats.columns import ChannelMap
 from sealscope.recordings.oil import oil_temperature
 
 _log = logging.getLogger(__name__)
@@ -32,27 +32,19 @@ _AHEAD_S = 60.0
 
 
 class WatchedFolder:
-    """The recordings of one actuator in a folder.
+    """The recordings of one actuator in its folder.
 
-    `pattern`: names of the files, such as ``*.csv``; `settle_s`: a file is read when its size and time have not changed
-    for so long [s]; `known`: whether a block with an identity is stored already; `channel_map`: channel -> column.
+    `settle_s`: a file is read when its size and time have not changed for so long [s]; `known`: whether a block with an
+    identity is stored already.
     """
 
-    def __init__(
-        self,
-        actuator: str,
-        folder: Path,
-        pattern: str,
-        settle_s: float,
-        known: Callable[[str, str], bool],
-        channel_map: ChannelMap | None = None,
-    ) -> None:
-        self.actuator, self.folder, self.pattern, self.settle_s = actuator, folder, pattern, settle_s
-        self._known, self._channel_map = known, channel_map
-        self._handed: set[str] = set()
-        self._met: dict[str, float] = {}
-        self._tried: set[str] = set()
-        self._led_out: set[str] = set()
+    def __init__(self, settings: ActuatorSettings, settle_s: float, known: Callable[[str, str], bool]) -> None:
+        assert settings.folder is not None
+        self.actuator, self.folder, self.pattern = settings.name, settings.folder, settings.pattern
+        self.settle_s, self._known = settle_s, known
+        self._channel_map = settings.map or load_rig(settings.rig).channel_map or None
+        self._met: dict[str, float] = {}  # clock at which a file was met [s]
+        self._handed, self._tried, self._outside = set[str](), set[str](), set[str]()
 
     def blocks(self) -> Iterator[SourceBlock | RefusedMessage]:
         """Yield the blocks of the files that are whole and not stored yet.
@@ -76,14 +68,14 @@ class WatchedFolder:
                 continue
             try:
                 samples = _on_the_clock(read(path, map=self._channel_map), at)
-            except (SealscopeError, OSError, MemoryError) as error:
-                self._tried.add(identity)
-                if patient:
-                    continue
-                yield RefusedMessage(UNREADABLE_FILE, f"{self.actuator}: {_shown(str(error)) or type(error).__name__}")
-                samples = None
-            except Exception as error:  # what no reader foresees: it would be no better a second time
-                yield RefusedMessage(UNREADABLE_FILE, f"{self.actuator}: {_shown(path.name)}: {place_of(error)}")
+            except Exception as error:
+                reason = f"{_shown(path.name)}: {place_of(error)}"
+                if isinstance(error, (SealscopeError, OSError, MemoryError)):  # what is foreseen may be better later
+                    self._tried.add(identity)
+                    if patient:
+                        continue
+                    reason = _shown(str(error)) or type(error).__name__
+                yield RefusedMessage(UNREADABLE_FILE, f"{self.actuator}: {reason}")
                 samples = None
             if samples is not None and at > time.time() + _AHEAD_S:
                 _log.warning("%s: %s is dated in the future", self.actuator, _shown(path.name))
@@ -101,9 +93,9 @@ class WatchedFolder:
                 continue
             try:
                 if path.is_symlink() and not path.resolve().is_relative_to(root):
-                    if path.name not in self._led_out:  # said once: what is there is nobody's recording
+                    if path.name not in self._outside:  # said once: what is there is nobody's recording
                         _log.warning("%s: %s is a link out of the folder", self.actuator, _shown(path.name))
-                    self._led_out.add(path.name)
+                    self._outside.add(path.name)
                     continue
                 status = path.stat()
             except (OSError, RuntimeError):  # gone meanwhile, or links in a circle
@@ -114,27 +106,24 @@ class WatchedFolder:
 
 def folders_of(service: BlockReceiver, *, once: bool) -> None:
     """Hand over what appears in the folders of a service's actuators; `once`: what is there now."""
-    settings = service.settings
+    settle_s, part = 0.0 if once else service.settings.settle_s, service.supervisor.part
     folders = {
-        service.supervisor.part(f"folder of {each.name}"): WatchedFolder(
-            *(each.name, each.folder, each.pattern, 0.0 if once else settings.settle_s),
-            *(service.store.is_known, each.map or load_rig(each.rig).channel_map or None),
-        )
-        for each in settings.actuator
+        part(f"folder of {each.name}"): WatchedFolder(each, settle_s, service.store.is_known)
+        for each in service.settings.actuator
         if each.folder is not None
     }
+
+    def hand_over(folder: WatchedFolder) -> None:
+        for block in folder.blocks():
+            if service.stopping.is_set():
+                return
+            service.hand(block)
+
     while not service.stopping.is_set():
-        done = [part.attempt(partial(_hand_over, service, folder)) for part, folder in folders.items()]
-        if once and (all(done) or DATABASE not in {outage["part"] for outage in service.outages.plain()}):
+        done = [own.attempt(partial(hand_over, folder)) for own, folder in folders.items()]
+        if once and (all(done) or part(DATABASE).since is None):
             return
         service.stopping.wait(_LOOK_S)
-
-
-def _hand_over(service: BlockReceiver, folder: WatchedFolder) -> None:
-    for block in folder.blocks():
-        if service.stopping.is_set():
-            return
-        service.hand(block)
 
 
 def _shown(name: str) -> str:

@@ -2,7 +2,6 @@
 
 A source that sends what changes (OPC UA) says nothing of a channel that stays as it is: a sample that is missing has
 the value before it. A block ends where every channel is known; one that says nothing for `SILENT_S` stays as it is.
-So the channels may come one after the other, each with the values of some time, as they do after a delay.
 """
 
 from __future__ import annotations
@@ -78,13 +77,12 @@ class ValueGatherer:
             self._count("values without a clock, or too many")
             return []
         first, own = round(t * self.rate), self._channels[channel]
-        if (
-            self._newest is not None and first - self._newest > self._ahead
-        ):  # after a pause, with the values as they are
+        apart = 0 if self._newest is None else first - self._newest
+        if apart > self._ahead:  # after a pause, with the values as they are
             held = {name: _Channel(held=each.last(), heard=each.heard) for name, each in self._channels.items()}
             self.interrupted()
             self._channels = held
-        elif self._newest is not None and self._newest - first > self._ahead:
+        elif apart < -self._ahead:
             if own.last() is None:  # it has not changed for long
                 own.held, own.heard = values[-1], self._now()
                 return self._whole_blocks()
@@ -113,8 +111,7 @@ class ValueGatherer:
             # every channel has a value from there on
             unknown = [min(each.values) for each in channels if each.held is None]
             self._start = max(unknown) if unknown else min(min(each.values) for each in channels if each.values)
-        recent = self._now() - SILENT_S
-        newest = [each.newest for each in channels if each.heard >= recent]
+        newest = [each.newest for each in channels if each.heard >= self._now() - SILENT_S]
         if not newest or None in newest:
             return []
         blocks: list[Recording] = []
@@ -122,8 +119,7 @@ class ValueGatherer:
         while known - self._start >= self._length:
             clock = np.arange(self._start, self._start + self._length)
             samples = {name: each.taken(clock[0], clock[-1] + 1) for name, each in self._channels.items()}
-            blocks.append(
-                Recording(clock / self.rate, samples, {name: CHANNEL_UNITS[name] for name in samples}, self.rate)
-            )
+            units = {name: CHANNEL_UNITS[name] for name in samples}
+            blocks.append(Recording(clock / self.rate, samples, units, self.rate))
             self._start += self._length
         return blocks

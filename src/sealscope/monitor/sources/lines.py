@@ -2,41 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import BinaryIO
 
-from sealscope.monitor.sources.source_block import (
-    LARGEST,
-    OVERSIZED,
-    BlockReceiver,
-    RefusedMessage,
-    SourceBlock,
-    decoded,
-)
+from sealscope.monitor.sources.source_block import LARGEST, OVERSIZED, BlockReceiver, RefusedMessage, decoded
 
 
 def lines_of(stream: BinaryIO) -> Callable[[BlockReceiver], None]:
-    """Return the source of a stream's lines."""
+    """Return the source of a stream's lines; empty ones are passed over."""
 
     def hand_lines(service: BlockReceiver) -> None:
-        for block in _blocks(stream):
-            service.hand(block)
-            if service.stopping.is_set():
-                return
+        while not service.stopping.is_set() and (line := stream.readline(LARGEST + 1)):
+            if len(line) > LARGEST:
+                refused = RefusedMessage(OVERSIZED, f"a line must have at most {LARGEST} bytes, got more", line)
+                while line and not line.endswith(b"\n"):
+                    line = stream.readline(LARGEST)
+                service.hand(refused)
+            elif line := line.strip():
+                try:
+                    service.hand(decoded(line))
+                except RefusedMessage as error:
+                    service.hand(RefusedMessage(error.reason, error, line))
 
     return hand_lines
-
-
-def _blocks(stream: BinaryIO) -> Iterator[SourceBlock | RefusedMessage]:
-    """Yield the block of every line, or the error where a line holds none; empty lines are passed over."""
-    while line := stream.readline(LARGEST + 1):
-        if len(line) > LARGEST:
-            refused = RefusedMessage(OVERSIZED, f"a line must have at most {LARGEST} bytes, got more", line)
-            while line and not line.endswith(b"\n"):
-                line = stream.readline(LARGEST)
-            yield refused
-        elif line := line.strip():
-            try:
-                yield decoded(line)
-            except RefusedMessage as error:
-                yield RefusedMessage(error.reason, error, line)

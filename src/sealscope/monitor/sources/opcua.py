@@ -10,10 +10,9 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Callable
-from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
-from queue import Empty, Full, Queue
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -21,13 +20,14 @@ import numpy as np
 from sealscope.errors import MissingExtra
 from sealscope.monitor.settings import OpcUaSettings, secret_of
 from sealscope.monitor.sources.gathering import ValueGatherer
-from sealscope.monitor.sources.source_block import BlockReceiver, SourceBlock, digest_of
+from sealscope.monitor.sources.source_block import BlockReceiver, SourceBlock, bytes_of, digest_of
 from sealscope.monitor.supervisor import OPCUA, PartAway
-from sealscope.recordings.recording import CHANNEL_UNITS, Recording
+from sealscope.monitor.waiting import Waiting
+from sealscope.recordings.recording import CHANNEL_UNITS
 from sealscope.units import to_si
 
-#: Publications in a block, and blocks that wait for the service; more are dropped and counted.
-_PUBLICATIONS, _ROOM = 4, 256
+#: Publications in a block, and blocks that wait for the service and their bytes; more are dropped and counted.
+_PUBLICATIONS, _ROOM, _ROOM_BYTES = 4, 256, 64_000_000
 #: How often the connection is looked at [s].
 _LOOK_S = 0.5
 _NO_ROOM = "blocks of OPC UA that found no room"
@@ -36,10 +36,8 @@ _NO_NUMBER = "OPC UA values that are no number"
 
 def opcua_of(settings: OpcUaSettings) -> Callable[[BlockReceiver], None]:
     """Return the source of a server's values; raises InputError for a secret that cannot be read."""
-    try:
-        import asyncua  # noqa: F401 (asked for before the service starts)
-    except ImportError:
-        raise MissingExtra("OPC UA needs asyncua: pip install 'sealscope[opcua]'") from None
+    if find_spec("asyncua") is None:  # asked for before the service starts
+        raise MissingExtra("OPC UA needs asyncua: pip install 'sealscope[opcua]'")
     password = secret_of(settings.password_file, "opcua.password_file")
     return lambda service: _OpcUaSession(settings, password, service).run()
 
@@ -54,22 +52,19 @@ class _OpcUaSession:
         self._scales: dict[tuple[str, str], Callable[[Any], Any]] = {}
         self._actuators = [actuator for actuator in service.settings.actuator if actuator.nodes]
         for actuator in self._actuators:
-            assert actuator.rate is not None  # the settings are checked
-            self._gatherers[actuator.name] = ValueGatherer(
-                tuple(actuator.nodes), actuator.rate, settings.block_s, service.count
-            )
+            rate = float(actuator.rate or math.nan)  # the settings are checked
+            self._gatherers[actuator.name] = ValueGatherer(tuple(actuator.nodes), rate, settings.block_s, service.count)
             for channel in actuator.nodes:
-                unit = actuator.units.get(channel, CHANNEL_UNITS[channel])
-                scale = partial(to_si, unit=unit, si_unit=CHANNEL_UNITS[channel], name=channel)
-                scale(np.zeros(1))
+                si, unit = CHANNEL_UNITS[channel], actuator.units.get(channel)
+                scale = partial(to_si, unit=unit or si, si_unit=si, name=channel)
+                scale(np.zeros(1))  # raises InputError for a wrong unit
                 self._scales[actuator.name, channel] = scale
         self._channels: dict[Any, tuple[str, str]] = {}
-        self._waiting: Queue[SourceBlock] = Queue(_ROOM)
+        self._waiting: Waiting[SourceBlock] = Waiting(_ROOM, _ROOM_BYTES)
 
     def run(self) -> None:
         """Hand blocks over until the service stops; after a lost connection a new one is made."""
-        stopping, supervisor = self._service.stopping, self._service.supervisor
-        handing = supervisor.start("OPC UA blocks", self._hand)
+        stopping, handing = self._service.stopping, self._service.supervisor.start("OPC UA blocks", self._hand)
         while not stopping.wait(self._server.pause_s):
             self._server.attempt(lambda: asyncio.run(self._connect()))
             for gatherer in self._gatherers.values():
@@ -102,12 +97,12 @@ class _OpcUaSession:
                 self._channels.update({node.nodeid: (actuator.name, channel) for node, channel in nodes.items()})
                 rate = float(actuator.rate or 1.0)
                 answers = await subscription.subscribe_data_change(
-                    list(nodes), queuesize=math.ceil(2.0 * rate * self._settings.block_s), sampling_interval=1e3 / rate
+                    [*nodes], queuesize=math.ceil(2.0 * rate * self._settings.block_s), sampling_interval=1e3 / rate
                 )
                 for (node, channel), answer in zip(nodes.items(), answers, strict=True):
                     if not isinstance(answer, int):
                         raise ConnectionError(f"{actuator.name}: {channel} is no node, got {node.nodeid} ({answer})")
-            self._server.works()
+            self._server.back()
             while not self._service.stopping.is_set():
                 await client.check_connection()
                 await asyncio.sleep(_LOOK_S)
@@ -128,18 +123,12 @@ class _OpcUaSession:
             self._service.count(_NO_NUMBER)
             return
         for block in self._gatherers[name].take(channel, t, self._scales[name, channel](samples).tolist()):
-            try:
-                self._waiting.put_nowait(SourceBlock(name, _identity(block), block))
-            except Full:
+            identity = digest_of(np.concatenate([block.t, *block.channels.values()]).tobytes())  # twice is known
+            if not self._waiting.put(SourceBlock(name, identity, block), bytes_of(block)):
                 self._service.count(_NO_ROOM)
 
     def _hand(self) -> None:
         """Hand blocks to the service, which may wait, while the connection lives on."""
         while not self._service.stopping.is_set():
-            with suppress(Empty):
-                self._service.hand(self._waiting.get(timeout=_LOOK_S))
-
-
-def _identity(block: Recording) -> str:
-    """Return the digest of a block: what comes twice is known."""
-    return digest_of(np.concatenate([block.t, *block.channels.values()]).tobytes())
+            for block in self._waiting.take(1, _LOOK_S):
+                self._service.hand(block)

@@ -24,9 +24,8 @@ from sealscope.recordings.recording import Recording
 from sealscope.units import to_si
 
 if TYPE_CHECKING:
-    from sealscope.monitor.memory.store import MonitorStore
     from sealscope.monitor.settings import MonitorSettings
-    from sealscope.monitor.supervisor import Outages, Supervisor
+    from sealscope.monitor.supervisor import Supervisor
 
 #: Largest message [bytes], and most samples of a channel in it.
 LARGEST, MOST_SAMPLES = 16_000_000, 1_000_000
@@ -38,22 +37,21 @@ _KNOWN = {"actuator", "t", "rate", "units", "id", *CHANNELS}
 
 
 class BlockReceiver(Protocol):
-    """What a source hands its blocks to, as a service is."""
+    """What a source hands its blocks to, as a service is; `store` is its MonitorStore."""
 
     stopping: threading.Event
-    store: MonitorStore
+    store: Any
     settings: MonitorSettings
-    outages: Outages
     supervisor: Supervisor
 
     def hand(self, block: SourceBlock | RefusedMessage) -> None:
         """Take a block, or the error of a message that holds none; may wait."""
 
-    def count(self, reason: str) -> None:
+    def count(self, reason: str, number: int = 1) -> None:
         """Count something that was dropped."""
 
-    def states(self) -> dict[str, dict[str, Any]]:
-        """Return the state of NE 107 of each actuator as plain values."""
+    def plain(self) -> dict[str, dict[str, Any]]:
+        """Return what each actuator shows."""
 
 
 def nothing() -> None:
@@ -63,8 +61,8 @@ def nothing() -> None:
 class RefusedMessage(InputError):  # noqa: N818 (says what happened)
     """A message or a file holds no block.
 
-    `reason`: one of `REASONS`; `size` of its `contents`, of which the beginning is kept; `done`: called when that is
-    stored.
+    `reason`: one of `REASONS`; `size` of its `contents`, of which the `beginning` of so many `bytes` is kept; `done`:
+    called when that is stored.
     """
 
     def __init__(
@@ -73,6 +71,7 @@ class RefusedMessage(InputError):  # noqa: N818 (says what happened)
         super().__init__(message)
         self.reason, self.done = reason, done or nothing
         self.size, self.beginning = len(contents), contents[:_BEGINNING]
+        self.bytes = len(self.beginning)
 
     def row(self) -> dict[str, Any]:
         """Return it as a row of the table of what was refused; any database can hold its texts."""
@@ -124,6 +123,11 @@ class SourceBlock:
     follows: bool = True
     done: Callable[[], None] = nothing
 
+    @property
+    def bytes(self) -> int:
+        """About how many bytes its samples take."""
+        return 0 if self.samples is None else bytes_of(self.samples)
+
 
 @refusing()
 def decoded(payload: bytes, actuator: str | None = None, done: Callable[[], None] = nothing) -> SourceBlock:
@@ -141,10 +145,9 @@ def decoded(payload: bytes, actuator: str | None = None, done: Callable[[], None
     unknown = sorted(_brief(name) for name in values if name not in _KNOWN)
     if unknown:
         raise RefusedMessage(NO_MAPPING, f"a message must hold {', '.join(sorted(_KNOWN))}, got {unknown[0]!r}")
-    name = values.get("actuator", actuator)
+    name, units = values.get("actuator", actuator), values.get("units", {})
     if not isinstance(name, str) or (actuator is not None and name != actuator):
         raise RefusedMessage(WRONG_ACTUATOR, f"a message must name its actuator, got {_brief(name)!r}")
-    units = values.get("units", {})
     if not isinstance(units, Mapping):
         raise RefusedMessage(WRONG_UNITS, "a message's units must be a mapping")
     t, rate = _number(values, "t"), _number(values, "rate")
@@ -158,19 +161,20 @@ def decoded(payload: bytes, actuator: str | None = None, done: Callable[[], None
         raise RefusedMessage(NO_SAMPLES, f"channels must have equally many samples, 1 to {MOST_SAMPLES}")
     count = sizes.pop()
     for channel in SLOW & channels.keys():
-        if channels[channel].size == 1:
-            channels[channel] = np.full(count, channels[channel][0])
-        elif channels[channel].size != count:
+        if channels[channel].size not in (1, count):
             raise RefusedMessage(NO_SAMPLES, f"channel {channel} must have 1 or {count} samples")
+        channels[channel] = np.broadcast_to(channels[channel], count)
     with np.errstate(over="ignore"):  # times beyond floating point are dropped by the stream
-        clock = _kept(t + np.arange(count) / rate)
+        clock = t + np.arange(count) / rate
+    for array in (clock, *channels.values()):  # a Recording takes what is read-only without a copy
+        array.setflags(write=False)
     samples = Recording(clock, channels, {channel: CHANNEL_UNITS[channel] for channel in channels}, rate)
     return SourceBlock(name, _identity(values.get("id")) or digest_of(payload), samples, done=done)
 
 
-def bytes_of(samples: Recording | None) -> int:
+def bytes_of(samples: Recording) -> int:
     """Return about how many bytes samples take."""
-    return 0 if samples is None else 8 * len(samples) * (1 + len(samples.channels))
+    return 8 * len(samples) * (1 + len(samples.channels))
 
 
 def digest_of(payload: bytes) -> str:
@@ -180,7 +184,7 @@ def digest_of(payload: bytes) -> str:
 
 def _identity(given: Any) -> str:
     """Return the identity that a message states, "" where it states none; a database must be able to hold it."""
-    if given is None or given == "":
+    if given is None:
         return ""
     if isinstance(given, bool) or not isinstance(given, (str, int)):
         raise RefusedMessage(NO_CLOCK, f"id must be a text or a whole number, got {type(given).__name__}")
@@ -214,9 +218,8 @@ def _mapping(payload: bytes) -> Mapping[str, Any]:
         needed = f"a message needs {error.name}: pip install 'sealscope[serve,mqtt]'"
         raise RefusedMessage(UNREADABLE, needed) from None
     except Exception as error:  # a damaged message makes the libraries raise whatever they like
-        raise RefusedMessage(
-            UNREADABLE, f"a message must be JSON or CBOR: {' '.join(str(error).split())[:80]}"
-        ) from None
+        reason = " ".join(str(error).split())[:80]
+        raise RefusedMessage(UNREADABLE, f"a message must be JSON or CBOR: {reason}") from None
     if not isinstance(values, Mapping):
         raise RefusedMessage(NO_MAPPING, f"a message must be a mapping, got {type(values).__name__}")
     return values
@@ -237,21 +240,18 @@ def _channel(values: Any, name: str, units: Mapping[str, Any]) -> np.ndarray[Any
     if name in SLOW and isinstance(values, (int, float)) and not isinstance(values, bool):
         values = [values]
     kind = _TYPED.get(getattr(values, "tag", None) or 0)
-    if kind is not None:
-        if not isinstance(values.value, bytes) or len(values.value) % np.dtype(kind).itemsize:
-            raise RefusedMessage(NO_SAMPLES, f"channel {name} must be an array of whole numbers of its type")
-        values = np.frombuffer(values.value, dtype=kind)
-    elif not isinstance(values, (list, tuple)):
-        raise RefusedMessage(NO_SAMPLES, f"channel {name} must be a list of numbers, got {type(values).__name__}")
     try:
+        if kind is not None:
+            values = np.frombuffer(values.value, dtype=kind)
+        elif not isinstance(values, (list, tuple)):
+            raise TypeError
         array = np.array(values, dtype=np.float64)  # None becomes NaN
+        if array.ndim != 1 or np.isinf(array).any():
+            raise ValueError
     except (TypeError, ValueError, OverflowError):
-        raise RefusedMessage(NO_SAMPLES, f"channel {name} must be a list of numbers") from None
-    if array.ndim != 1:
-        raise RefusedMessage(NO_SAMPLES, f"channel {name} must be a list of numbers, got a list of lists")
-    if np.isinf(array).any():
-        raise RefusedMessage(NO_SAMPLES, f"channel {name} must have finite numbers, got infinity")
-    return _kept(in_si(array, units.get(name), name))
+        rule = f"channel {name} must be a list of finite numbers"
+        raise RefusedMessage(NO_SAMPLES, f"{rule}, or an array of whole numbers of its type") from None
+    return np.asarray(in_si(array, units.get(name), name))
 
 
 def in_si(values: Any, unit: object, channel: str) -> Any:
@@ -260,10 +260,3 @@ def in_si(values: Any, unit: object, channel: str) -> Any:
         return values if unit is None else to_si(values, _brief(unit), CHANNEL_UNITS[channel], name=channel)
     except InputError as error:
         raise RefusedMessage(WRONG_UNITS, error) from None
-
-
-def _kept(values: Any) -> np.ndarray[Any, Any]:
-    """Return an array that nobody else has, read-only, which a Recording takes without a copy."""
-    array = np.asarray(values)
-    array.setflags(write=False)
-    return array

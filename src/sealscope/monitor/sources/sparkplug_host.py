@@ -1,12 +1,8 @@
 """Blocks from edge nodes of Sparkplug B: births name the metrics, data bring the samples, deaths end it.
 
-A node or device of a node is an actuator, its metrics are the channels. A metric is an array of samples that begin at
-its time, or a single sample; metrics of one time belong together, and a single one that is left out is as it was, which
-is how nodes report by exception. Times are whole milliseconds; a block that follows the one before within that follows
-it exactly.
-
-The host asks a node to be born again when it does not know its birth, or when a sequence number is missing: then an
-alias may mean another metric, so metrics without a name are refused until the birth comes.
+A node or its device is an actuator, its metrics are the channels: arrays of samples from their time on, or single ones,
+of which those left out are as they were. Times are whole milliseconds; a block that follows the one before within that
+follows it exactly. After a missing sequence number an alias may mean another metric: it waits for the birth asked for.
 """
 
 from __future__ import annotations
@@ -59,12 +55,12 @@ class _Birth:
         """Return the birth of an actuator: a name counts with a unit in brackets behind it, too."""
         birth, wanted = cls(), {actuator.map.get(channel, channel): channel for channel in (*CHANNELS, _RATE)}
         for metric in metrics:
-            name = metric.name or ""
-            bracketed = _BRACKETED.fullmatch(name)
-            channel = wanted.get(name) or (wanted.get(bracketed["name"]) if bracketed else None)
+            name, unit = metric.name or "", metric.unit
+            channel, bracketed = wanted.get(name), _BRACKETED.fullmatch(name)
+            if bracketed is not None:
+                channel, unit = channel or wanted.get(bracketed["name"]), unit or bracketed["unit"]
             if channel is None:
                 continue
-            unit = metric.unit or (bracketed["unit"] if bracketed else None)
             birth.names[channel], birth.metrics[name] = name, replace(metric, unit=unit)
             if metric.alias is not None:
                 birth.aliases[metric.alias] = name
@@ -83,6 +79,15 @@ class _Birth:
         except ValueError as error:
             raise RefusedMessage(blocks.NO_SAMPLES, error) from None
         return replace(metric, name=name, unit=metric.unit or born.unit)
+
+    def rate(self, actuator: ActuatorSettings) -> float:
+        """Return the sampling rate [Hz]: that of the settings, else that of the metric."""
+        metric = self.metrics.get(self.names.get(_RATE))
+        rate = actuator.rate or (math.nan if metric is None else metric.value)
+        if not isinstance(rate, (int, float)) or not 0.0 < rate < math.inf:
+            rule = f"{actuator.name} must have a rate > 0 Hz, in its settings or as the metric {_RATE!r}"
+            raise RefusedMessage(blocks.NO_CLOCK, f"{rule}, got {str(rate)[:40]}")
+        return float(rate)
 
 
 @dataclass
@@ -104,7 +109,7 @@ class SparkplugHost:
     def __init__(
         self,
         actuators: Iterable[ActuatorSettings],
-        publish: Callable[[str, bytes], None],
+        publish: Callable[[str, bytes], object],
         count: Callable[[str], None],
     ) -> None:
         spb.payload_class()
@@ -164,8 +169,17 @@ class SparkplugHost:
                 raise RefusedMessage(blocks.STALE_DEATH, "a death must bear the bdSeq of the last birth")
             born = (number, payload.seq, True) if kind == "NBIRTH" else (None, None, False)
             state.births, (state.birth_sequence, state.seq, state.whole) = {}, born
+        elif state.seq is None:
+            self._ask(group, node)
+            raise RefusedMessage(blocks.UNBORN, f"a message of {group}/{node} must follow its birth")
+        elif payload.seq is None:
+            raise RefusedMessage(blocks.OUT_OF_SEQUENCE, f"a message of {group}/{node} must have a sequence number")
         else:
-            self._in_order(group, node, state, payload.seq)
+            if payload.seq != (state.seq + 1) % 256:
+                state.whole = False
+                self._count(GAPS)
+                self._ask(group, node)
+            state.seq = payload.seq
         actuator = self._actuators.get(path)
         if actuator is None or kind == "NDEATH":
             return None
@@ -179,24 +193,11 @@ class SparkplugHost:
         if birth is None:
             self._ask(group, node)
             raise RefusedMessage(blocks.UNBORN, f"data of {path} must follow its birth")
-        known = (birth.known(metric, whole=state.whole) for metric in payload.metrics)
+        known = [birth.known(metric, whole=state.whole) for metric in payload.metrics]
         samples = self._samples(actuator, birth, [metric for metric in known if metric is not None], payload.timestamp)
         if samples is None:
             return None
         return SourceBlock(actuator.name, digest_of(topic.encode() + b"\0" + data), samples, done=done)
-
-    def _in_order(self, group: str, node: str, state: _EdgeState, seq: int | None) -> None:
-        """Look at the sequence number; where some are missing the node is asked for its birth."""
-        if state.seq is None:
-            self._ask(group, node)
-            raise RefusedMessage(blocks.UNBORN, f"a message of {group}/{node} must follow its birth")
-        if seq is None:
-            raise RefusedMessage(blocks.OUT_OF_SEQUENCE, f"a message of {group}/{node} must have a sequence number")
-        if seq != (state.seq + 1) % 256:
-            state.whole = False
-            self._count(GAPS)
-            self._ask(group, node)
-        state.seq = seq
 
     def _samples(
         self, actuator: ActuatorSettings, birth: _Birth, metrics: list[spb.SparkplugMetric], sent: int | None
@@ -214,7 +215,7 @@ class SparkplugHost:
                 groups[at][by_name[name]] = metric
         if not groups:
             return None
-        rate, pieces = _rate(actuator, birth), []
+        rate, pieces = birth.rate(actuator), []
         for at in sorted(groups):
             piece = _piece(groups[at], birth, by_name)
             size = next(iter(piece.values())).size
@@ -244,19 +245,6 @@ class SparkplugHost:
         return np.asarray(first + np.arange(size) / rate)
 
 
-def _rate(actuator: ActuatorSettings, birth: _Birth) -> float:
-    """Return the sampling rate [Hz]: that of the settings, else that of the metric."""
-    metric = birth.metrics.get(birth.names.get(_RATE))
-    try:
-        rate = actuator.rate or spb.number_of(None if metric is None else metric.value)
-    except ValueError:
-        rate = math.nan
-    if not 0.0 < rate < math.inf:
-        rule = f"{actuator.name} must have a rate > 0 Hz, in its settings or as the metric {_RATE!r}"
-        raise RefusedMessage(blocks.NO_CLOCK, f"{rule}, got {rate:g}")
-    return rate
-
-
 def _piece(group: Mapping[str, spb.SparkplugMetric], birth: _Birth, by_name: Mapping[str, str]) -> dict[str, Array]:
     """Return the samples (n,) of the metrics of one time; a single one that is missing is as it was last."""
     if any(isinstance(metric.value, np.ndarray) for metric in group.values()):
@@ -266,11 +254,8 @@ def _piece(group: Mapping[str, spb.SparkplugMetric], birth: _Birth, by_name: Map
             raise RefusedMessage(blocks.NO_SAMPLES, "metrics of one time must be arrays of equally many numbers")
         return piece
     birth.metrics.update({metric.name: metric for metric in group.values()})
-    try:
-        return {
-            channel: np.array([spb.number_of(birth.metrics[name].value)])
-            for name, channel in by_name.items()
-            if channel not in SLOW and not isinstance(birth.metrics[name].value, np.ndarray)
-        }
-    except ValueError as error:
-        raise RefusedMessage(blocks.NO_SAMPLES, error) from None
+    known = {channel: birth.metrics[name].value for name, channel in by_name.items() if channel not in SLOW}
+    single = {channel: value for channel, value in known.items() if not isinstance(value, np.ndarray)}
+    if not all(isinstance(value, (int, float, type(None))) for value in single.values()):
+        raise RefusedMessage(blocks.NO_SAMPLES, "a single sample must be a number")
+    return {channel: np.array([math.nan if value is None else float(value)]) for channel, value in single.items()}

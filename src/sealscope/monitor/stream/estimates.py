@@ -1,36 +1,37 @@
-"""What a watch gives: an estimate of every block, and the leak that its tests show."""
+"""What a watch gives and compares with: an estimate of every block, the leak that its tests show, and the baseline.
+
+The baseline is learned over stated hours of healthy running, then frozen, with a version.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+from sealscope.diagnosis.beliefs import beliefs
+from sealscope.diagnosis.inference.live.sequential import Rise
+
+Interval = tuple[float, float]
+Duty = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class BlockEstimate:
     """What one block shows.
 
-    Parameters
-    ----------
-    number : int
-        Blocks so far, this one included.
-    t : float
-        End of the block [s].
-    status : str
-        "learning", "watched", "alarm", or why the block is not judged: "at standstill", "missing values", ...
-    total_lpm, total_interval_lpm : float and pair of floats, optional
-        Flow past pump and piston together, and its 95 % interval [L/min]; None where it is not known.
-    leak_lpm, leak_interval_lpm : float and pair of floats, optional
-        Flow beyond that of the healthy machine, and its interval [L/min], in which the oil may have warmed.
+    `number`: blocks so far, with this one; `t`: its end [s]; `status`: "learning", "watched", "alarm", or why it is not
+    judged ("at standstill", "missing values", ...); `total_lpm`: flow past pump and piston together, `leak_lpm`: beyond
+    that of the healthy machine, each with a 95 % interval, in which the oil may have warmed [L/min], None where it is
+    not known.
     """
 
     number: int
     t: float
     status: str
     total_lpm: float | None = None
-    total_interval_lpm: tuple[float, float] | None = None
+    total_interval_lpm: Interval | None = None
     leak_lpm: float | None = None
-    leak_interval_lpm: tuple[float, float] | None = None
+    leak_interval_lpm: Interval | None = None
 
     @property
     def judged(self) -> bool:
@@ -42,29 +43,17 @@ class BlockEstimate:
 class WatchedLeak:
     """A leak that the tests show, until `dismiss` or `relearn` is called.
 
-    Parameters
-    ----------
-    raised_s : float
-        Clock when it was first shown [s].
-    onset_s, onset_interval_s : float and pair of floats
-        Since when it leaks, and its 95 % interval [s].
-    leak_lpm, leak_interval_lpm : float and pair of floats, optional
-        Size when it was shown, and its 95 % interval [L/min].
-    before : float
-        Conductance before the onset [m^3/(s Pa)].
-    before_sd : float
-        Its deviation [m^3/(s Pa)].
-    test, cause, reason : str
-        Which test shows it, where the oil goes, and why, in one line.
-    score, threshold : float
-        The test's statistic and threshold.
+    `raised_s`: clock when it was first shown, `onset_s`: since when it leaks [s], `leak_lpm`: its size when it was
+    shown [L/min], both with 95 % intervals; `before`, `before_sd`: conductance before the onset and its deviation
+    [m^3/(s Pa)]; `test`, `cause`, `reason`: which test shows it, where the oil goes, and why, in one line; `score`,
+    `threshold`: of the test's statistic.
     """
 
     raised_s: float
     onset_s: float
-    onset_interval_s: tuple[float, float]
+    onset_interval_s: Interval
     leak_lpm: float | None
-    leak_interval_lpm: tuple[float, float] | None
+    leak_interval_lpm: Interval | None
     before: float
     before_sd: float
     test: str
@@ -86,3 +75,91 @@ class WatchedLeak:
         else:
             exponent = 0.5 * (self.threshold - self.score)
         return math.exp(min(0.0, max(exponent, math.log(1e-9))))
+
+
+@dataclass(frozen=True)
+class WatchBaseline:
+    """A healthy machine, as it was while the baseline was learned.
+
+    `version`: 1 for the first, one more after each repair; `learned_s`: clock when it was complete [s]; `hours` of
+    operation that it rests on; `level`, `low`, `high`: conductance of pump and piston, its mean, and least and largest
+    mean of successive blocks [m^3/(s Pa)]; `lpm`: the mean as a flow under the pressure difference learned with
+    [L/min], None where that cannot be stated; `duty_low`, `duty_high`: least and largest logarithm of mean pressure
+    difference [Pa] and of rms flow of the pump [m^3/s].
+    """
+
+    version: int
+    learned_s: float
+    hours: float
+    level: float
+    low: float
+    high: float
+    lpm: float | None
+    duty_low: Duty
+    duty_high: Duty
+
+    def rise(self, at: float, g: float, deviation: float, probability: float) -> Rise | None:
+        """Return the rise where a mean conductance is over what warm oil makes of the baseline's least; None where not.
+
+        `deviation`: of `g`; `probability`: of a look at a healthy machine as warm as that.
+        """
+        from scipy.special import ndtri
+
+        warmest = beliefs("inference")["oil"]["warmest"]
+        ceiling = warmest * max(self.low, 0.0)
+        score, threshold = (g - ceiling) / deviation, -float(ndtri(probability))
+        if score <= threshold:
+            return None
+        reason = (
+            f"the leakage conductance is {g:.3g} m^3/(s Pa), over {warmest:g} times the least of the baseline: more "
+            f"than the warmest oil makes of it (score {score:.1f}, threshold {threshold:.1f})"
+        )
+        # what is healthy may be anywhere from the least of the baseline to the ceiling
+        healthy = max(self.level - self.low, ceiling - self.level, 0.0) / 1.96
+        size = g - max(self.level, 0.0)
+        return Rise(score, (at, self.learned_s, at), size, math.hypot(deviation, healthy), "level", threshold, reason)
+
+
+def within(duty: Duty, low: Duty, high: Duty) -> bool:
+    """Return whether a duty lies between two others, give or take; a leak may take more of the pressure."""
+    believed = beliefs("inference.live")["watch"]
+    margin = believed["margin"]
+    below = (low[0] - believed["damped"], low[1] - margin)
+    return all(least <= own <= most + margin for own, least, most in zip(duty, below, high, strict=True))
+
+
+@dataclass
+class BaselineLearning:
+    """Sums of the baseline that is being learned; what no block has shown yet is None."""
+
+    blocks: int = 0
+    total: float = 0.0
+    flow: float = 0.0
+    low: float | None = None
+    high: float | None = None
+    duty_low: Duty | None = None
+    duty_high: Duty | None = None
+    group: list[float] = field(default_factory=list)
+
+    def add(self, g: float, flow: float, duty: Duty, group: int) -> None:
+        """Take a block's conductance, flow of a unit of it [L/min] and duty; means are of `group` blocks."""
+        self.blocks += 1
+        self.total += g
+        self.flow += flow
+        low, high = self.duty_low or duty, self.duty_high or duty
+        self.duty_low = min(low[0], duty[0]), min(low[1], duty[1])
+        self.duty_high = max(high[0], duty[0]), max(high[1], duty[1])
+        self.group.append(g)
+        if len(self.group) == group:
+            mean = sum(self.group) / group
+            self.low = mean if self.low is None else min(self.low, mean)
+            self.high, self.group = mean if self.high is None else max(self.high, mean), []
+
+    def frozen(self, version: int, at: float, hours: float, litres: bool) -> WatchBaseline:
+        """Return the baseline of one block or more."""
+        assert self.duty_low is not None and self.duty_high is not None
+        level = self.total / self.blocks
+        low = min(self.group) if self.low is None else self.low  # shorter than one group
+        high = max(self.group) if self.high is None else self.high
+        lpm = level * self.flow / self.blocks if litres else None
+        return WatchBaseline(version, at, hours, level, low, high, lpm, self.duty_low, self.duty_high)

@@ -6,7 +6,7 @@ The result depends on the samples and their order alone, never on how they were 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sealscope.diagnosis.inference.live.balance import FOLLOWS
 from sealscope.errors import InputError
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
-from sealscope.storage.plain_state import restored
+from sealscope.storage.plain_state import recall, saved
 
 #: Channels by which an actuator is watched, and with those that are kept beside the estimates.
 _WATCHED = ("x", "theta", "omega", "p_A", "p_B", "p_1", "p_2", "u")
@@ -98,24 +98,23 @@ class SampleJoiner:
         names, offered = self.names, channels_to_watch(frozenset(samples.channels), self.valved)
         if not names or ("x" in offered and "x" not in names and not self.settled):
             names = offered
-        missing = [name for name in names if name not in samples]
-        wrong = [name for name in names if name in samples and samples.units[name] != CHANNEL_UNITS[name]]
-        reason = ""
+        wrong = [name for name in names if name not in samples or samples.units[name] != CHANNEL_UNITS[name]]
         if not names:
             reason = "samples without p_A, p_B and x with theta or omega, or u, theta or omega"
-        elif missing:
-            reason = f"samples without {missing[0]}"
         elif wrong:
-            reason = f"samples of {wrong[0]} not in {CHANNEL_UNITS[wrong[0]]}"
+            missing = [name for name in wrong if name not in samples]
+            of = f" of {wrong[0]} not in {CHANNEL_UNITS[wrong[0]]}"
+            reason = f"samples without {missing[0]}" if missing else f"samples{of}"
         elif not 10.0 <= samples.rate <= 1e5:  # a reversal is not resolved, or a block holds too many samples
             reason = "samples at a rate outside 10 to 100000 Hz"
-        elif names != self.names:
-            if self.names:
-                self.count("began anew: a position is recorded, too")
-            self.names, self.rate = names, samples.rate
-        if reason:
-            self.count(reason, len(samples))
-        return not reason
+        else:
+            if names != self.names:
+                if self.names:
+                    self.count("began anew: a position is recorded, too")
+                self.names, self.rate = names, samples.rate
+            return True
+        self.count(reason, len(samples))
+        return False
 
     def _in_order(self, t: Array) -> Iterator[tuple[int, int]]:
         """Yield first and one past the last index of runs of samples that follow each other."""
@@ -125,38 +124,35 @@ class SampleJoiner:
         if whole:  # as nearly always
             yield 0, t.size
             return
-        finite = np.isfinite(t)
-        if not finite.all():
-            self.count("samples without a time", int(np.count_nonzero(~finite)))
-        known: NDArray[np.intp] = np.flatnonzero(finite)
-        at = 0
-        while at < known.size:
-            first = int(known[at])
-            if t[first] <= self.newest:
-                if self.newest - t[first] > self.late_s:
-                    self.restart("clock set back")
-                    continue
-                late = (t[known[at:]] <= self.newest) & (t[known[at:]] >= self.newest - self.late_s)
-                run = int(np.argmin(late)) if not late.all() else late.size
-                self.count("late or repeated samples", run)
-                at += run
+        known: NDArray[np.intp] = np.flatnonzero(np.isfinite(t))
+        if known.size < t.size:
+            self.count("samples without a time", t.size - known.size)
+        while known.size:
+            first, times = int(known[0]), t[known]
+            if times[0] > self.newest:
+                steps = np.diff(times) * self.rate
+                follows = (steps > FOLLOWS[0]) & (steps < FOLLOWS[1]) & (np.diff(known) == 1)
+                run = _length(follows) + 1
+                yield first, first + run
+            elif self.newest - times[0] > self.late_s:
+                self.restart("clock set back")
                 continue
-            rest = known[at:]
-            steps = np.diff(t[rest]) * self.rate
-            breaks = ~((steps > FOLLOWS[0]) & (steps < FOLLOWS[1])) | (np.diff(rest) != 1)
-            run = int(np.argmax(breaks)) + 1 if breaks.any() else rest.size
-            yield first, first + run
-            at += run
+            else:
+                run = _length((times <= self.newest) & (times >= self.newest - self.late_s))
+                self.count("late or repeated samples", run)
+            known = known[run:]
 
     def state(self) -> dict[str, Any]:
         """Return all of it as plain values."""
-        newest = self.newest if math.isfinite(self.newest) else None
-        return {**vars(self), "names": list(self.names), "newest": newest, "counters": dict(self.counters)}
+        return saved(self, vars(self))
 
-    @classmethod
-    def from_state(cls, state: Mapping[str, Any]) -> SampleJoiner:
-        """Return the joiner that `state` was of; raises InputError where it does not fit."""
-        joiner = restored(cls, {name: value for name, value in state.items() if value is not None}, "samples")
-        if not {*joiner.names} <= {*CHANNELS}:
-            raise InputError(f"saved state's samples must be of channels that are known, got {', '.join(joiner.names)}")
-        return joiner
+    def recall(self, state: Any) -> None:
+        """Continue from a `state`; raises InputError where it does not fit."""
+        recall(self, [*vars(self)], state, {"names": tuple[str, ...], "counters": dict[str, int]})
+        if not {*self.names} <= {*CHANNELS}:
+            raise InputError(f"saved state's samples must be of channels that are known, got {', '.join(self.names)}")
+
+
+def _length(true: NDArray[np.bool_]) -> int:
+    """Return how many of the first values are true."""
+    return int(np.argmin(true)) if not true.all() else true.size

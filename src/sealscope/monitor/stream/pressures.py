@@ -1,12 +1,9 @@
 """An actuator watched by both chamber pressures and the command, without a position.
 
 The response of p_A - p_B to the command is estimated along with the machine (`diagnosis.inference.pressures.response`),
-block by block: friction, stiffness and gain of the machine are among its parameters, so that what changes in them as
-the oil warms is not taken for a leak. Each block gives a conductance of its own. Its level is not known well, so that
-changes are stated and levels are not.
-
-After a gap it goes on with what it knew of the machine. After a pause, or where it has lost the machine, parameters are
-as little known as at first, and nothing before is compared with what comes after.
+block by block, so that friction, stiffness and gain that change as the oil warms are not taken for a leak. Changes of
+the conductance are stated, levels are not. After a pause, or where it has lost the machine, nothing before is compared
+with what comes after.
 """
 
 from __future__ import annotations
@@ -53,8 +50,8 @@ class PressureEstimator:
     def __init__(self, rig: Rig, names: Sequence[str], litres: bool | None = None) -> None:
         self._rig, self.names = rig, tuple(names)
         self.litres = states_flow(rig) if litres is None else litres
-        self._pieces: list[list[Array]] = []  # since the last whole block, of each the times and the channels
-        self._have, self._rate, self._until = 0, 0.0, -math.inf
+        self._kept = np.empty((1 + len(self.names), 0))  # times and channels since the last whole block
+        self._rate, self._until = 0.0, -math.inf
         self.begun = False  # once the machine moved for so long that its response was fitted
         self._follower: Follower | None = None
         self._next = math.nan  # clock at which the next block begins if it follows
@@ -64,38 +61,30 @@ class PressureEstimator:
         """Take samples that follow each other at the times `t` [s]; return what each block shows that they complete."""
         if rate != self._rate or not FOLLOWS[0] < (float(t[0]) - self._until) * rate < FOLLOWS[1]:
             self.interrupt()
-        self._rate, self._until, self._have = rate, float(t[-1]), self._have + t.size
-        self._pieces.append([t, *(samples[name] for name in self.names)])
+        self._rate, self._until = rate, float(t[-1])
+        kept = np.hstack([self._kept, [t, *(samples[name] for name in self.names)]])
         first, length = round(_BELIEVED["begins"] * rate), round(self.block_seconds * rate)
         shown: list[Shown] = []
-        while not self.begun and self._have >= first:
-            self.begun = self._begin(self._next_samples(first))
+        while not self.begun and kept.shape[1] >= first:
+            self.begun = self._begin(self._recording(kept[:, :first]))
             if not self.begun:
-                self._drop(first // 2)
+                kept = kept[:, first // 2 :]
                 reason = "half minutes at standstill or with missing values before the first block"
                 shown.append(NotJudged(self._until, "", reason))
-        while self.begun and self._have >= length:
-            block = self._next_samples(length)
-            self._drop(length)
+        while self.begun and kept.shape[1] >= length:
+            block, kept = self._recording(kept[:, :length]), kept[:, length:]
             shown.append(self._shown(block))
+        self._kept = kept.copy()
         return shown
 
-    def _join(self) -> None:
-        if len(self._pieces) > 1:
-            self._pieces = [[np.concatenate(column) for column in zip(*self._pieces, strict=True)]]
-
-    def _next_samples(self, length: int) -> Recording:
-        self._join()
-        t, *channels = (values[:length] for values in self._pieces[0])
+    def _recording(self, rows: Array) -> Recording:
+        t, *channels = rows
         units = {name: CHANNEL_UNITS[name] for name in self.names}
         return Recording(t, dict(zip(self.names, channels, strict=True)), units, self._rate)
 
-    def _drop(self, length: int) -> None:
-        self._pieces, self._have = [[values[length:].copy() for values in self._pieces[0]]], self._have - length
-
     def interrupt(self) -> None:
         """Take the next samples as those after a gap, whatever their time is."""
-        self._pieces, self._have, self._until = [], 0, -math.inf
+        self._kept, self._until = self._kept[:, :0], -math.inf
 
     def _begin(self, first: Recording) -> bool:
         """Fit the response to the first minute; return whether the machine moves in it, and nothing is missing."""
@@ -157,36 +146,31 @@ class PressureEstimator:
 
     def state(self) -> dict[str, Any]:
         """Return all of it but the rig as plain values."""
-        self._join()
-        state = saved(self, _SAVED) | {"pieces": [plain_array(np.array(piece)) for piece in self._pieces]}
+        state = saved(self, ("names", *_SAVED)) | {"pieces": [plain_array(self._kept)]}
         if (own := self._follower) is None:
             return state | {"follower": None}
         machine = {"rate": own.machine.rate, "law": own.machine.law, "sense": own.sense}
         return state | {"follower": saved(own, _FOLLOWED) | machine}
 
-    @classmethod
-    def from_state(cls, rig: Rig, state: Mapping[str, Any]) -> PressureEstimator:
-        """Return the estimator that `state` was of; raises InputError where it does not fit."""
-        estimator = cls(rig, part_of(state, "names", list), part_of(state, "litres", bool))
-        recall(estimator, _SAVED, state)
+    def recall(self, state: Mapping[str, Any]) -> None:
+        """Continue from a `state` with the same bits; raises InputError where it does not fit."""
+        recall(self, _SAVED, state)
         pieces = [array_of(piece, "pieces") for piece in part_of(state, "pieces", list)]
-        if any(piece.ndim != 2 or len(piece) != 1 + len(estimator.names) for piece in pieces):
+        if any(piece.ndim != 2 or len(piece) != len(self._kept) for piece in pieces):
             raise InputError("saved state's pieces must have a row of times and one for each channel")
-        estimator._pieces, estimator._have = [list(piece) for piece in pieces], sum(piece.shape[1] for piece in pieces)
+        self._kept = np.hstack([self._kept, *pieces])
         if (known := part_of(state, "follower", (Mapping, type(None)))) is None:
-            return estimator
+            return
         rate, sense = (float(part_of(known, name, (float, int))) for name in ("rate", "sense"))
         if not rate > 0.0:
             raise InputError(f"saved state's rate must be > 0 Hz, got {rate}")
         if (law := part_of(known, "law", str)) not in LAWS:
             raise InputError(f"saved state's law must be {' or '.join(LAWS)}, got {law!r}")
-        follower = Follower(Machine.of(rig, rate, law), beliefs_of(rig, law), sense)
-        recall(follower, _FOLLOWED, known)
-        estimator._follower = follower
-        return estimator
+        self._follower = Follower(Machine.of(self._rig, rate, law), beliefs_of(self._rig, law), sense)
+        recall(self._follower, _FOLLOWED, known)
 
 
-_SAVED = ("names", "litres", "begun", "_rate", "_until", "_next", "_settling", "_lost")
+_SAVED = ("litres", "begun", "_rate", "_until", "_next", "_settling", "_lost")
 _FOLLOWED = ("theta", "covariance", "states", "variance", "last")
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections import deque
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -14,22 +13,14 @@ import numpy as np
 
 from sealscope.calls import checked_call
 from sealscope.diagnosis.beliefs import beliefs
-from sealscope.diagnosis.inference.live.balance import (
-    BLOCK_SECONDS,
-    LEARNED,
-    BlockConductance,
-    LiveBalance,
-    NotJudged,
-    Shown,
-)
-from sealscope.diagnosis.inference.live.sequential import RECENT, StepDetector, probability_of
+from sealscope.diagnosis.inference.live.balance import LEARNED, BlockConductance, LiveBalance, NotJudged, Shown
+from sealscope.diagnosis.inference.live.sequential import RECENT, Rise, StepDetector, probability_of
 from sealscope.errors import InputError
-from sealscope.monitor.stream.baseline import BaselineLearning, WatchBaseline, WatchedRise, within
-from sealscope.monitor.stream.estimates import BlockEstimate, WatchedLeak
+from sealscope.monitor.stream.estimates import BaselineLearning, BlockEstimate, WatchBaseline, WatchedLeak, within
 from sealscope.monitor.stream.joining import SampleJoiner
 from sealscope.monitor.stream.pressures import PressureEstimator
 from sealscope.recordings.recording import Recording
-from sealscope.storage.plain_state import array_of, part_of, plain_array, plain_fields, restored
+from sealscope.storage.plain_state import part_of, recall, restored, saved
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -40,7 +31,7 @@ STATE_VERSION = 10
 GROUP, _RECENT = 16, 8
 _BELIEVED = beliefs("inference.live")["watch"]
 #: Ways of watching, each a stream of conductances.
-_KINDS: tuple[type[LiveBalance | PressureEstimator], ...] = (LiveBalance, PressureEstimator)
+_KINDS: dict[str, type[LiveBalance | PressureEstimator]] = {of.by: of for of in (LiveBalance, PressureEstimator)}
 
 
 class Watch:
@@ -61,8 +52,8 @@ class Watch:
         The leak that the tests show.
     baseline : WatchBaseline or None
         What the machine is compared with, None while it is learned.
-    blocks : int
-        Whole blocks so far.
+    blocks, baseline_version : int
+        Whole blocks so far, and version of the baseline, or of that which is being learned.
 
     Examples
     --------
@@ -78,29 +69,23 @@ class Watch:
     """
 
     def __init__(
-        self,
-        rig: Rig,
-        false_alarms_per_1000_h: float,
-        learn_hours: float,
-        *,
-        litres: Mapping[str, bool] | None = None,
+        self, rig: Rig, false_alarms_per_1000_h: float, learn_hours: float, *, litres: Mapping[str, bool] | None = None
     ) -> None:
         self.false_alarms_per_1000_h, self.learn_hours = false_alarms_per_1000_h, learn_hours
-        self._probability("step", BLOCK_SECONDS)
+        self._probability("step", LiveBalance.block_seconds)
         if not 0.0 < learn_hours <= 1000.0:
             raise InputError(f"learn_hours must be > 0 and at most 1000 h, got {learn_hours:g}")
         self._rig = rig
-        self._litres = {kind.by: kind.states_flow(rig) for kind in _KINDS} if litres is None else litres
+        self._litres = {by: kind.states_flow(rig) for by, kind in _KINDS.items()} if litres is None else litres
         self._samples = SampleJoiner(valved=rig.valve.spool == "present")
         self._estimator: LiveBalance | PressureEstimator | None = None
         self.baseline: WatchBaseline | None = None
         self.leak: WatchedLeak | None = None
-        self.blocks, self._version = 0, 1
+        self.blocks, self.baseline_version = 0, 1
         self._learning, self._detector = BaselineLearning(), StepDetector()
         # of the last blocks end, conductance, deviation, flow of a unit of it, duty; of those whose mean is not whole
         # yet end, conductance, deviation, and what all conductances are off by
-        self._last: deque[tuple[float, ...]] = deque(maxlen=RECENT)
-        self._group: list[tuple[float, ...]] = []
+        self._last, self._group = np.empty((0, 6)), np.empty((0, 4))
 
     def _probability(self, test: str, seconds: float) -> float:
         """Return the probability of a false alarm of one look of a test, with so many seconds between looks."""
@@ -120,7 +105,7 @@ class Watch:
     @property
     def block_seconds(self) -> float:
         """About how long a block is [s]."""
-        return BLOCK_SECONDS if self._estimator is None else self._estimator.block_seconds
+        return LiveBalance.block_seconds if self._estimator is None else self._estimator.block_seconds
 
     def update(self, samples: Recording, *, follows: bool = True) -> list[BlockEstimate]:
         """Take the next samples; results do not depend on how they are cut.
@@ -149,8 +134,7 @@ class Watch:
                 self._estimator.interrupt()
         for t, channels in self._samples.runs(samples):
             if self._estimator is None or self._estimator.by != self.by:  # a position came with the second piece
-                kind = next(kind for kind in _KINDS if kind.by == self.by)
-                self._estimator = kind(self._rig, self._samples.names, self._litres[self.by])
+                self._estimator = self._estimator_by()
             with np.errstate(all="ignore"):  # a block whose sums overflow says nothing
                 every = self._estimator.take(t, channels, self._samples.rate)
             self._samples.settled = self._estimator.begun
@@ -160,18 +144,16 @@ class Watch:
                 else:
                     yield self.judged(shown), self.leak
 
+    def _estimator_by(self) -> LiveBalance | PressureEstimator:
+        return _KINDS[self.by](self._rig, self._samples.names, self._litres.get(self.by, False))
+
     def continue_from(self, blocks: int, baseline_version: int) -> None:
         """Count blocks and baselines on from those of a watch before, whose settings or state were of another kind."""
-        self.blocks, self._version = blocks, baseline_version + 1
-
-    @property
-    def baseline_version(self) -> int:
-        """Version of the baseline, or of that which is being learned."""
-        return self._version
+        self.blocks, self.baseline_version = blocks, baseline_version + 1
 
     def relearn(self) -> None:
         """Learn a new baseline from now on: the machine was repaired, or is another."""
-        self._version += 1
+        self.baseline_version += 1
         self.baseline, self._learning = None, BaselineLearning()
         if self._estimator is not None:
             self._estimator.relearn()
@@ -184,8 +166,7 @@ class Watch:
 
     def _forget(self) -> None:
         self._detector.forget()
-        self._last.clear()
-        self._group = []
+        self._last, self._group = self._last[:0], self._group[:0]
 
     def judged(self, shown: Shown) -> BlockEstimate:
         """Return the estimate of a block, from what is shown of it."""
@@ -202,13 +183,14 @@ class Watch:
 
     def _judge(self, block: BlockConductance) -> BlockEstimate:
         assert self._estimator is not None
-        if self.baseline is not None and not self.baseline.knows(block.duty):
+        if self.baseline is not None and not within(block.duty, self.baseline.duty_low, self.baseline.duty_high):
             self._samples.count("blocks: another duty")
             return BlockEstimate(self.blocks, block.end, "another duty")
-        if self._last and not 0.0 <= block.end - self._last[-1][0] <= _BELIEVED["pause"]:
+        if len(self._last) and not 0.0 <= block.end - self._last[-1, 0] <= _BELIEVED["pause"]:
             self._forget()
         self._detector.take(block.begin, block.end, block.g, block.sd)
-        self._last.append((block.end, block.g, block.sd, block.flow, *block.duty))
+        row = block.end, block.g, block.sd, block.flow, *block.duty
+        self._last = np.vstack([self._last[1 - RECENT :], row])
         self._test_step(block)
         self._test_level(block)
         if self.baseline is None and self.leak is None:
@@ -216,7 +198,7 @@ class Watch:
             hours = self._learning.blocks * self.block_seconds / 3600.0
             if self._learning.blocks >= LEARNED and hours >= self.learn_hours * (1.0 - 1e-12):
                 litres = self._estimator.litres and self._estimator.levels
-                self.baseline = self._learning.frozen(self._version, block.end, hours, litres)
+                self.baseline = self._learning.frozen(self.baseline_version, block.end, hours, litres)
                 self._learning = BaselineLearning()
         status = "alarm" if self.leak is not None else "learning" if self.baseline is None else "watched"
         if not self._estimator.litres:
@@ -237,17 +219,16 @@ class Watch:
             self._samples.count("blocks not compared: changed duty")
             self._forget()
             return
-        score, threshold = 2.0 * rise.log_e, 2.0 * threshold
         reason = (
-            f"the leakage conductance rises at {rise.onset[0]:.0f} s beyond its random walk (score {score:.1f}, "
-            f"threshold {threshold:.1f})"
+            f"the leakage conductance rises at {rise.onset[0]:.0f} s beyond its random walk (score {rise.score:.1f}, "
+            f"threshold {2.0 * threshold:.1f})"
         )
-        self._raise(WatchedRise("step", rise.onset, rise.size, rise.deviation, reason, score, threshold), block)
+        self._raise(rise._replace(threshold=2.0 * threshold, reason=reason), block)
 
     def _other_duty(self, onset: float, size: float) -> bool:
         """Return whether the duty changed with a rise, beyond what it was before and what a leak makes of it."""
         assert self._estimator is not None
-        ends, *_, pressure, motion = np.array(self._last).T
+        ends, *_, pressure, motion = self._last.T
         after = ends > onset
         if np.count_nonzero(~after) < _RECENT or not after.any():
             return False
@@ -259,12 +240,12 @@ class Watch:
 
     def _test_level(self, block: BlockConductance) -> None:
         """Gather blocks to means, and compare these with the baseline."""
-        self._group.append((block.end, block.g, block.sd, block.offset))
+        self._group = np.vstack([self._group, (block.end, block.g, block.sd, block.offset)])
         if len(self._group) < GROUP:
             return
-        at, g, _, offset = (float(value) for value in np.mean(self._group, axis=0))
-        sd = math.sqrt(sum(row[2] ** 2 for row in self._group)) / GROUP
-        self._group = []
+        at, g, _, offset = self._group.mean(axis=0).tolist()
+        sd = math.sqrt(sum(value**2 for value in self._group[:, 2].tolist())) / GROUP
+        self._group = self._group[:0]
         if self.leak is not None or self.baseline is None:
             return
         # what all conductances are off by is in the ceiling that many times
@@ -273,12 +254,13 @@ class Watch:
         if rise is not None:
             self._raise(rise, block, self.baseline.level)
 
-    def _raise(self, rise: WatchedRise, block: BlockConductance, before: float | None = None) -> None:
+    def _raise(self, rise: Rise, block: BlockConductance, before: float | None = None) -> None:
         assert self._estimator is not None
         own, leak, (onset, *ends) = self._estimator, self.leak, rise.onset
         if before is None:
-            earlier = [row[1] for row in self._last if row[0] <= ends[0]] or [block.g - rise.size]
-            before = leak.before if leak is not None else float(np.mean(earlier[-GROUP:]))
+            earlier = self._last[self._last[:, 0] <= ends[0], 1][-GROUP:]
+            known = float(np.mean(earlier)) if earlier.size else block.g - rise.size
+            before = leak.before if leak is not None else known
         half = 1.96 * math.hypot(rise.deviation, own.size_error * rise.size)
         low, high = own.inside * max(0.0, rise.size - half) * block.flow, own.orifice * (rise.size + half) * block.flow
         self.leak = WatchedLeak(
@@ -318,8 +300,8 @@ class Watch:
         self, leak: WatchedLeak, own: LiveBalance | PressureEstimator, block: BlockConductance, sd: float
     ) -> tuple[float, float, float]:
         """Return the conductance since the onset of a leak, and its interval, in which the oil may have warmed."""
-        recent = [row[1] for row in self._last if row[0] - self.block_seconds >= leak.onset_interval_s[1]][-_RECENT:]
-        now, oil = float(np.mean(recent or [block.g])), beliefs("inference")["oil"]
+        recent = self._last[self._last[:, 0] - self.block_seconds >= leak.onset_interval_s[1], 1][-_RECENT:]
+        now, oil = float(np.mean(recent)) if recent.size else block.g, beliefs("inference")["oil"]
         hours = max(0.0, block.end - leak.onset_s) / 3600.0
         warmed = oil["warmest"] ** min(1.0, hours / oil["shift"])
         before, rise = max(leak.before, 0.0), now - leak.before
@@ -327,75 +309,40 @@ class Watch:
         return rise, own.inside * (now - before * warmed - spread), now - before / warmed + spread
 
     def state(self) -> dict[str, Any]:
-        """Return all that the watch knows as plain values that JSON holds; `from_state` continues with the same bits.
-
-        Returns
-        -------
-        dict
-            Mappings, lists, texts and numbers; ``"version"`` is the format's.
-        """
-        facts = {"learning": self._learning, "baseline": self.baseline, "leak": self.leak}
+        """Return all that the watch knows as plain values that JSON holds, its ``"version"`` that of the format."""
+        own = self._estimator if self._estimator is not None and self._estimator.by == self.by else None
         return {
             "version": STATE_VERSION,
             "rig": json.dumps(self._rig.model_dump()),
-            "litres": self._litres,
-            "false_alarms_per_1000_h": self.false_alarms_per_1000_h,
-            "learn_hours": self.learn_hours,
-            "blocks": self.blocks,
-            "baseline_version": self._version,
-            "samples": self._samples.state(),
-            "detector": self._detector.state(),
-            "estimator": None if self._estimator is None else self._estimator.state(),
-            **{name: None if fact is None else plain_fields(fact) for name, fact in facts.items()},
-            "last": plain_array(np.array(self._last).reshape(-1, 6)),
-            "group": plain_array(np.array(self._group).reshape(-1, 4)),
+            **saved(self, ("_litres", *_SAVED)),
+            "estimator": None if own is None else own.state(),
         }
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> Watch:
-        """Return the watch that `state` was of.
+        """Return the watch that `state` was of, also after JSON; it continues with the same bits.
 
-        Parameters
-        ----------
-        state : mapping
-            What `state` returned, also after JSON.
-
-        Returns
-        -------
-        Watch
-            It continues with the same bits.
-
-        Raises
-        ------
-        InputError
-            Where the state is none, of another version, or damaged.
+        Raises InputError where the state is none, of another version, or damaged.
         """
         version = part_of(state, "version", int)
         if version != STATE_VERSION:
             raise InputError(f"saved state must have version {STATE_VERSION}, got {version}")
-        names = ("false_alarms_per_1000_h", "learn_hours", "blocks", "baseline_version")
-        rate, hours, blocks, own_version = (part_of(state, name, (float, int)) for name in names)
-        rig = _rig_of(part_of(state, "rig", str))
-        litres = part_of(state, "litres", Mapping)
-        watch = cls(rig, rate, hours, litres={kind.by: part_of(litres, kind.by, bool) for kind in _KINDS})
-        watch.blocks, watch._version = int(blocks), int(own_version)
-        watch._samples = SampleJoiner.from_state(part_of(state, "samples", Mapping))
-        watch._detector = StepDetector.from_state(part_of(state, "detector", Mapping))
+        rate, hours = (part_of(state, name, (float, int)) for name in ("false_alarms_per_1000_h", "learn_hours"))
+        litres = restored(dict[str, bool], part_of(state, "litres", Mapping), "litres")
+        watch = cls(_rig_of(part_of(state, "rig", str)), rate, hours, litres=litres)
+        recall(watch, _SAVED, state, _KINDS_OF_SAVED)
         if (own := part_of(state, "estimator", (Mapping, type(None)))) is not None:
-            kind = next(kind for kind in _KINDS if kind.by == watch.by)
-            watch._estimator = kind.from_state(rig, own)
-            if not {*watch._estimator.names} <= {*watch._samples.names}:
-                raise InputError("saved state's estimator must read channels of its samples")
-        watch._learning = restored(BaselineLearning, part_of(state, "learning", Mapping), "learning")
-        for name, fact in (("baseline", WatchBaseline), ("leak", WatchedLeak)):
-            if (own := part_of(state, name, (Mapping, type(None)))) is not None:
-                setattr(watch, name, restored(fact, own, name))
-        last, group = (array_of(part_of(state, name, Mapping), name) for name in ("last", "group"))
-        if last.shape[1:] != (6,) or group.shape[1:] != (4,):
-            raise InputError(f"saved state's last blocks must have 6 and 4 columns, got {last.shape}, {group.shape}")
-        watch._last.extend(tuple(row) for row in last.tolist())
-        watch._group = [tuple(row) for row in group.tolist()]
+            watch._estimator = watch._estimator_by()
+            watch._estimator.recall(own)
         return watch
+
+
+#: Attributes that are the state beside rig and estimator; types of those that may be None.
+_SAVED = (
+    *("false_alarms_per_1000_h", "learn_hours", "blocks", "baseline_version", "_samples", "_detector"),
+    *("_learning", "baseline", "leak", "_last", "_group"),
+)
+_KINDS_OF_SAVED = {"baseline": WatchBaseline, "leak": WatchedLeak}
 
 
 @lru_cache(maxsize=256)

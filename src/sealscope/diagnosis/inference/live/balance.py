@@ -18,18 +18,7 @@ from sealscope.compiled import kernel
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.balance import BlockStream
 from sealscope.diagnosis.inference.blocks import Blocks, Columns
-from sealscope.diagnosis.inference.live.known import (
-    STANDSTILL,
-    TINY,
-    Known,
-    Said,
-    add,
-    begin,
-    known_shapes,
-    motion,
-    says,
-    take,
-)
+from sealscope.diagnosis.inference.live.known import STANDSTILL, Known, add, begin, known_shapes, motion, says, take
 from sealscope.diagnosis.inference.terms import Equation, equations
 from sealscope.diagnosis.inference.weak_form import stride_samples
 from sealscope.errors import InputError
@@ -105,17 +94,8 @@ def _says(known: Known, gram: Any, place: Any, rows: float, adds: bool) -> tuple
 class LiveBalance:
     """The balance of a running machine: samples in, conductances of blocks out, the same for pieces of any size.
 
-    Parameters
-    ----------
-    rig : Rig
-        Gives the pump's displacement and the circuit.
-    names : sequence of str
-        Channels of the samples.
-
-    Raises
-    ------
-    InputError
-        Where the channels allow no balance.
+    `rig`: gives the pump's displacement and the circuit; `names`: channels of the samples. Raises InputError where they
+    allow no balance.
     """
 
     by, levels, cause, inside, orifice = "volumes", True, "piston or pump leak", 1.0, 1.0
@@ -149,30 +129,26 @@ class LiveBalance:
     def take(self, t: Array, samples: Mapping[str, Array], rate: float) -> list[Shown]:
         """Take samples that follow each other at the times `t` [s]; return what each block says that they complete.
 
-        The first blocks say nothing until there are `LEARNED`; the last of these says what all of them do.
-
-        After a gap the balance goes on with what it knew; what lay before the gap and fills no block is dropped.
+        The first blocks say nothing until there are `LEARNED`; the last of these says what all of them do. After a gap
+        the balance goes on with what it knew; what lay before the gap and fills no block is dropped.
         """
         shown: list[Shown] = []
-        steps = (float(t[0]) - self._next) * rate + 1.0
-        if self._stream is None or rate != self._rate or not FOLLOWS[0] < steps < FOLLOWS[1]:
-            shown += self.finish()
-            if self._stream is None or rate != self._rate:
-                before = self._stream
-                self._stream, self._rate = BlockStream(self._balances, rate, BLOCK_SECONDS), rate
-                if before is not None:
-                    self._stream.recall({**before.state(), "samples": {}, "first": 0, "done": 0})
-            self._stream.restart(float(t[0]))
+        stream, steps = self._stream, (float(t[0]) - self._next) * rate + 1.0
+        if stream is None or rate != self._rate or not FOLLOWS[0] < steps < FOLLOWS[1]:
+            if stream is not None:
+                shown += self._said(stream.push({}, last=True))
+            if stream is None or rate != self._rate:
+                fresh, self._rate = BlockStream(self._balances, rate, BLOCK_SECONDS), rate
+                if stream is not None:
+                    fresh.recall({**stream.state(), "samples": {}, "first": 0, "done": 0})
+                self._stream = stream = fresh
+            stream.restart(float(t[0]))
         self._next = float(t[-1]) + 1.0 / rate
-        return shown + self._said(self._stream.push({name: samples[name] for name in self.names}))
+        return shown + self._said(stream.push({name: samples[name] for name in self.names}))
 
     def interrupt(self) -> None:
         """Take the next samples as those after a gap, whatever their time is."""
         self._next = -math.inf
-
-    def finish(self) -> list[Shown]:
-        """Return what the blocks say that are whole though nothing follows."""
-        return [] if self._stream is None else self._said(self._stream.push({}, last=True))
 
     def _said(self, blocks: Blocks | None) -> list[Shown]:
         return [] if blocks is None else [self._taken(block) for block in _parts(blocks)]
@@ -196,7 +172,7 @@ class LiveBalance:
         waiting, self._waiting = self._waiting, None
         for e, (known, place) in enumerate(zip(self._known, self._places, strict=True)):
             _learns(known, np.ascontiguousarray(waiting.gram[:, e]), place, waiting.rows)
-        self._precision = float(np.median([self._says(part, adds=False).precision for part in _parts(waiting)]))
+        self._precision = float(np.median([self._says(part, adds=False)[0] for part in _parts(waiting)]))
         parts = [self._shown(part, adds=False) for part in _parts(waiting)]
         return [part for part in parts if not isinstance(part, NotJudged)] or NotJudged(end, "at standstill")
 
@@ -204,11 +180,11 @@ class LiveBalance:
         """Return the motion of a block over the usual one."""
         return motion(float(block.gram[0, 0, -1, -1]), float(block.rows[0]), self._known[0].numbers)
 
-    def _says(self, block: Blocks, adds: bool = True) -> Said:
-        """Return what a block says by all equations; with `adds` it is one of those that are known from now on."""
+    def _says(self, block: Blocks, adds: bool = True) -> tuple[float, ...]:
+        """Return what a block says by all equations (`says`); with `adds` it is one of those known from now on."""
         rows, each = float(block.rows[0]), zip(self._known, block.gram[0], self._places, strict=True)
         said = [_says(known, gram, place, rows, adds) for known, gram, place in each]
-        return Said(*(sum(values) for values in zip(*said, strict=True)))
+        return tuple(sum(values) for values in zip(*said, strict=True))
 
     def _shown(self, block: Blocks, adds: bool = True) -> BlockConductance | NotJudged:
         half = 0.5 * stride_samples(self._rate) / self._rate
@@ -219,7 +195,7 @@ class LiveBalance:
             return NotJudged(end, "at standstill", "blocks: at standstill")
         total = lead / precision
         offset = math.hypot(math.sqrt(leaning) / precision, self.size_error * lead / precision)
-        pressure, _, rate = (max(float(value), TINY) for value in block.means[0])
+        pressure, _, rate = (max(float(value), np.finfo(float).tiny) for value in block.means[0])
         duty = math.log(pressure), math.log(rate)
         g, sd = total - shift / precision, precision**-0.5
         return BlockConductance(begin, end, g, sd, total, offset, pressure / LITRE_PER_MINUTE, duty)
@@ -235,32 +211,29 @@ class LiveBalance:
         """Return all of it as plain values that JSON holds."""
         waiting, stream = self._waiting, self._stream
         return {
-            **saved(self, _SAVED),
+            **saved(self, ("names", *_SAVED)),
             "known": [saved(known, _KNOWN) for known in self._known],
             "waiting": None if waiting is None else saved(waiting, _BLOCK),
             "stream": None if stream is None else stream.state(),
         }
 
-    @classmethod
-    def from_state(cls, rig: Rig, state: Mapping[str, Any]) -> LiveBalance:
-        """Return the balance that `state` was of; raises InputError where it does not fit."""
-        live = cls(rig, part_of(state, "names", list), part_of(state, "litres", bool))
-        recall(live, _SAVED, state)
+    def recall(self, state: Mapping[str, Any]) -> None:
+        """Continue from a `state` with the same bits; raises InputError where it does not fit."""
+        recall(self, _SAVED, state)
         known = part_of(state, "known", list)
-        if len(known) != len(live._known):
-            raise InputError(f"saved state's known must be of {len(live._known)} equations, got {len(known)}")
-        for sums, before in zip(live._known, known, strict=True):
+        if len(known) != len(self._known):
+            raise InputError(f"saved state's known must be of {len(self._known)} equations, got {len(known)}")
+        for sums, before in zip(self._known, known, strict=True):
             recall(sums, _KNOWN, before)
         waiting, stream = (part_of(state, name, (Mapping, type(None))) for name in ("waiting", "stream"))
         if waiting is not None:
-            live._waiting = Blocks(*(array_of(part_of(waiting, name, Mapping), name) for name in _BLOCK))
+            self._waiting = Blocks(*(array_of(part_of(waiting, name, Mapping), name) for name in _BLOCK))
         if stream is not None:
-            live._stream = BlockStream(live._balances, live._rate, BLOCK_SECONDS)
-            live._stream.recall(stream)
-        return live
+            self._stream = BlockStream(self._balances, self._rate, BLOCK_SECONDS)
+            self._stream.recall(stream)
 
 
-_SAVED = ("names", "litres", "_precision", "_woken", "_rate", "_next")
+_SAVED = ("litres", "_precision", "_woken", "_rate", "_next")
 _KNOWN, _BLOCK = ("sums", "coefficients", "along", "numbers"), tuple(Blocks.__dataclass_fields__)
 
 

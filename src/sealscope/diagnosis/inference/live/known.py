@@ -51,19 +51,6 @@ class Known(NamedTuple):
     scale: Any
 
 
-class Said(NamedTuple):
-    """What a block says of the leak's coefficient.
-
-    `precision`; that times its estimate, `lead`, and times what is to be taken from it so that the series does not move
-    with the other coefficients, `shift`; `leaning`: the variance that these leave, times the precision squared.
-    """
-
-    precision: float
-    lead: float
-    shift: float
-    leaning: float
-
-
 def known_shapes(n: int) -> tuple[tuple[int, ...], ...]:
     """Return the shapes of a `Known`."""
     return (n + 2, n + 2), (n,), (n,), (len(NUMBERS),), (n + 2, n + 2), (n, n), (n, 3), (n,)
@@ -146,7 +133,11 @@ def begin(known: Any) -> None:
 
 @large_law
 def says(known: Any, rows: float, adds: bool) -> tuple[float, float, float, float]:
-    """Return what the block `known.own` says (`Said`), beside those before it; with `adds` it is one of them then."""
+    """Return what the block `known.own` says, beside those before it; with `adds` it is one of them then.
+
+    The precision of the leak's coefficient; that times its estimate, and times what is to be taken from it so that the
+    series does not move with the other coefficients; the variance that these leave, times the precision squared.
+    """
     own, right, n, numbers = known.own, known.right, len(known.matrix), known.numbers
     energy, usual = max(own[n, n], TINY), max(numbers[ENERGY], TINY)
     for i in range(n):

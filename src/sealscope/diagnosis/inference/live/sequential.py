@@ -23,7 +23,6 @@ Trans. Automat. Contr. 21 (1976) 108 (step in a filter).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -60,12 +59,18 @@ def probability_of(rate: float, hours: float, seconds: float, name: str) -> floa
 
 
 class Rise(NamedTuple):
-    """A step that the blocks show: `log_e` = log M; `onset` (value, low, high) [s]; `size` and its `deviation`."""
+    """A rise of a coefficient that a `test` shows, by a `score` over a `threshold` for a `reason`.
 
-    log_e: float
+    `score`: of a step, twice log M; `onset`: value, low and high [s]; `size` and its `deviation`.
+    """
+
+    score: float
     onset: tuple[float, float, float]
     size: float
     deviation: float
+    test: str = "step"
+    threshold: float = np.nan
+    reason: str = ""
 
 
 class StepDetector:
@@ -150,13 +155,16 @@ class StepDetector:
             return -np.inf
         return float(np.logaddexp.reduce(self._terms().ravel()))
 
+    def _healthy(self) -> Array:
+        """Return log of the likelihood of each walk and onset while nothing stepped, up to a constant, shape (q, j)."""
+        return np.asarray(self._onsets[4] - 0.5 * (self._places[:, 0] * np.log(self._onsets[3]) + self._widths))
+
     def _terms(self) -> Array:
         """Return log of each part of M, by size, walk and onset, shape (v, q, j)."""
-        _, along, square, total, lead = self._onsets
-        number, widest = self._places[:, 0], SIZES[:, None, None]
+        _, along, square, total, _ = self._onsets
+        number, widest, healthy = self._places[:, 0], SIZES[:, None, None], self._healthy()
         rising = np.maximum(along, 0.0) ** 2 / ((square + 1.0 / widest) * total)
         ratio = -0.5 * (np.log1p(widest * square) + number * np.log1p(-rising))
-        healthy = lead - 0.5 * (number * np.log(total) + self._widths)
         prior = np.logaddexp.reduce(healthy, axis=0) + np.log(len(SIZES) * len(PARTS))
         return np.asarray(np.where(along > 0.0, ratio, -np.inf) + healthy - prior)
 
@@ -165,28 +173,20 @@ class StepDetector:
         terms = self._terms()
         log_e = float(np.logaddexp.reduce(terms.ravel()))
         weights = np.exp(terms - log_e)
-        mean, variance = self._sizes()
-        value = float((weights * mean).sum())
-        deviation = float(np.sqrt((weights * (variance + (mean - value) ** 2)).sum()))
-        scale = self._unit
-        return Rise(log_e, self._onset(weights.sum(axis=(0, 1))), scale * value, scale * deviation)
-
-    def _sizes(self) -> tuple[Array, Array]:
-        """Return mean and variance of the step's size, by size, walk and onset."""
         _, along, square, total, _ = self._onsets
         precision = square + 1.0 / SIZES[:, None, None]
-        mean = along / precision
-        freedom = np.maximum(self._places[:, 0] - 2.0, 1.0)
-        return mean, np.maximum(total - along * mean, 0.0) / freedom / precision
-
-    def _onset(self, weights: Array) -> tuple[float, float, float]:
-        """Return the mean onset with its 95 % interval, from the probability of each."""
+        mean, freedom = along / precision, np.maximum(self._places[:, 0] - 2.0, 1.0)
+        variance = np.maximum(total - along * mean, 0.0) / freedom / precision
+        value = float((weights * mean).sum())
+        deviation = float(np.sqrt((weights * (variance + (mean - value) ** 2)).sum()))
+        shares = weights.sum(axis=(0, 1))  # probability of each onset
         onset, begin = self._places[:, 2:].T
         order = np.argsort(onset, kind="stable")
-        low, high = np.searchsorted(np.cumsum(weights[order]), [0.025, 0.975])
+        low, high = np.searchsorted(np.cumsum(shares[order]), [0.025, 0.975])
         last = order[min(high, len(order) - 1)]
         apart = float((onset - begin)[-len(PARTS)]) / len(PARTS)  # a part of a block, about
-        return float(weights @ onset), float(onset[order[low]]) - apart, float(onset[last]) + apart
+        since = float(shares @ onset), float(onset[order[low]]) - apart, float(onset[last]) + apart
+        return Rise(2.0 * log_e, since, self._unit * value, self._unit * deviation)
 
     def bound(self, probability: float = 0.95) -> float:
         """Return the rise that is exceeded with probability 1 - `probability`, given that there is one."""
@@ -194,18 +194,16 @@ class StepDetector:
 
         if not len(self._places):
             return np.inf
-        _, along, square, total, lead = self._onsets
-        number = self._places[:, 0]
-        healthy = lead - 0.5 * (number * np.log(total) + self._widths)
-        size = along / square
-        deviation = np.sqrt(np.maximum(total - along * size, np.finfo(float).tiny) / number / square)
-        above = np.exp(healthy - np.logaddexp.reduce(healthy, axis=0)) * np.maximum(ndtr(size / deviation), 1e-300)
+        _, along, square, total, _ = self._onsets
+        healthy, size = self._healthy(), along / square
+        least = np.finfo(float).tiny
+        deviation = np.sqrt(np.maximum(total - along * size, least) / self._places[:, 0] / square)
+        positive = np.maximum(ndtr(size / deviation), 1e-300)
+        above = np.exp(healthy - np.logaddexp.reduce(healthy, axis=0)) * positive
         low, high = 0.0, float(np.max(size + 8.0 * deviation))
         for _ in range(50):
             middle = 0.5 * (low + high)
-            beyond = float(
-                (above * ndtr((size - middle) / deviation) / np.maximum(ndtr(size / deviation), 1e-300)).sum()
-            )
+            beyond = float((above * ndtr((size - middle) / deviation) / positive).sum())
             low, high = (middle, high) if beyond > (1.0 - probability) * above.sum() else (low, middle)
         return self._unit * high
 
@@ -218,14 +216,11 @@ class StepDetector:
         """Return all of it as plain values."""
         return saved(self, _SAVED)
 
-    @classmethod
-    def from_state(cls, state: Mapping[str, Any]) -> StepDetector:
-        """Return the detector that `state` was of; raises InputError where it does not fit."""
-        detector = cls()
-        recall(detector, _SAVED, state)
-        if detector._onsets.shape[2] != len(detector._places):
-            raise InputError(f"saved state's onsets must be {len(detector._places)}, got {detector._onsets.shape[2]}")
-        return detector
+    def recall(self, state: Any) -> None:
+        """Continue from a `state` with the same bits; raises InputError where it does not fit."""
+        recall(self, _SAVED, state)
+        if self._onsets.shape[2] != len(self._places):
+            raise InputError(f"saved state's onsets must be {len(self._places)}, got {self._onsets.shape[2]}")
 
 
 def _kept(now: int, places: Array) -> NDArray[np.bool_]:

@@ -32,18 +32,10 @@ if TYPE_CHECKING:
 class BalanceState:
     """State of a `SequentialBalance`.
 
-    Attributes
-    ----------
-    t : float
-        End of the last whole block [s].
-    blocks, refused : int
-        Whole blocks so far, and those of them that say nothing: at standstill, or with missing values throughout.
-    evidence : Evidence
-        As of the last block, with the 95 % bound of a leak where none is shown.
-    alarm : Evidence or None
-        The evidence with the highest score since the alarm was raised, until it is acknowledged.
-    total_lpm : float or None
-        Leakage of pump and piston together [L/min], None where L/min cannot be stated.
+    `t`: end of the last whole block [s]; `blocks`, `refused`: whole blocks so far, and those of them that say nothing:
+    at standstill, or with missing values throughout; `evidence`: as of the last block, with the 95 % bound of a leak
+    where none is shown; `alarm`: the evidence with the highest score since the alarm was raised, until it is
+    acknowledged; `total_lpm`: leakage of pump and piston together [L/min], None where L/min cannot be stated.
     """
 
     t: float
@@ -134,14 +126,16 @@ class SequentialBalance:
                 f"{samples.rate:g} Hz and {', '.join(f'{name} [{unit}]' for name, unit in chosen.units.items())}"
             )
         if len(chosen):
+            last = None
             with np.errstate(all="ignore"):  # a block whose sums overflow says nothing
-                shown = [self._taken(block) for block in live.take(chosen.t, chosen.channels, chosen.rate)]
-            if shown and (last := shown[-1]) is not None:
+                for shown in live.take(chosen.t, chosen.channels, chosen.rate):
+                    last = self._taken(live, shown)
+            if last is not None:
                 total = last.total * last.flow if live.litres else None
-                self.state = replace(self.state, evidence=self._evidence(last), total_lpm=total)
+                self.state = replace(self.state, evidence=self._evidence(live, last), total_lpm=total)
         return self.state
 
-    def _taken(self, shown: Shown) -> BlockConductance | None:
+    def _taken(self, live: LiveBalance, shown: Shown) -> BlockConductance | None:
         """Take what a block shows, raise or sharpen the alarm; return the block, None where it says nothing."""
         before = self.state
         if isinstance(shown, NotJudged):
@@ -153,40 +147,38 @@ class SequentialBalance:
             self._detector.take(block.begin, block.end, block.g, block.sd)
             least = self._threshold if alarm is None else 0.5 * (alarm.score or 0.0)
             if self._detector.log_e(least) > least:
-                alarm = self._leak(block)
+                alarm = self._leak(live, block)
         self.state = replace(before, t=block.end, blocks=before.blocks + 1, alarm=alarm)
         return block
 
-    def _leak(self, block: BlockConductance) -> Evidence:
-        assert self._live is not None
+    def _leak(self, live: LiveBalance, block: BlockConductance) -> Evidence:
         rise, unit = self._detector.rise(), block.flow
-        onset, *interval = rise.onset
-        half = 1.96 * math.hypot(rise.deviation, rise.size * self._live.size_error)
+        onset, low, high = rise.onset
+        half = 1.96 * math.hypot(rise.deviation, rise.size * live.size_error)
         cause: Cause = "piston leak" if self._rig.valve.spool == "present" else "piston or pump leak"
         evidence = Evidence(
             "leak",
             "the leakage conductance steps up beyond its random walk",
-            score=2.0 * rise.log_e,
+            score=rise.score,
             threshold=2.0 * self._threshold,
             onset_s=onset,
-            onset_interval_s=(interval[0], interval[1]),
+            onset_interval_s=(low, high),
             leak_lpm=rise.size * unit,
             leak_interval_lpm=(max(rise.size - half, 0.0) * unit, (rise.size + half) * unit),
             cause=cause,
             detector="volume balance",
         )
-        return evidence if self._live.litres else without_flow(evidence, NO_RIG)
+        return evidence if live.litres else without_flow(evidence, NO_RIG)
 
-    def _evidence(self, block: BlockConductance) -> Evidence:
+    def _evidence(self, live: LiveBalance, block: BlockConductance) -> Evidence:
         """Return the evidence as of the last block."""
-        assert self._live is not None
-        log_e, litres = self._detector.log_e(), self._live.litres
+        log_e = self._detector.log_e()
         if log_e > self._threshold:
-            return self._leak(block)
+            return self._leak(live, block)
         bound, pump = self._detector.bound() * block.flow, math.exp(block.duty[1]) / LITRE_PER_MINUTE
         if not math.isfinite(bound):
             return _waits("for the next blocks")
-        limit = f"{bound:.2g} L/min" if litres else f"{100.0 * bound / pump:.2g} % of the pump's flow"
+        limit = f"{bound:.2g} L/min" if live.litres else f"{100.0 * bound / pump:.2g} % of the pump's flow"
         enough = bound <= beliefs("inference")["worth"]["share"] * pump
         return Evidence(
             "no leak" if enough else "cannot tell",
@@ -194,7 +186,7 @@ class SequentialBalance:
             score=max(2.0 * log_e, 0.0),
             threshold=2.0 * self._threshold,
             detector="volume balance",
-            bound_lpm=bound if litres else None,
+            bound_lpm=bound if live.litres else None,
         )
 
 
