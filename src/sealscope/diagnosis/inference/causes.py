@@ -168,7 +168,9 @@ def stepped(tested: Sequence[StepHypothesis], chance: float, other: OtherStep | 
     That where a step of its term is as rare as `chance` among so many, or it is the other's; None where nothing is.
     """
     named = next(iter(probabilities(tested, other)), None)
-    if tested and other is not None and named == other.cause and _coincides(tested[0].test, other):
-        return named
+    if tested and other is not None:
+        own = named == other.cause if _coincides(tested[0].test, other) else other.score > tested[0].score
+        if own:
+            return other.cause
     best = max((own.test for own in tested if own.cause == named), key=lambda test: test.score, default=None)
     return named if best is not None and best.chance * len(tested) < chance else None

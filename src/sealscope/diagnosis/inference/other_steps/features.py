@@ -25,7 +25,7 @@ _BESIDE = (3.0, 4.0, 5.0)
 
 
 def duty_tests(recording: Recording) -> list[StepTest]:
-    """Return the tests of the size of command and motion, two where the channels show both.
+    """Return the tests of the size of command and motion, two where the channels show both; none where one stays.
 
     A duty of another size changes them alike; a leak one of them, in an open or in a closed loop.
     """
@@ -39,7 +39,8 @@ def duty_tests(recording: Recording) -> list[StepTest]:
         if name := next((own for own in names if own in recording), None):
             low, high = np.nanpercentile(_blocks(recording, length)[name], [2.0, 98.0], axis=1)
             sizes.append(np.log(high - low))
-    return [test for own in sizes if (test := _test(recording, own, length)) is not None]
+    tests = [_test(recording, own, length) for own in sizes]
+    return [test for test in tests if test is not None] if None not in tests else []
 
 
 def sensor_tests(recording: Recording) -> list[tuple[str, StepTest]]:
