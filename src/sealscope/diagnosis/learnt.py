@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from sealscope.recordings.recording import Recording
@@ -17,22 +17,11 @@ Lesson = Mapping[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class Learnt:
-    """What a healthy recording has taught.
+    """What the healthy recording of a `file` has taught.
 
-    Parameters
-    ----------
-    file : str
-        Name of its file.
-    digest : str
-        Hash of its chamber pressures in hexadecimal digits, by which copies are known.
-    units : mapping of str to str
-        Units by channel.
-    rate, seconds : float
-        Sampling rate [Hz], and length [s].
-    start_s : float or None
-        When its first sample was taken [s since 1970].
-    lessons : mapping of str to mapping
-        By the names of the detectors that could use the recording.
+    `digest`: hash of its chamber pressures in hexadecimal digits, by which copies are known; `units` by channel; `rate`
+    [Hz]; `seconds` long; `start_s`: when its first sample was taken [s since 1970], None where not known; `lessons` by
+    the names of the detectors that could use it; `about`: what people read of it, pressure, oil, noise.
     """
 
     file: str
@@ -42,6 +31,7 @@ class Learnt:
     seconds: float
     start_s: float | None
     lessons: Mapping[str, Lesson]
+    about: Mapping[str, Any] = field(default_factory=dict)
 
 
 #: A healthy recording, or what it taught.
