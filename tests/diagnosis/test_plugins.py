@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from sealscope.diagnosis import detector, plugins
+from sealscope.diagnosis import detector, registry
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.registry import DETECTORS, detectors
 from sealscope.recordings.recording import Recording
@@ -39,12 +39,12 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
         info = tmp_path / f"{distribution}-1.0.dist-info"
         info.mkdir()
         (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1.0\n", encoding="utf-8")
-        lines = [f"[{plugins.GROUP}]", *(f"{name} = {value}" for name, value in points.items())]
+        lines = [f"[{registry.GROUP}]", *(f"{name} = {value}" for name, value in points.items())]
         (info / "entry_points.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
         forget()
 
     def forget() -> None:
-        plugins.plug_ins.cache_clear()
+        registry.plug_ins.cache_clear()
         detector._log_once.cache_clear()
 
     before = set(sys.modules)
@@ -61,7 +61,7 @@ def reported(caplog: pytest.LogCaptureFixture) -> list[str]:
 
 def test_the_documented_example_is_found_and_heard(install: Install, leaky: Recording) -> None:
     project = tomllib.loads((EXAMPLE / "pyproject.toml").read_text(encoding="utf-8"))
-    points = project["project"]["entry-points"][plugins.GROUP]
+    points = project["project"]["entry-points"][registry.GROUP]
     assert points == {"ringing energy": "ringing_energy:RingingEnergy"}
     install("ringing_energy", (EXAMPLE / "ringing_energy.py").read_text(encoding="utf-8"), points)
     assert list(detectors()) == ["rms change", "ringing energy"]
@@ -138,7 +138,7 @@ def test_two_of_one_name(install: Install, healthy: Recording, caplog: pytest.Lo
 def test_another_source_is_another_fingerprint(install: Install) -> None:
     install("first", GOOD, {"good": "first:Good"})
     install("second", GOOD + "\n# changed\n", {"fine": "second:Good"})
-    prints = [one.fingerprint for one in plugins.plug_ins(frozenset())]
+    prints = [one.fingerprint for one in registry.plug_ins(frozenset()).values()]
     assert len(set(prints)) == 2
     assert "unknown" not in prints
 
