@@ -217,7 +217,7 @@ def _checked(recording: object, baseline: Recording | Sequence[Healthy]) -> list
     """Return the baselines; InputError where they, or the recording, are something else."""
     single = isinstance(baseline, Recording | str | os.PathLike)
     try:
-        healthy: list[Any] = [baseline] if single else list(baseline)
+        healthy: list[Any] = [baseline] if single else [*baseline]  # type: ignore[misc]
     except TypeError:
         kind = type(baseline).__name__
         raise InputError(f"baseline must be a Recording or a sequence of Recordings, got {kind}") from None

@@ -25,18 +25,13 @@ if TYPE_CHECKING:
     import matplotlib.axes
     import pandas
 
-#: Figures of a diagnosis that stand in its plain form as they are, and those of a detector, and of a finding.
-_FIGURES = (
-    *("file", "verdict", "reason", "onset_s", "onset_interval_s", "leak_lpm", "leak_interval_lpm", "bound_lpm"),
-    *("unused", "false_alarm_probability", "score", "threshold"),
-)
-_OF_METHOD = ("score", "threshold", "verdict", "reason")
-_OF_FINDING = ("code", "channel", "count", "first_t", "severity", "text")
 #: Columns of a table of diagnoses, beside those of the intervals.
 _COLUMNS = (
     *("file", "start", "machine", "verdict", "reason", "onset_s", "leak_lpm", "bound_lpm", "score", "threshold"),
     *("chance", "odds", "false_alarm_probability", "cause", "summary", "next_check"),
 )
+#: What the file of a recording may call its machine.
+_MACHINES = ("machine", "actuator", "asset", "serial number", "serial", "rig", "test rig", "maschine", "prüfstand")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,13 +109,8 @@ class Diagnosis(Evidence):
     @property
     def severity(self) -> Severity | None:
         """How bad the leak is; None where there is none, or nothing is known of its size."""
-        contradicted = (
-            "leak_lpm" in self.refuses
-            and self.machine is not None
-            and self.machine.stated
-            and self.measured_ratio is not None
-        )
-        return severity(self, self.limit, trusts_position=not contradicted)
+        measured, stated = self.measured_ratio is not None, self.machine is not None and self.machine.stated
+        return severity(self, self.limit, trusts_position=not ("leak_lpm" in self.refuses and stated and measured))
 
     @property
     def limit_lpm(self) -> float | None:
@@ -154,19 +144,8 @@ class Diagnosis(Evidence):
     @property
     def machine_name(self) -> str | None:
         """What the file calls the machine; None where it does not say."""
-        of_machine = (
-            "machine",
-            "actuator",
-            "asset",
-            "serial number",
-            "serial",
-            "rig",
-            "test rig",
-            "maschine",
-            "prüfstand",
-        )
         names = {name.lower(): text for name, text in self.about.items()}
-        return next((names[name] for name in of_machine if name in names), None)
+        return next((names[name] for name in _MACHINES if name in names), None)
 
     @property
     def methods(self) -> tuple[Evidence, ...]:
@@ -204,31 +183,34 @@ class Diagnosis(Evidence):
 
         A number that is not finite becomes null.
         """
-        ratio = self.measured_ratio or (None, None)
-        of_passage = {} if self.passage is None else vars(self.passage)
-        passage = {("pressure_Pa" if name == "pressure" else name): value for name, value in of_passage.items()}
+        ratio, passage = self.measured_ratio or (None, None), self.passage and dict(vars(self.passage))
+        if passage:
+            passage["pressure_Pa"] = passage.pop("pressure")
         methods = [
-            {"name": own.detector}
-            | {name: getattr(own, name) for name in _OF_METHOD}
-            | {"chance": own.stated_chance, "odds": own.odds}
+            {"name": own.detector, "score": own.score, "threshold": own.threshold, "verdict": own.verdict}
+            | {"reason": own.reason, "chance": own.stated_chance, "odds": own.odds}
             for own in self.methods
         ]
-        evidence = {
-            "detector": self.detector or None,
-            "share": self.share,
-            "baselines": self.baselines,
-            "ratio": ratio[0],
-            "ratio_interval": ratio[1],
-            "refuses": sorted(self.refuses),
-        }
+        names = ("code", "channel", "count", "first_t", "severity", "text")
         return plain(  # type: ignore[no-any-return]
             {
-                **{name: getattr(self, name) for name in _FIGURES},
+                "file": self.file,
+                "verdict": self.verdict,
+                "reason": self.reason,
+                "onset_s": self.onset_s,
+                "onset_interval_s": self.onset_interval_s,
+                "leak_lpm": self.leak_lpm,
+                "leak_interval_lpm": self.leak_interval_lpm,
+                "bound_lpm": self.bound_lpm,
+                "unused": self.unused,
+                "false_alarm_probability": self.false_alarm_probability,
+                "score": self.score,
+                "threshold": self.threshold,
                 "methods": methods,
-                "quality": [{name: getattr(own, name) for name in _OF_FINDING} for own in self.quality],
+                "quality": [{name: getattr(own, name) for name in names} for own in self.quality],
                 "cause": self.cause,
                 "next_check": self.next_check,
-                "passage": passage or None,
+                "passage": passage,
                 "chance": self.stated_chance,
                 "odds": self.odds,
                 "summary": self.summary,
@@ -238,8 +220,15 @@ class Diagnosis(Evidence):
                 "rig": self.machine and self.machine.as_dict(),
                 "severity": self.severity and self.severity.as_dict(),
                 "limit": self.limit.as_dict(),
-                "evidence": evidence,
-                "state": self.state.as_dict(),
+                "evidence": {
+                    "detector": self.detector or None,
+                    "share": self.share,
+                    "baselines": self.baselines,
+                    "ratio": ratio[0],
+                    "ratio_interval": ratio[1],
+                    "refuses": sorted(self.refuses),
+                },
+                "state": self.state,
             }
         )
 
