@@ -13,8 +13,7 @@ import pytest
 from sealscope.diagnosis.trend.reading import LeakReading
 from sealscope.diagnosis.trend.trend import Trend, trend_of
 from sealscope.errors import InputError
-from sealscope.reporting.trend.chart import chart_of
-from sealscope.reporting.trend.page import render_trend_page, write_trend_page
+from sealscope.reporting.trend.page import chart_of, render_trend_page, write_trend_page
 from sealscope.reporting.trend.text import trend_text
 
 

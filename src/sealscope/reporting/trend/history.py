@@ -15,11 +15,8 @@ from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
 from sealscope.reporting import charts, messages, template
-from sealscope.reporting.trend.chart import SIZES, Scale, day_ticks, with_margin
+from sealscope.reporting.trend.page import SIZES, Scale, with_margin
 from sealscope.reporting.trend.text import stamp
-
-#: A figure of more than so many times the median one is not drawn to scale: it would press the others flat.
-_FAR = 8.0
 
 
 class Judged(NamedTuple):
@@ -108,38 +105,26 @@ def history_chart(ordered: Sequence[Judged], size: str) -> dict[str, Any] | None
     dated = all(own.start_s is not None for own in ordered)
     days = [(own.start_s or 0.0) / DAY if dated else float(k + 1) for k, own in enumerate(ordered)]
     limit = ordered[-1].diagnosis.limit_lpm
-    far = _FAR * float(np.median([level.lpm for level in known])) or math.inf
+    far = 8.0 * float(np.median([level.lpm for level in known])) or math.inf  # beyond it others would be pressed flat
     near = [value for level in known for value in (level.lpm, level.high) if value <= far and value < math.inf]
     near += [] if limit is None or limit > far else [limit]
-    top = 1.08 * max(near, default=0.0) or 1.0
-    scale = Scale(*SIZES[size], with_margin(days[0], days[-1]), (0.0, top))
-    drawn: dict[str, list[dict[str, Any]]] = {"points": [], "bounds": [], "beyond": []}
+    scale = Scale(size, with_margin(days[0], days[-1]), (0.0, 1.08 * max(near, default=0.0) or 1.0))
+    drawn: dict[str, list[Any]] = {"points": [], "bounds": [], "beyond": [], "absent": []}
     for own, day, level in zip(ordered, days, levels, strict=True):
         if level is None:
+            drawn["absent"].append(scale.x(day))
             continue
-        mark = {"x": scale.x(day), "y": scale.y(min(level.lpm, top)), "kind": "first"}
+        mark = {"x": scale.x(day), "y": scale.y(level.lpm), "kind": "first"}
         mark["title"] = f"{Path(own.diagnosis.file).name}: {messages.flow(own.diagnosis)}"
-        if level.lpm > top:
+        if level.lpm > scale.levels[1]:
             drawn["beyond"].append(mark)
         elif level.low is None:
             drawn["bounds"].append(mark)
         else:
-            ends = {"low": scale.y(max(level.low, 0.0)), "high": scale.y(min(level.high, top))}
-            drawn["points"].append(mark | ends)
-    span = days[-1] - days[0]
-    ticks = day_ticks(scale, days[0])
-    ticks = ticks if dated else [day for day in ticks if day.is_integer()]
-    return {
-        **scale.frame,
-        **drawn,
-        "course": [],
-        "bands": [],
-        "marks": [],
-        "absent": [scale.x(day) for day, level in zip(days, levels, strict=True) if level is None],
-        "limit": None if limit is None or limit > top else scale.y(limit),
-        "x_ticks": [(scale.x(day), stamp(day * DAY, span) if dated else f"{day:g}") for day in ticks],
-        "y_ticks": [(scale.y(level), f"{level:.6g}") for level in charts.ticks(0.0, top, 4)],
-    }
+            drawn["points"].append(mark | {"low": scale.y(level.low), "high": scale.y(level.high)})
+    ticks = [day for day in scale.day_ticks(days[0]) if dated or day.is_integer()]
+    labels = [stamp(day * DAY, days[-1] - days[0]) if dated else f"{day:g}" for day in ticks]
+    return scale.picture(list(zip(map(scale.x, ticks), labels, strict=True)), limit=scale.limit(limit), **drawn)
 
 
 def _level(diagnosis: Diagnosis) -> _Level | None:
