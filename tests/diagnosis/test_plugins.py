@@ -28,6 +28,11 @@ class Good:
 Install = Callable[..., None]
 
 
+@pytest.fixture(scope="module")
+def short(healthy: Recording) -> Recording:
+    return healthy.between(0.0, 30.0)
+
+
 @pytest.fixture
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
     """Install a distribution of that name with its source and entry points, as pip would leave it."""
@@ -74,13 +79,13 @@ def test_the_documented_example_is_found_and_heard(install: Install, leaky: Reco
     assert {"ringing of p_A", "ringing of p_B"} <= set(result)
 
 
-def test_it_is_made_for_the_rig_that_is_assumed(install: Install, healthy: Recording) -> None:
+def test_it_is_made_for_the_rig_that_is_assumed(install: Install, short: Recording) -> None:
     from sealscope.parameters import load_rig
 
     install("fine", GOOD, {"good": "fine:Good"})
     for name in ("thesis", "thesis-calibrated"):
         rig = load_rig(name)
-        methods = {one.detector: one for one in diagnose(healthy, rig=rig).methods}
+        methods = {one.detector: one for one in diagnose(short, rig=rig).methods}
         assert methods["good"].reason == f"assumed {rig.name}"
 
 
@@ -111,13 +116,13 @@ BROKEN = {
 
 @pytest.mark.parametrize("case", BROKEN)
 def test_a_broken_one_costs_one_line_that_names_the_distribution(
-    case: str, install: Install, healthy: Recording, caplog: pytest.LogCaptureFixture
+    case: str, install: Install, short: Recording, caplog: pytest.LogCaptureFixture
 ) -> None:
     source, points, words = BROKEN[case]
-    expected = diagnose(healthy)
+    expected = diagnose(short)
     install("broken", source, points)
     with caplog.at_level(logging.WARNING, "sealscope"):
-        result = [diagnose(healthy), diagnose(healthy)]
+        result = [diagnose(short), diagnose(short)]
     (line,) = reported(caplog)  # once, however often it fails
     assert "\n" not in line
     assert "of broken is left out" in line
@@ -126,7 +131,7 @@ def test_a_broken_one_costs_one_line_that_names_the_distribution(
         assert (one.verdict, one.score, one.reason) == (expected.verdict, expected.score, expected.reason)
 
 
-def test_two_of_one_name(install: Install, healthy: Recording, caplog: pytest.LogCaptureFixture) -> None:
+def test_two_of_one_name(install: Install, caplog: pytest.LogCaptureFixture) -> None:
     install("first", GOOD, {"good": "first:Good"})
     install("second", GOOD, {"good": "second:Good"})
     with caplog.at_level(logging.WARNING, "sealscope"):

@@ -16,7 +16,8 @@ from scipy.stats import halfnorm, multivariate_normal
 import sealscope as ss
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.trend.reading import LeakReading, reading_of
-from sealscope.diagnosis.trend.trend import Trend, trend_of
+from sealscope.diagnosis.trend.trend import Trend
+from sealscope.diagnosis.trend.trend import trend as trend_of
 from sealscope.diagnosis.trend.wear import MONTH, DayToDay, Level, Levels, beyond, episodes, search
 from sealscope.errors import InputError
 from sealscope.recordings.oil import oil_temperature

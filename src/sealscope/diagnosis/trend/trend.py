@@ -54,26 +54,21 @@ class Trend:
     pressure : float or None
         Pressure difference for which L/min are stated [Pa].
     points : tuple of TrendPoint
-        The recordings in the order of their times.
+        The recordings in the order of their times; `rows`: numbers of those that the episodes count.
     groups : tuple of str
         What sets each group of recordings apart from the first one.
     episodes : tuple of Episode
         Stretches between repairs; the last one is that of the machine as it is. Days of its `wear` count from the first
         recording.
-    rows : tuple of int
-        Numbers of the points that the episodes count.
     repair : RepairLimit
         Leak beyond the healthy level at which a repair is due; `limit` is that level.
     machine : AssumedMachine or None
         What was assumed of the machine, and who stated it.
     findings : tuple of Finding
         What is left out, not comparable or missing, and why.
-    years : float
-        Machine-years to a false alarm.
-    healthy : int
-        First recordings that were known to be healthy.
-    dated : bool
-        Whether the times are those of the recordings, as opposed to equal intervals.
+    years, healthy, dated
+        Machine-years to a false alarm, first recordings that were known to be healthy, and whether the times are those
+        of the recordings, as opposed to equal intervals.
 
     Examples
     --------
@@ -195,7 +190,7 @@ class Trend:
 
 @checked_call
 def trend(
-    recordings: Iterable[Recording],
+    recordings: Iterable[Recording | LeakReading],
     *,
     rig: Rig | str | os.PathLike[str] | None = None,
     healthy: int = 1,
@@ -208,7 +203,7 @@ def trend(
     Parameters
     ----------
     recordings : iterable of Recording
-        Recordings of the machine, in any order; copies count once.
+        Recordings of the machine, in any order, or readings of them; copies count once.
     rig : Rig, str or path-like, optional
         What may be assumed of the machine, as for `diagnose`; without it, and where the recordings do not tell, levels
         are relative.
@@ -241,25 +236,13 @@ def trend(
     >>> ss.trend(days).verdict
     'no leak'
     """
-    readings = [reading_of(recording, rig) for recording in recordings]
-    return trend_of(readings, healthy=healthy, limit=limit, years=years, every=every)
-
-
-def trend_of(
-    readings: Sequence[LeakReading],
-    *,
-    healthy: int = 1,
-    limit: str | None = None,
-    years: float = 10.0,
-    every: float | None = None,
-) -> Trend:
-    """Return the trend of readings; arguments and errors as for `trend`."""
     if not (isinstance(healthy, int) and healthy >= 1):
         raise InputError(f"the number of healthy recordings must be 1 or more, got {healthy!r}")
     if not 0.1 <= years <= 1000.0:
         raise InputError(f"machine-years to a false alarm must be 0.1 to 1000, got {years!r}")
     if every is not None and not (math.isfinite(every) and every > 0.0):
         raise InputError(f"every must be > 0 s, got {every!r}")
+    readings = [own if isinstance(own, LeakReading) else reading_of(own, rig) for own in recordings]
     line = timeline(readings, every)
     kept = tuple(k for k, point in enumerate(line.points) if point.group >= 0)
     flows = bool(kept) and all(line.readings[k].states_flow for k in kept)
@@ -336,27 +319,23 @@ def _levels(trend: Trend, readings: Sequence[LeakReading]) -> tuple[Levels, DayT
 
 def _verdict(trend: Trend) -> tuple[Verdict, str]:
     """Return the verdict and why."""
-    wear = trend.wear
+    rate, wear = f"1 false alarm in {trend.years:g} machine-years", trend.wear
     if wear is None:
         reasons = dict.fromkeys(point.note for point in trend.points if point.note)
-        return "cannot tell", "no recording states a level" + (f": {next(iter(reasons))}" if reasons else "")
+        return "cannot tell", ": ".join(["no recording states a level", *list(reasons)[:1]])
     last = trend.episodes[-1]
-    rate = f"1 false alarm in {trend.years:g} machine-years"
+    beyond_scatter = f"beyond the machine's own scatter ({rate})"
     if trend.basis == "ringing":
+        ringing = "the damping of the pressures' ringing"
         if last.alarm is None:
-            return "cannot tell", (
-                f"the damping of the pressures' ringing did not change beyond the machine's own scatter ({rate}); it "
-                "states no flow"
-            )
+            return "cannot tell", f"{ringing} did not change {beyond_scatter}; it states no flow"
         return "cannot tell", (
-            f"the damping of the pressures' ringing rose beyond the machine's own scatter ({rate}): a leak, warmer "
-            "oil, or another machine; without angle and position, or command, they cannot be told apart"
+            f"{ringing} rose {beyond_scatter}: a leak, warmer oil, or another machine; without angle and position, or "
+            "command, they cannot be told apart"
         )
     if last.alarm is not None:
         shape = "grows" if wear.step is None else "stepped up"
-        return "leak", (
-            f"the leakage {shape} beyond the machine's own scatter ({rate}); pump and piston are not told apart"
-        )
+        return "leak", f"the leakage {shape} {beyond_scatter}; pump and piston are not told apart"
     count = last.end - last.begin
     if count < 3:
         return "cannot tell", f"{count} comparable recordings are too few, 3 are needed"

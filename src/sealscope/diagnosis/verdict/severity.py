@@ -138,9 +138,9 @@ def beside_the_pump(evidence: Evidence, recording: Recording, machine: AssumedMa
 
 def _mean_speed(recording: Recording) -> float:
     """Return the mean size of the pump's speed [rad/s], 0 where it is not recorded in its unit."""
-    if recording.units.get("omega") == "rad/s":
+    if "omega" in recording and recording.units["omega"] == "rad/s":
         return float(np.nanmean(np.abs(recording["omega"])))
-    if recording.units.get("theta") == "rad" and len(recording) > 1:
+    if "theta" in recording and recording.units["theta"] == "rad" and len(recording) > 1:
         return float(np.nanmean(np.abs(np.diff(recording["theta"])))) * recording.rate
     return 0.0
 

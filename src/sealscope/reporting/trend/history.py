@@ -27,12 +27,8 @@ class Judged(NamedTuple):
     read: Callable[[], Recording]
 
 
-class _Level(NamedTuple):
-    """What a recording states of the leak [L/min]: figure and interval, or a bound where `low` is None."""
-
-    lpm: float
-    low: float | None
-    high: float
+#: What a recording states of the leak [L/min]: figure, ends of its interval; a bound where the lower one is None.
+_Level = tuple[float, float | None, float]
 
 
 def write_history_page(
@@ -43,21 +39,9 @@ def write_history_page(
 
 
 def render_history_page(judged: Sequence[Judged], title: str, left_out: int = 0) -> str:
-    """Return the page of a machine as HTML.
+    """Return the page of a machine as HTML: its recordings and their diagnoses, in any order.
 
-    Parameters
-    ----------
-    judged : sequence of Judged
-        Its recordings and their diagnoses, in any order.
-    title : str
-        Name of the machine.
-    left_out : int, optional
-        Files that could not be read.
-
-    Raises
-    ------
-    InputError
-        There is no recording.
+    `title`: name of the machine; `left_out`: files that could not be read. Raises InputError without a recording.
     """
     from markupsafe import Markup
 
@@ -105,8 +89,8 @@ def history_chart(ordered: Sequence[Judged], size: str) -> dict[str, Any] | None
     dated = all(own.start_s is not None for own in ordered)
     days = [(own.start_s or 0.0) / DAY if dated else float(k + 1) for k, own in enumerate(ordered)]
     limit = ordered[-1].diagnosis.limit_lpm
-    far = 8.0 * float(np.median([level.lpm for level in known])) or math.inf  # beyond it others would be pressed flat
-    near = [value for level in known for value in (level.lpm, level.high) if value <= far and value < math.inf]
+    far = 8.0 * float(np.median([lpm for lpm, *_ in known])) or math.inf  # beyond it others would be pressed flat
+    near = [value for lpm, _, high in known for value in (lpm, high) if value <= far and value < math.inf]
     near += [] if limit is None or limit > far else [limit]
     scale = Scale(size, with_margin(days[0], days[-1]), (0.0, 1.08 * max(near, default=0.0) or 1.0))
     drawn: dict[str, list[Any]] = {"points": [], "bounds": [], "beyond": [], "absent": []}
@@ -114,14 +98,15 @@ def history_chart(ordered: Sequence[Judged], size: str) -> dict[str, Any] | None
         if level is None:
             drawn["absent"].append(scale.x(day))
             continue
-        mark = {"x": scale.x(day), "y": scale.y(level.lpm), "kind": "first"}
-        mark["title"] = f"{Path(own.diagnosis.file).name}: {messages.flow(own.diagnosis)}"
-        if level.lpm > scale.levels[1]:
+        lpm, low, high = level
+        title = f"{Path(own.diagnosis.file).name}: {messages.flow(own.diagnosis)}"
+        mark = {"x": scale.x(day), "y": scale.y(lpm), "kind": "first", "title": title}
+        if lpm > scale.levels[1]:
             drawn["beyond"].append(mark)
-        elif level.low is None:
+        elif low is None:
             drawn["bounds"].append(mark)
         else:
-            drawn["points"].append(mark | {"low": scale.y(level.low), "high": scale.y(level.high)})
+            drawn["points"].append(mark | {"low": scale.y(low), "high": scale.y(high)})
     ticks = [day for day in scale.day_ticks(days[0]) if dated or day.is_integer()]
     labels = [stamp(day * DAY, days[-1] - days[0]) if dated else f"{day:g}" for day in ticks]
     return scale.picture(list(zip(map(scale.x, ticks), labels, strict=True)), limit=scale.limit(limit), **drawn)
@@ -129,11 +114,12 @@ def history_chart(ordered: Sequence[Judged], size: str) -> dict[str, Any] | None
 
 def _level(diagnosis: Diagnosis) -> _Level | None:
     leak, bound = diagnosis.leak_lpm, diagnosis.bound_lpm
-    if diagnosis.verdict == "leak" and leak is not None and math.isfinite(leak):
-        low, high = diagnosis.leak_interval_lpm or (leak, leak)
-        return _Level(leak, low if math.isfinite(low) else 0.0, high)
-    bounded = diagnosis.verdict != "leak" and bound is not None and math.isfinite(bound)
-    return _Level(bound, None, bound) if bounded else None  # type: ignore[arg-type]
+    if diagnosis.verdict != "leak":
+        return None if bound is None or not math.isfinite(bound) else (bound, None, bound)
+    if leak is None or not math.isfinite(leak):
+        return None
+    low, high = diagnosis.leak_interval_lpm or (leak, leak)
+    return leak, low if math.isfinite(low) else 0.0, high
 
 
 def _dates(ordered: Sequence[Judged]) -> list[str]:
