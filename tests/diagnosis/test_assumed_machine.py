@@ -85,7 +85,7 @@ def test_area_or_displacement_alone_gives_the_flow_whatever_the_other_is(ratio: 
 
 
 def test_pressures_alone_state_no_flow_without_a_rig() -> None:
-    own = simulate(command="3 sin(4t)", leak="0.02 L/min from 40 s", duration="80 s", seed=1)
+    own = simulate(command="3 sin(4t)", leak="0.02 L/min from 20 s", duration="40 s", seed=1)
     pressures = own.only(["u", "p_A", "p_B"])
     foreign = diagnose(replace(pressures, provenance={}))
     known = PressureResponse(assumed_rig(None, pressures)[0]).examine(pressures, [], 0.01)

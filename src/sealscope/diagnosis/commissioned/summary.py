@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.blocks import Columns, solve
 from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.inference.terms import ATMOSPHERE, equations
@@ -23,9 +24,7 @@ if TYPE_CHECKING:
     from sealscope.diagnosis.learnt import Learnt
     from sealscope.parameters import Rig
 
-#: Probability with which the smallest leak is found, and of a false alarm for which it is stated.
-POWER, FALSE_ALARM = 0.9, 0.01
-_BALANCE = VolumeBalance.name
+_BALANCE, _ASKED = VolumeBalance.name, beliefs("commissioned")["smallest"]
 
 
 class TermEstimate(NamedTuple):
@@ -87,9 +86,8 @@ class Summary:
             ("noise", ", ".join(noise)),
         ]
         if self.smallest is not None:
-            rows.append(
-                ("smallest leak", f"the next recording shows {self.smallest} ({100.0 * POWER:g} % of the time)")
-            )
+            share = 100.0 * _ASKED["power"]
+            rows.append(("smallest leak", f"the next recording shows {self.smallest} ({share:g} % of the time)"))
             half = "twice the pressure difference at the same flow; more recordings alone do not"
             if (times := self.smallest.halved_by) is not None:
                 half = f"{times * len(healthy)} healthy recordings instead of {len(healthy)}"
@@ -174,7 +172,7 @@ def summarised(healthy: Sequence[Learnt], rig: Rig | None, left_out: Sequence[st
     problems += [
         f"{own.file} is not like the others: its leakage differs from theirs by {abs(rise.score):.2g} deviations"
         for own, rise in zip(alike, rises, strict=True)
-        if len(rises) > 2 and 2.0 * min(rise.chance, 1.0 - rise.chance) < FALSE_ALARM
+        if len(rises) > 2 and 2.0 * min(rise.chance, 1.0 - rise.chance) < _ASKED["false_alarm"]
     ]
     return Summary(terms, noise, _smallest(balance, lessons, channels), problems)
 
@@ -208,11 +206,11 @@ def _smallest(balance: VolumeBalance, lessons: Sequence[Mapping[str, Any]], chan
 
     def findable(repeated: int) -> float:
         coming = balance.next_rise(lessons, channels, repeated)
-        return float((coming.threshold(FALSE_ALARM) + ndtri(POWER)) * coming.deviation)
+        return float((coming.threshold(_ASKED["false_alarm"]) + ndtri(_ASKED["power"])) * coming.deviation)
 
     pressure, flow = (float(np.median([own[name] for own in lessons])) for name in ("pressure", "flow"))
     scale, own = float(np.median([lesson["scale"] for lesson in lessons])), findable(1)
-    halved = next((times for times in (2, 3, 5, 10) if findable(times) <= 0.5 * own), None)
+    halved = next((times for times in _ASKED["repeats"] if findable(times) <= 0.5 * own), None)
     share = own * pressure / flow if flow > 0.0 else float("nan")
     return Smallest(own * pressure * scale / LITRE_PER_MINUTE if scale > 0.0 else None, share, halved)
 

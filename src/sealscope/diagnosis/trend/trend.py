@@ -339,7 +339,9 @@ def _verdict(trend: Trend) -> tuple[Verdict, str]:
     count = last.end - last.begin
     if count < 3:
         return "cannot tell", f"{count} comparable recordings are too few, 3 are needed"
-    detectable = 5.0 * max(wear.scatter, (wear.healthy.high - wear.healthy.low) / 3.92)
+    detectable = beliefs("trend")["course"]["detectable"] * max(
+        wear.scatter, (wear.healthy.high - wear.healthy.low) / 3.92
+    )
     if trend.limit is not None and wear.healthy.value + detectable > trend.limit:
         return "cannot tell", (
             f"the level scatters so much from recording to recording that a rise to the limit would not surely show: "

@@ -9,15 +9,13 @@ from textwrap import fill
 
 import numpy as np
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Interval
 from sealscope.diagnosis.trend.reading import DAY
 from sealscope.diagnosis.trend.trend import Trend
-from sealscope.diagnosis.trend.wear import MONTH
 from sealscope.recordings.formats.columns import counted
 from sealscope.reporting.messages import machine_text, number
 
-#: Furthest time that is stated [days].
-_FURTHEST = 120.0 * MONTH
 _BASES = {
     None: "",
     "volume balance": "Levels by the volume balance. ",
@@ -106,13 +104,14 @@ def _figure(interval: Interval, unit: str) -> str:
 def _reach(trend: Trend, limit: float, reach: Interval) -> str:
     """Return when the level reaches its limit, `reach` days after the last recording."""
     named, first, last = f"{number(limit, 2)} {trend.unit}", trend.points[0].day, trend.points[-1].day
-    value, low, high = (moment(trend, last + days) if days <= _FURTHEST else "later" for days in reach)
+    furthest = beliefs("trend")["course"]["furthest"]
+    value, low, high = (moment(trend, last + days) if days <= furthest else "later" for days in reach)
     if reach.value == 0.0:
         return f"{named} is reached"
-    if trend.alarm is not None and reach.value <= _FURTHEST:
+    if trend.alarm is not None and reach.value <= furthest:
         return f"{named}, reached {value} ({low} to {high}) if it goes on so"
-    if reach.low > _FURTHEST:
-        return f"{named}, not within {_FURTHEST / MONTH / 12.0:.0f} years"
+    if reach.low > furthest:
+        return f"{named}, not within {furthest / 365.25:.0f} years"
     if reach.low * max(len(trend.rows) - 1, 1) < last - first or math.isnan(reach.value):
         return f"{named}; the recordings are too few to say when"
     return f"{named}, not before {low} (95 %)"
