@@ -129,7 +129,7 @@ class Diagnosis(Evidence):
         course, level = self.course, self.limit_lpm
         if course is None or level is None or not course.whole:
             return None if course is None else level
-        onset = self.onset_s if self.onset_s is not None and math.isfinite(self.onset_s) else np.inf
+        onset = math.inf if self.onset_s is None or not math.isfinite(self.onset_s) else self.onset_s
         before = course.lpm[(course.t < onset) & np.isfinite(course.lpm)]
         return level + float(np.median(before)) if before.size else None
 
@@ -267,17 +267,16 @@ class Diagnosis(Evidence):
         MissingExtra
             matplotlib is not installed.
         """
-        if self.course is None:
-            raise InputError(
-                f"a diagnosis must state the leak over time to be drawn, got one that does not ({self.file})"
-            )
+        if (course := self.course) is None:
+            rule = "a diagnosis must state the leak over time to be drawn"
+            raise InputError(f"{rule}, got one that does not ({self.file})")
         try:
             from matplotlib.figure import Figure
         except ImportError:
             raise MissingExtra("a drawing needs matplotlib: pip install 'sealscope[report]'") from None
         axes = Figure(layout="constrained").subplots() if ax is None else ax
-        axes.plot(self.course.t, self.course.lpm, label="leak" if not self.course.whole else "pump and piston together")
-        axes.fill_between(self.course.t, self.course.low, self.course.high, alpha=0.3, label="95 % interval")
+        axes.plot(course.t, course.lpm, label="pump and piston together" if course.whole else "leak")
+        axes.fill_between(course.t, course.low, course.high, alpha=0.3, label="95 % interval")
         if self.onset_s is not None:
             axes.axvline(self.onset_s, color="C3", label="onset")
         if self.repair_lpm is not None:
@@ -298,9 +297,9 @@ class Diagnosis(Evidence):
     def _repr_html_(self) -> str:
         """Return the diagnosis as a table for notebooks."""
 
-        def shown(value: float | None, interval: tuple[float, float] | None = None) -> str | None:
+        def shown(value: float | None, interval: tuple[float, float] | None = None) -> str:
             ends = "" if interval is None else f" ({interval[0]:.4g} to {interval[1]:.4g})"
-            return None if value is None else f"{value:.4g}{ends}"
+            return "" if value is None else f"{value:.4g}{ends}"
 
         rows = [
             ("reason", self.reason),
