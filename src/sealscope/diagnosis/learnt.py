@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sealscope.recordings.recording import Recording
-
-if TYPE_CHECKING:
-    from sealscope.diagnosis.detector import Detector
 
 #: What a detector has learnt of a healthy recording, as plain values; the detector alone reads it.
 Lesson = Mapping[str, Any]
@@ -38,10 +35,7 @@ class Learnt:
 Healthy = Recording | Learnt
 
 
-def lessons_of(detector: Detector, baseline: Sequence[Healthy]) -> list[Lesson]:
+def lessons_of(detector: Any, baseline: Sequence[Healthy]) -> list[Lesson]:
     """Return what a detector has learnt of each healthy recording, from its samples or from what was written down."""
-    known = (
-        own.lessons.get(detector.name) if isinstance(own, Learnt) else detector.learn(own)  # type: ignore[attr-defined]
-        for own in baseline
-    )
+    known = (own.lessons.get(detector.name) if isinstance(own, Learnt) else detector.learn(own) for own in baseline)
     return [lesson for lesson in known if lesson is not None]

@@ -54,21 +54,26 @@ class Trend:
     pressure : float or None
         Pressure difference for which L/min are stated [Pa].
     points : tuple of TrendPoint
-        The recordings in the order of their times; `rows`: numbers of those that the episodes count.
+        The recordings in the order of their times.
     groups : tuple of str
         What sets each group of recordings apart from the first one.
     episodes : tuple of Episode
         Stretches between repairs; the last one is that of the machine as it is. Days of its `wear` count from the first
         recording.
+    rows : tuple of int
+        Numbers of the points that the episodes count.
     repair : RepairLimit
         Leak beyond the healthy level at which a repair is due; `limit` is that level.
     machine : AssumedMachine or None
         What was assumed of the machine, and who stated it.
     findings : tuple of Finding
         What is left out, not comparable or missing, and why.
-    years, healthy, dated
-        Machine-years to a false alarm, first recordings that were known to be healthy, and whether the times are those
-        of the recordings, as opposed to equal intervals.
+    years : float
+        Machine-years to a false alarm.
+    healthy : int
+        First recordings that were known to be healthy.
+    dated : bool
+        Whether the times are those of the recordings, as opposed to equal intervals.
 
     Examples
     --------
