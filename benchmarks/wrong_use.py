@@ -60,7 +60,7 @@ def main() -> None:
     runs = [
         dated(ss.simulate(command=DUTY, duration=SECONDS, set=HEALTHY, seed=seed), "2026-03-01") for seed in range(1, 6)
     ]
-    healthy = tuple(learn(run, rig, f"run{k + 1}")[0] for k, run in enumerate(runs))
+    healthy = tuple(learn(run, rig, f"run{k + 1}") for k, run in enumerate(runs))
     machine = ss.CommissionedMachine("actuator 7", healthy, rig)
     print("| used with | leak | cannot tell | no leak | named as another machine |\n| --- | --- | --- | --- | --- |")
     for name, (keywords, changes) in CASES.items():

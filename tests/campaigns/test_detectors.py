@@ -19,7 +19,7 @@ from sealscope.campaigns.judging.judge import judge
 from sealscope.campaigns.plans.detectors import ALL_CHANNELS, check_detector, plan_detector
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.campaigns.results import simulated_result, write_result
-from sealscope.diagnosis import plugins, registry
+from sealscope.diagnosis import registry
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.errors import InputError
@@ -84,8 +84,8 @@ class Watcher:
 def plan(tmp_path, monkeypatch):
     quick = {name: registry.DETECTORS[name] for name in ("volume balance", "rms change")}
     monkeypatch.setattr(registry, "DETECTORS", {**quick, "watcher": Watcher})
-    monkeypatch.setattr(plugins, "entry_points", lambda group: ())
-    plugins.plug_ins.cache_clear()
+    monkeypatch.setattr(registry, "entry_points", lambda group: ())
+    registry.plug_ins.cache_clear()
     plan_detector.cache_clear()
     examined.clear()
     path = tmp_path / "watched.toml"

@@ -30,7 +30,7 @@ def test_a_leak_from_the_start_needs_a_baseline(records, sound_ones: list[Record
         assert f"{count} comparable leak-free recording" in result.reason
 
 
-@pytest.mark.parametrize("count", [1, 3, 7])
+@pytest.mark.parametrize("count", [1, 7])
 def test_a_sound_one_is_no_leak_beside_sound_ones(count: int, records, sound_ones: list[Recording]) -> None:  # type: ignore[no-untyped-def]
     result = [diagnose(records(seed, duration=60.0, throttled=True), sound_ones[:count]) for seed in range(8)]
     assert "leak" not in [one.verdict for one in result]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import pytest
@@ -15,70 +14,26 @@ from hypothesis import strategies as st
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
-from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.diagnosis.verdict.severity import Severity
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
 
-KEYS = [
-    "file", "verdict", "reason", "onset_s", "onset_interval_s", "leak_lpm", "leak_interval_lpm",
-    "bound_lpm", "unused", "false_alarm_probability", "score", "threshold", "methods", "quality", "cause", "next_check",
-    "passage", "chance", "odds", "summary", "start", "machine", "about", "rig", "severity", "limit", "evidence",
-    "state",
-]  # fmt: skip
-VERDICTS = ("leak", "no leak", "cannot tell")
-CAUSES = get_args(Cause)
-
-
-def is_number(value: object) -> bool:
-    return value is None or (type(value) is float and math.isfinite(value))
-
-
-def is_pair(value: object) -> bool:
-    return value is None or (isinstance(value, list) and len(value) == 2 and all(type(one) is float for one in value))
+jsonschema = pytest.importorskip("jsonschema")
+DOCS = Path(__file__).parents[2] / "docs"
+SCHEMA = jsonschema.Draft202012Validator(json.loads((DOCS / "reference" / "verdict.schema.json").read_text()))
 
 
 def check(result: Diagnosis) -> None:
     """Everything that another program may rely on, after a way through text."""
     line = json.dumps(result.as_dict(), allow_nan=False)
-    assert "\n" not in line
     tree = json.loads(line)
-    assert list(tree) == KEYS
-    assert type(tree["file"]) is str
-    assert tree["verdict"] in VERDICTS
-    assert tree["reason"]
-    assert type(tree["reason"]) is str
-    assert "\n" not in tree["reason"]
-    assert is_number(tree["onset_s"])
-    assert is_number(tree["score"])
-    assert is_number(tree["threshold"])
-    assert is_number(tree["leak_lpm"])
-    assert is_number(tree["bound_lpm"])
+    SCHEMA.validate(tree)
+    assert "\n" not in line + tree["reason"] + tree["next_check"]
+    assert tree["reason"] and tree["next_check"] and tree["methods"][0]["verdict"] == tree["verdict"]
     assert tree["verdict"] != "leak" or tree["bound_lpm"] is None
-    assert is_pair(tree["onset_interval_s"])
-    assert is_pair(tree["leak_interval_lpm"])
-    assert type(tree["false_alarm_probability"]) is float
-    assert tree["methods"]
-    for method in tree["methods"]:
-        assert list(method) == ["name", "score", "threshold", "verdict", "reason", "chance", "odds"]
-        assert type(method["name"]) is str
-        assert type(method["reason"]) is str
-        assert method["verdict"] in VERDICTS
-        assert is_number(method["score"])
-        assert is_number(method["threshold"])
-    for finding in tree["quality"]:
-        assert list(finding) == ["code", "channel", "count", "first_t", "severity", "text"]
-        assert type(finding["count"]) is int
-        assert finding["severity"] in ("note", "warning", "fatal")
-        assert is_number(finding["first_t"])
-    assert tree["cause"] is None or tree["cause"] in CAUSES
-    assert tree["next_check"]
-    assert "\n" not in tree["next_check"]
-    assert tree["methods"][0]["verdict"] == tree["verdict"]
     if tree["onset_s"] is not None:
         first, last = tree["onset_interval_s"]
-        assert tree["verdict"] == "leak"
-        assert first <= tree["onset_s"] <= last
+        assert tree["verdict"] == "leak" and first <= tree["onset_s"] <= last
 
 
 @pytest.mark.usefixtures("rms_change_alone")
@@ -185,7 +140,7 @@ def test_any_recording_gets_a_verdict(data: st.DataObject) -> None:
 
 def test_every_field_is_documented(healthy: Recording) -> None:
     """Each key, and each key within it, stands in docs/verdict.md."""
-    page = (Path(__file__).parents[2] / "docs" / "verdict.md").read_text(encoding="utf-8")
+    page = (DOCS / "verdict.md").read_text(encoding="utf-8")
     tree = diagnose(healthy).as_dict()
     for key, value in tree.items():
         assert f"`{key}`" in page, key

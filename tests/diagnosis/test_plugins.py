@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from sealscope.diagnosis import detector, plugins
+from sealscope.diagnosis import detector, registry
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.registry import DETECTORS, detectors
 from sealscope.recordings.recording import Recording
@@ -28,6 +28,11 @@ class Good:
 Install = Callable[..., None]
 
 
+@pytest.fixture(scope="module")
+def short(healthy: Recording) -> Recording:
+    return healthy.between(0.0, 30.0)
+
+
 @pytest.fixture
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
     """Install a distribution of that name with its source and entry points, as pip would leave it."""
@@ -39,12 +44,12 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
         info = tmp_path / f"{distribution}-1.0.dist-info"
         info.mkdir()
         (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1.0\n", encoding="utf-8")
-        lines = [f"[{plugins.GROUP}]", *(f"{name} = {value}" for name, value in points.items())]
+        lines = [f"[{registry.GROUP}]", *(f"{name} = {value}" for name, value in points.items())]
         (info / "entry_points.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
         forget()
 
     def forget() -> None:
-        plugins.plug_ins.cache_clear()
+        registry.plug_ins.cache_clear()
         detector._log_once.cache_clear()
 
     before = set(sys.modules)
@@ -61,7 +66,7 @@ def reported(caplog: pytest.LogCaptureFixture) -> list[str]:
 
 def test_the_documented_example_is_found_and_heard(install: Install, leaky: Recording) -> None:
     project = tomllib.loads((EXAMPLE / "pyproject.toml").read_text(encoding="utf-8"))
-    points = project["project"]["entry-points"][plugins.GROUP]
+    points = project["project"]["entry-points"][registry.GROUP]
     assert points == {"ringing energy": "ringing_energy:RingingEnergy"}
     install("ringing_energy", (EXAMPLE / "ringing_energy.py").read_text(encoding="utf-8"), points)
     assert list(detectors()) == ["rms change", "ringing energy"]
@@ -74,13 +79,13 @@ def test_the_documented_example_is_found_and_heard(install: Install, leaky: Reco
     assert {"ringing of p_A", "ringing of p_B"} <= set(result)
 
 
-def test_it_is_made_for_the_rig_that_is_assumed(install: Install, healthy: Recording) -> None:
+def test_it_is_made_for_the_rig_that_is_assumed(install: Install, short: Recording) -> None:
     from sealscope.parameters import load_rig
 
     install("fine", GOOD, {"good": "fine:Good"})
     for name in ("thesis", "thesis-calibrated"):
         rig = load_rig(name)
-        methods = {one.detector: one for one in diagnose(healthy, rig=rig).methods}
+        methods = {one.detector: one for one in diagnose(short, rig=rig).methods}
         assert methods["good"].reason == f"assumed {rig.name}"
 
 
@@ -111,13 +116,13 @@ BROKEN = {
 
 @pytest.mark.parametrize("case", BROKEN)
 def test_a_broken_one_costs_one_line_that_names_the_distribution(
-    case: str, install: Install, healthy: Recording, caplog: pytest.LogCaptureFixture
+    case: str, install: Install, short: Recording, caplog: pytest.LogCaptureFixture
 ) -> None:
     source, points, words = BROKEN[case]
-    expected = diagnose(healthy)
+    expected = diagnose(short)
     install("broken", source, points)
     with caplog.at_level(logging.WARNING, "sealscope"):
-        result = [diagnose(healthy), diagnose(healthy)]
+        result = [diagnose(short), diagnose(short)]
     (line,) = reported(caplog)  # once, however often it fails
     assert "\n" not in line
     assert "of broken is left out" in line
@@ -126,7 +131,7 @@ def test_a_broken_one_costs_one_line_that_names_the_distribution(
         assert (one.verdict, one.score, one.reason) == (expected.verdict, expected.score, expected.reason)
 
 
-def test_two_of_one_name(install: Install, healthy: Recording, caplog: pytest.LogCaptureFixture) -> None:
+def test_two_of_one_name(install: Install, caplog: pytest.LogCaptureFixture) -> None:
     install("first", GOOD, {"good": "first:Good"})
     install("second", GOOD, {"good": "second:Good"})
     with caplog.at_level(logging.WARNING, "sealscope"):
@@ -138,7 +143,7 @@ def test_two_of_one_name(install: Install, healthy: Recording, caplog: pytest.Lo
 def test_another_source_is_another_fingerprint(install: Install) -> None:
     install("first", GOOD, {"good": "first:Good"})
     install("second", GOOD + "\n# changed\n", {"fine": "second:Good"})
-    prints = [one.fingerprint for one in plugins.plug_ins(frozenset())]
+    prints = [one.fingerprint for one in registry.plug_ins(frozenset()).values()]
     assert len(set(prints)) == 2
     assert "unknown" not in prints
 

@@ -22,8 +22,8 @@ THROTTLES = {"line.orifices": "present", "line.closed_A": "50[%]", "line.closed_
 
 
 def leaking(lpm: float, command: str) -> Recording:
-    leak = f"{lpm} L/min from 60 s"
-    experiment = Experiment.of(command=command, duration=120.0, leak=leak, set=THROTTLES, seed=3)
+    leak = f"{lpm} L/min from 30 s"
+    experiment = Experiment.of(command=command, duration=60.0, leak=leak, set=THROTTLES, seed=3)
     return simulate_with_truth(experiment).recording
 
 

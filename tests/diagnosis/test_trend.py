@@ -16,8 +16,9 @@ from scipy.stats import halfnorm, multivariate_normal
 import sealscope as ss
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.trend.reading import LeakReading, reading_of
-from sealscope.diagnosis.trend.trend import Trend, trend_of
-from sealscope.diagnosis.trend.wear import MONTH, DayToDay, Level, Levels, beyond, episodes, search
+from sealscope.diagnosis.trend.trend import Trend
+from sealscope.diagnosis.trend.trend import trend as trend_of
+from sealscope.diagnosis.trend.wear import MONTH, DayToDay, Level, Levels, beyond, search
 from sealscope.errors import InputError
 from sealscope.recordings.oil import oil_temperature
 from sealscope.units import LITRE_PER_MINUTE
@@ -341,12 +342,6 @@ def test_a_recording_that_states_nothing_is_left_out() -> None:
     trend = trend_of([replace(own, start=1.704e9), *life(5)])
     assert trend.points[0].value is None or trend.points[1].value is None
     assert any("still.csv" in finding.text for finding in trend.findings)
-
-
-def test_each_stretch_counts_its_own_false_alarms() -> None:
-    levels = levels_at(np.arange(10.0), np.zeros(10), 0.1)
-    (only,) = episodes(levels, PRIOR, years=10.0)
-    assert (only.begin, only.end, only.alarm, only.fell) == (0, 10, None, False)
 
 
 def test_without_a_stated_machine_levels_are_relative_and_a_creep_is_still_a_limit() -> None:

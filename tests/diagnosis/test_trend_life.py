@@ -12,7 +12,8 @@ import pytest
 
 import sealscope as ss
 from sealscope.diagnosis.trend.reading import LeakReading, reading_of
-from sealscope.diagnosis.trend.trend import Trend, trend_of
+from sealscope.diagnosis.trend.trend import Trend
+from sealscope.diagnosis.trend.trend import trend as trend_of
 from sealscope.diagnosis.trend.wear import MONTH
 from sealscope.recordings.recording import Recording
 from sealscope.reporting.trend.page import render_trend_page

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.trend.reading import LeakReading
-from sealscope.diagnosis.trend.trend import Trend, trend_of
+from sealscope.diagnosis.trend.trend import Trend
+from sealscope.diagnosis.trend.trend import trend as trend_of
 from sealscope.errors import InputError
-from sealscope.reporting.trend.chart import chart_of
-from sealscope.reporting.trend.page import render_trend_page, write_trend_page
+from sealscope.reporting.trend.page import chart_of, render_trend_page, write_trend_page
 from sealscope.reporting.trend.text import trend_text
 
 

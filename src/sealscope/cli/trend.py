@@ -38,7 +38,7 @@ def trend(
     """
     from sealscope.diagnosis.commissioned.machine import recordings_in
     from sealscope.diagnosis.trend.reading import reading_of
-    from sealscope.diagnosis.trend.trend import trend_of
+    from sealscope.diagnosis.trend.trend import trend as trend_of
     from sealscope.reporting.trend.page import write_trend_page
     from sealscope.reporting.trend.text import trend_csv, trend_text
     from sealscope.units import parse_quantity

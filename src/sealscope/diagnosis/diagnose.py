@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import KW_ONLY, dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -22,13 +21,10 @@ from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.diagnosis.verdict.machine import assumed_rig
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
+from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.motion import does_not_move
 from sealscope.recordings.recording import Recording
 
-if TYPE_CHECKING:
-    from sealscope.parameters import Rig
-
-_log = logging.getLogger(__name__)
 #: Probability of `leak` on a leak-free recording, unless the caller asks for another.
 FALSE_ALARM_PROBABILITY = 0.01
 
@@ -39,6 +35,7 @@ def check_probability(probability: float) -> None:
         raise InputError(f"false-alarm probability must be 0.0001 to 0.2, got {probability!r}")
 
 
+@dataclass(frozen=True, eq=False)
 class Examination:
     """One recording, its gaps bridged, without missing samples, and what detectors are given beside it.
 
@@ -47,41 +44,26 @@ class Examination:
     were given can be compared; `share` of what was to be judged that the recording is.
     """
 
-    def __init__(
-        self,
-        recording: Recording,
-        baseline: Sequence[Healthy] = (),
-        *,
-        false_alarm_probability: float,
-        rig: Rig | str | os.PathLike[str] = "thesis",
-        distrust: str | None = None,
-        refusal: str | None = None,
-        share: float = 1.0,
-    ) -> None:
-        self.recording, self.baseline, self.rig = recording, tuple(baseline), rig
-        self.false_alarm_probability = false_alarm_probability
-        self.distrust, self.refusal, self.share = distrust, refusal, share
-        self._detectors: dict[str, Detector] = {}
-        self._evidence: dict[tuple[str, frozenset[str]], Evidence] = {}
+    recording: Recording
+    baseline: Sequence[Healthy] = ()
+    _: KW_ONLY
+    false_alarm_probability: float
+    rig: Rig | str | os.PathLike[str] = "thesis"
+    distrust: str | None = None
+    refusal: str | None = None
+    share: float = 1.0
+    _detectors: dict[str, Detector] = field(default_factory=dict)
+    _evidence: dict[tuple[str, frozenset[str]], Evidence] = field(default_factory=dict)
 
     def through(self, channels: Iterable[str]) -> Examination:
         """Return the same recording with these channels alone; a detector that reads no other is not run again."""
         wanted = set(channels)
-        view = Examination(
-            self.recording.only(name for name in self.recording.channels if name in wanted),
-            [
-                own.only(name for name in own.channels if name in wanted)
-                for own in self.baseline
-                if isinstance(own, Recording)
-            ],
-            false_alarm_probability=self.false_alarm_probability,
-            rig=self.rig,
-            distrust=self.distrust,
-            refusal=self.refusal,
-            share=self.share,
+        recording, *baseline = (
+            own.only(name for name in own.channels if name in wanted)
+            for own in (self.recording, *self.baseline)
+            if isinstance(own, Recording)
         )
-        view._detectors, view._evidence = self._detectors, self._evidence
-        return view
+        return replace(self, recording=recording, baseline=baseline)
 
     def evidence(self, name: str) -> Evidence:
         """Return a detector's evidence, `cannot tell` where the recording lacks what it needs or where it fails.
@@ -90,16 +72,12 @@ class Examination:
         """
         from threadpoolctl import threadpool_limits
 
-        from sealscope.parameters import load_rig
-
-        factory = detectors()[name]
-        # a detector may state the channels that it `reads` where there is no baseline: another view differs in no other
-        visible = frozenset(self.recording.channels)
-        key = (name, visible)
+        factory, visible = detectors()[name], frozenset(self.recording.channels)
         try:
             if name not in self._detectors:
                 self._detectors[name] = factory(load_rig(self.rig))
             detector = self._detectors[name]
+            # a detector may state the channels that it `reads` where there is no baseline
             reads = visible if self.baseline else frozenset(getattr(detector, "reads", visible))
             key = (name, visible & reads)
             if key not in self._evidence:
@@ -107,11 +85,10 @@ class Examination:
                 # the bit
                 with np.errstate(all="ignore"), threadpool_limits(limits=1):
                     self._evidence[key] = self._run(name, detector)
+            return self._evidence[key]
         except Exception as error:
-            self._evidence[key] = Evidence(
-                "cannot tell", failure(name, getattr(factory, "distribution", None), error), detector=name, usable=False
-            )
-        return self._evidence[key]
+            why = failure(name, getattr(factory, "distribution", None), error)
+            return Evidence("cannot tell", why, detector=name, usable=False)
 
     def _run(self, name: str, detector: Detector) -> Evidence:
         if detector.name != name:
@@ -123,8 +100,7 @@ class Examination:
         if reason is None and baseline:
             reasons = [_unusable(detector, own) for own in baseline]
             baseline = tuple(own for own, why in zip(baseline, reasons, strict=True) if why is None)
-            if not baseline:
-                reason = f"no baseline recording can be used: {reasons[0]}"
+            reason = None if baseline else f"no baseline recording can be used: {reasons[0]}"
         if reason is not None:
             return Evidence("cannot tell", reason, detector=name, usable=False)
         evidence = checked(detector.examine(self.recording, baseline, self.false_alarm_probability))
@@ -217,7 +193,6 @@ def diagnose(
     known, machine = assumed_rig(rig, recording)
     inspection = inspected(recording)
     compared = comparable(inspection, baselines)
-    stated = {"false_alarm_probability": false_alarm_probability, "baselines": len(compared.parts), "limit": repair}
     evidence = Examination(
         inspection.part,
         compared.parts,
@@ -227,24 +202,29 @@ def diagnose(
         refusal=compared.refusal,
         share=inspection.share,
     ).fused(quick)
-    quality = (*inspection.findings, *compared.findings)
-    name = os.fspath(file) if file else None
-    return Diagnosis.of(evidence, recording, machine, file=name, quality=quality, **stated)
+    return Diagnosis.of(
+        evidence,
+        recording,
+        machine,
+        file=os.fspath(file) if file else None,
+        quality=(*inspection.findings, *compared.findings),
+        false_alarm_probability=false_alarm_probability,
+        baselines=len(compared.parts),
+        limit=repair,
+    )
 
 
 def _checked(recording: object, baseline: Recording | Sequence[Healthy]) -> list[Healthy]:
     """Return the baselines; InputError where they, or the recording, are something else."""
-    healthy: list[Any] = [baseline]
-    if not isinstance(baseline, Recording | str | os.PathLike):
-        try:
-            healthy = list(baseline)
-        except TypeError:
-            kind = type(baseline).__name__
-            raise InputError(f"baseline must be a Recording or a sequence of Recordings, got {kind}") from None
-    single = isinstance(baseline, str | os.PathLike)
-    names = ("recording", *("baseline" if single else f"baseline[{k}]" for k in range(len(healthy))))
-    for name, value in zip(names, (recording, *healthy), strict=True):
-        if not isinstance(value, Recording if name == "recording" else Recording | Learnt):
+    single = isinstance(baseline, Recording | str | os.PathLike)
+    try:
+        healthy: list[Any] = [baseline] if single else [*baseline]  # type: ignore[misc]
+    except TypeError:
+        kind = type(baseline).__name__
+        raise InputError(f"baseline must be a Recording or a sequence of Recordings, got {kind}") from None
+    named = [("baseline" if single else f"baseline[{k}]", own, Recording | Learnt) for k, own in enumerate(healthy)]
+    for name, value, kinds in (("recording", recording, Recording), *named):
+        if not isinstance(value, kinds):
             hint = "; sealscope.read makes one of a file" if isinstance(value, str | os.PathLike) else ""
             raise InputError(f"{name} must be a Recording, got {type(value).__name__} {value!r:.40}{hint}")
     return healthy

@@ -6,7 +6,6 @@ samples of another recording, are left out for all detectors alike.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -48,6 +47,17 @@ class Inspection:
             return f"needs {SHORTEST} samples or more without a gap, got {len(self.part)}"
         return self.distrust
 
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Units of the part by channel."""
+        return self.part.units
+
+    @property
+    def file(self) -> str | None:
+        """Name of the recording's file, None where it is of none."""
+        file = self.part.provenance.get("file")
+        return None if file is None else str(file)
+
     @cached_property
     def digest(self) -> str:
         """Hash of the chamber pressures: equal for copies of a recording."""
@@ -76,35 +86,27 @@ def _inspection(recording: Recording, names: Sequence[str]) -> Inspection:
         )
         findings.append(Finding("gaps_bridged", "note", None, rows.size, float(part.t[rows[0]]), text))
     stretches, count = uniform_segments(part, needed), len(part)
-    if not stretches:
-        part = part.between(math.inf, math.inf)
-    else:
-        longest = max(stretches, key=lambda stretch: stretch.stop - stretch.start)
-        if longest.stop - longest.start < count:
-            part = part.samples(longest)
+    longest = max(stretches, key=lambda stretch: stretch.stop - stretch.start, default=slice(0, 0))
+    if longest.stop - longest.start < count:
+        part = part.samples(longest)
+        if stretches:
             text = (
                 f"only the longest whole stretch was analysed: {part.t[0]:.4g} s to {part.t[-1]:.4g} s, {len(part)} of "
                 f"{count} samples"
             )
-            left_out = count - len(part)
-            findings.append(Finding("part_analysed", "warning", None, left_out, float(part.t[0]), text))
-    spoiled = next((own for own in findings if own.channel in chambers and _spoils(own, len(part))), None)
-    distrust = None if spoiled is None else f"the pressures cannot be trusted: {spoiled.text}"
+            findings.append(Finding("part_analysed", "warning", None, count - len(part), float(part.t[0]), text))
+    distrust = None
+    for own in findings:
+        # a chamber that empties into the tank stays at the rail for a while in any stroke
+        spoils = own.code in ("constant", "stuck") or (own.code == "clipped" and own.count > len(part) / 2)
+        if spoils and own.channel in chambers and distrust is None:
+            distrust = f"the pressures cannot be trusted: {own.text}"
     if distrust is None and len(part) >= SHORTEST and (reason := no_readings(part)):
         distrust = f"this is no recording of a hydraulic machine: {reason}"
     return Inspection(part, tuple(findings), distrust, len(part) / max(count, 1))
 
 
-def _spoils(finding: Finding, samples: int) -> bool:
-    """Return whether a finding on a chamber pressure of so many samples leaves no trust in its details.
-
-    A chamber that empties into the tank stays at the rail for a while in any stroke.
-    """
-    return finding.code in ("constant", "stuck") or (finding.code == "clipped" and finding.count > samples / 2)
-
-
-@dataclass(frozen=True, eq=False)
-class Baselines:
+class Baselines(NamedTuple):
     """Leak-free recordings that a recording can be compared with.
 
     `parts`: what of them can be analysed; `findings`: which were left out, and why; `refusal`: why none is left, None
@@ -123,54 +125,35 @@ def comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baselines:
     recording itself, and all but one copy (that with the most channels) of the same recording. What differs in speed,
     load and temperature is for the detectors to describe.
     """
-    inspections = [_Healthy.of(recording) for recording in baseline]
+    healthy = [own if isinstance(own, Learnt) else inspected(own) for own in baseline]
     chosen: dict[str, int] = {}
     left_out: dict[tuple[Severity, str], list[int]] = {}
-    for k in sorted(range(len(baseline)), key=lambda k: -len(inspections[k].units)):
-        own = inspections[k]
-        severity, reason = _refusal(judged, own)
-        if reason is None and own.digest in chosen:
-            severity, reason = "note", "the same samples as another baseline recording"
-        if reason is None:
+    for k in sorted(range(len(healthy)), key=lambda k: -len(healthy[k].units)):
+        own = healthy[k]
+        alike = all(own.units.get(name) == judged.units[name] for name in chambers_of(judged.part))
+        kind: tuple[Severity, str] | None = None
+        if isinstance(own, Inspection) and own.defect is not None:
+            kind = "warning", own.defect
+        elif own.digest == judged.digest:
+            kind = "warning", "the same samples as the recording itself"
+        elif not alike:
+            kind = "note", "other channels or units"
+        elif own.digest in chosen:
+            kind = "note", "the same samples as another baseline recording"
+        if kind is None:
             chosen[own.digest] = k
         else:
-            left_out.setdefault((severity, reason), []).append(k)
+            left_out.setdefault(kind, []).append(k)
     findings = []
     for (severity, reason), numbers in left_out.items():
-        names = [inspections[k].file or f"number {k + 1}" for k in sorted(numbers)]
+        names = [healthy[k].file or f"number {k + 1}" for k in sorted(numbers)]
         listed = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
-        count = f"{len(names)} of {len(baseline)} baseline recordings {'is' if len(names) == 1 else 'are'}"
+        count = f"{len(names)} of {len(healthy)} baseline recordings {'is' if len(names) == 1 else 'are'}"
         text = f"{count} left out: {reason} ({listed})"
         findings.append(Finding("baseline_left_out", severity, None, len(numbers), None, text))
     refusal = None
-    if baseline and not chosen:
+    if healthy and not chosen:
         most = max(left_out, key=lambda kind: len(left_out[kind]))
         refusal = f"no baseline recording can be used: {most[1]}"
-    return Baselines(tuple(inspections[k].part for k in sorted(chosen.values())), tuple(findings), refusal)
-
-
-class _Healthy(NamedTuple):
-    """A healthy recording to compare with: itself, or what it taught; why it cannot be used, None where it can."""
-
-    part: Healthy
-    units: Mapping[str, str]
-    digest: str
-    defect: str | None
-    file: str | None
-
-    @classmethod
-    def of(cls, healthy: Healthy) -> _Healthy:
-        if isinstance(healthy, Learnt):
-            return cls(healthy, healthy.units, healthy.digest, None, healthy.file)
-        own, file = inspected(healthy), healthy.provenance.get("file")
-        return cls(own.part, own.part.units, own.digest, own.defect, None if file is None else str(file))
-
-
-def _refusal(judged: Inspection, own: _Healthy) -> tuple[Severity, str | None]:
-    """Return why a baseline recording cannot be compared, None where it can, and how much that matters."""
-    if own.defect is not None:
-        return "warning", own.defect
-    if own.digest == judged.digest:
-        return "warning", "the same samples as the recording itself"
-    alike = all(own.units.get(name) == judged.part.units[name] for name in chambers_of(judged.part))
-    return "note", None if alike else "other channels or units"
+    parts = (own.part if isinstance(own := healthy[k], Inspection) else own for k in sorted(chosen.values()))
+    return Baselines(tuple(parts), tuple(findings), refusal)

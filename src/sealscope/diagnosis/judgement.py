@@ -31,21 +31,11 @@ def judging(evidences: Sequence[Evidence]) -> Evidence | None:
     return next((own for own in able or usable if not own.abstains), None)
 
 
-def judged(
-    evidences: Sequence[Evidence],
-    other: OtherStep | None = None,
-    refusal: str | None = None,
-) -> Evidence:
-    """Return the verdict on a recording.
+def judged(evidences: Sequence[Evidence], other: OtherStep | None = None, refusal: str | None = None) -> Evidence:
+    """Return the verdict on a recording, from the evidence of every detector that was asked.
 
-    Parameters
-    ----------
-    evidences : sequence of Evidence
-        That of every detector that was asked.
-    other : OtherStep, optional
-        What else than a leak stepped, by what a leak does not move.
-    refusal : str, optional
-        Why the recording cannot be compared with the baseline that was given: then only a leak is stated.
+    `other`: what else than a leak stepped, by what a leak does not move; `refusal`: why the recording cannot be
+    compared with the baseline that was given: then only a leak is stated.
     """
     ranked = sorted(evidences, key=lambda own: rank(own.detector))
     judge = judging(ranked)
@@ -59,23 +49,14 @@ def judged(
     if judge.share < 1.0:
         reasons.append(f"this rests on {100.0 * judge.share:.3g} % of the recording")
     if verdict == "no leak":
-        doubts = [] if refusal is None else [refusal]
-        if judge.share < 0.95:
-            doubts.append("and the rest may hide a leak (95% are needed)")
+        hidden = "and the rest may hide a leak (95% are needed)" if judge.share < 0.95 else None
+        doubts = [doubt for doubt in (refusal, hidden) if doubt is not None]
         reasons += doubts
         verdict = "cannot tell" if doubts else verdict
     others = [own for own in ranked if own is not judge]
     reasons += [text for own in others if own.usable and (text := _difference(judge, own)) is not None]
-    leaks = verdict == "leak"
-    return replace(
-        judge,
-        verdict=verdict,
-        cause=cause,
-        reason="; ".join(reasons),
-        onset_s=judge.onset_s if leaks else None,
-        onset_interval_s=judge.onset_interval_s if leaks else None,
-        parts=(judge, *others),
-    )
+    stated = replace(judge, verdict=verdict, cause=cause, reason="; ".join(reasons), parts=(judge, *others))
+    return stated if verdict == "leak" else replace(stated, onset_s=None, onset_interval_s=None)
 
 
 def _difference(judge: Evidence, other: Evidence) -> str | None:

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from typing import Any
 
 from sealscope.recordings.recording import Recording
-
-if TYPE_CHECKING:
-    from sealscope.diagnosis.detector import Detector
 
 #: What a detector has learnt of a healthy recording, as plain values; the detector alone reads it.
 Lesson = Mapping[str, Any]
@@ -17,22 +14,11 @@ Lesson = Mapping[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class Learnt:
-    """What a healthy recording has taught.
+    """What the healthy recording of a `file` has taught.
 
-    Parameters
-    ----------
-    file : str
-        Name of its file.
-    digest : str
-        Hash of its chamber pressures in hexadecimal digits, by which copies are known.
-    units : mapping of str to str
-        Units by channel.
-    rate, seconds : float
-        Sampling rate [Hz], and length [s].
-    start_s : float or None
-        When its first sample was taken [s since 1970].
-    lessons : mapping of str to mapping
-        By the names of the detectors that could use the recording.
+    `digest`: hash of its chamber pressures in hexadecimal digits, by which copies are known; `units` by channel; `rate`
+    [Hz]; `seconds` long; `start_s`: when its first sample was taken [s since 1970], None where not known; `lessons` by
+    the names of the detectors that could use it; `about`: what people read of it, pressure, oil, noise.
     """
 
     file: str
@@ -42,16 +28,14 @@ class Learnt:
     seconds: float
     start_s: float | None
     lessons: Mapping[str, Lesson]
+    about: Mapping[str, Any] = field(default_factory=dict)
 
 
 #: A healthy recording, or what it taught.
 Healthy = Recording | Learnt
 
 
-def lessons_of(detector: Detector, baseline: Sequence[Healthy]) -> list[Lesson]:
+def lessons_of(detector: Any, baseline: Sequence[Healthy]) -> list[Lesson]:
     """Return what a detector has learnt of each healthy recording, from its samples or from what was written down."""
-    known = (
-        own.lessons.get(detector.name) if isinstance(own, Learnt) else detector.learn(own)  # type: ignore[attr-defined]
-        for own in baseline
-    )
+    known = (own.lessons.get(detector.name) if isinstance(own, Learnt) else detector.learn(own) for own in baseline)
     return [lesson for lesson in known if lesson is not None]

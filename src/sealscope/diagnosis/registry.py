@@ -1,34 +1,97 @@
-"""Registry of detectors by name: the built-in ones and those of installed distributions."""
+"""Detectors by name: the built-in ones, and those of other distributions, found by entry point.
+
+A distribution names a class, or any function of a Rig that gives a detector, in its `pyproject.toml`:
+
+    [project.entry-points."sealscope.detectors"]
+    "pressure means" = "my_package:PressureMeans"
+
+A broken one is left out with a logged line.
+"""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache, partial
+from hashlib import sha256
 from importlib import import_module
+from importlib.metadata import entry_points
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sealscope.diagnosis.detector import Detector, Factory
-from sealscope.diagnosis.plugins import plug_ins
+from sealscope.diagnosis.detector import Detector, Factory, failure
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
+GROUP = "sealscope.detectors"
+#: Names that mean something else wherever detectors are named.
+_RESERVED = ("diagnose", "always fire", "never fire")
 
-def _built_in(module: str, name: str) -> Factory:
-    def make(rig: Rig) -> Detector:
-        detector: Detector = getattr(import_module(f"sealscope.diagnosis.{module}"), name)(rig)
-        return detector
 
-    return make
+@dataclass(frozen=True)
+class PlugIn:
+    """A detector of another distribution: called with a rig it gives the detector made for it."""
+
+    name: str
+    distribution: str
+    make: Factory
+
+    def __call__(self, rig: Rig) -> Detector:
+        """Make the detector."""
+        return self.make(rig)
+
+    @property
+    def fingerprint(self) -> str:
+        """A hash of the source file that it comes from, so that its results are not taken for another version's."""
+        source = getattr(sys.modules.get(getattr(self.make, "__module__", "")), "__file__", None)
+        try:
+            return sha256(Path(source).read_bytes()).hexdigest()[:16] if source else "unknown"
+        except OSError:
+            return "unknown"
+
+
+def _made(module: str, name: str, rig: Rig) -> Detector:
+    detector: Detector = getattr(import_module(f"sealscope.diagnosis.{module}"), name)(rig)
+    return detector
 
 
 #: The built-in detectors by name, loaded when first made; one contract test runs them all.
 DETECTORS: dict[str, Factory] = {
-    "volume balance": _built_in("inference.detector", "VolumeBalance"),
-    "pressure response": _built_in("inference.pressures.detector", "PressureResponse"),
-    "rms change": _built_in("rms_change.detector", "RmsChange"),
+    "volume balance": partial(_made, "inference.detector", "VolumeBalance"),
+    "pressure response": partial(_made, "inference.pressures.detector", "PressureResponse"),
+    "rms change": partial(_made, "rms_change.detector", "RmsChange"),
 }
 
 
 def detectors() -> Mapping[str, Factory]:
-    """Return every detector by name: the built-in ones, then those of installed distributions (`plugins`)."""
-    return {**DETECTORS, **{plug_in.name: plug_in for plug_in in plug_ins(frozenset(DETECTORS))}}
+    """Return every detector by name: the built-in ones, then those of installed distributions."""
+    return {**DETECTORS, **plug_ins(frozenset(DETECTORS))}
+
+
+@cache
+def plug_ins(taken: frozenset[str]) -> Mapping[str, PlugIn]:
+    """Return the detectors of installed distributions, in the order of their names.
+
+    One that cannot be loaded, or whose name is `taken` by a built-in detector, by another plug-in or by a reserved
+    word, is left out with one line that names its distribution. Looked for once in a process.
+    """
+    known: dict[str, PlugIn] = {}
+    for point in sorted(entry_points(group=GROUP), key=lambda point: (point.name, point.value)):
+        distribution = point.dist.name if point.dist is not None else point.value
+        try:
+            if point.name in known:
+                raise ValueError(f"its name is that of a detector of {known[point.name].distribution}")
+            if point.name in taken or point.name in _RESERVED:
+                raise ValueError("its name is taken by Sealscope itself")
+            if any(mark in point.name for mark in (" @ ", ",", "\n")) or not point.name.strip():
+                raise ValueError("its name must be plain words without ',' and '@'")
+            make = point.load()
+            if not callable(make):
+                raise TypeError(f"{point.value} must be callable with a rig, got {type(make).__name__}")
+        except Exception as error:
+            failure(point.name, distribution, error)
+            continue
+        known[point.name] = PlugIn(point.name, distribution, make)
+    return known

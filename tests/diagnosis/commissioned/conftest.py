@@ -17,6 +17,11 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
+def healthy(folder):
+    return [ss.read(path) for path in sorted(folder.iterdir())]
+
+
+@pytest.fixture(scope="session")
 def machine(folder):
     return ss.commission(folder, rig="thesis", name="actuator7")
 

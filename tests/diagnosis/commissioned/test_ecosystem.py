@@ -32,7 +32,7 @@ def test_the_estimator_learns_and_predicts(folder, leaking):
     assert np.greater(*detector.score_samples([new, leaking]))
     assert detector.predict([leaking, new]).tolist() == [-1, 1]
     twin = pickle.loads(pickle.dumps(detector))
-    np.testing.assert_array_equal([twin.decision_function([path])[0] for path in (new, leaking)], margins)
+    np.testing.assert_array_equal(twin.decision_function([leaking]), margins[1:])
     assert clone(detector).set_params(rate=500.0).get_params()["rig"] == "thesis"
 
 
@@ -69,10 +69,14 @@ def test_the_estimator_passes_the_checks_of_scikit_learn_that_apply():
             assert "recordings must be a folder's path or paths of files" in text or "sparse data" in text
 
 
-def test_a_diagnosis_is_a_row_of_a_table(machine, leaking):
+@pytest.fixture(scope="module")
+def leak(machine, leaking):
+    return machine.diagnose(leaking)
+
+
+def test_a_diagnosis_is_a_row_of_a_table(leak):
     """Columns are the same with and without a leak, and whatever channels were not used."""
     pandas = pytest.importorskip("pandas", reason="pandas is not installed")
-    leak = machine.diagnose(leaking)
     healthy = replace(leak, verdict="no leak", onset_interval_s=None, leak_interval_lpm=None, unused=("p_x", "p_y"))
     frames = [diagnosis.to_frame() for diagnosis in (leak, healthy)]
     assert list(frames[0]) == list(frames[1])
@@ -81,11 +85,9 @@ def test_a_diagnosis_is_a_row_of_a_table(machine, leaking):
     assert row["leak_interval_lpm_low"] < row["leak_lpm"] < row["leak_interval_lpm_high"]
 
 
-def test_a_diagnosis_is_drawn_with_the_repair_limit(machine, leaking):
+def test_a_diagnosis_is_drawn_with_the_repair_limit(leak):
     pytest.importorskip("matplotlib", reason="matplotlib is not installed")
-    diagnosis = machine.diagnose(leaking)
-    axes = diagnosis.plot()
+    axes = leak.plot()
     labels = [text.get_text() for text in axes.get_legend().get_texts()]
     assert labels[-1].startswith("repair limit (8 mm/min")
-    leak = axes.get_lines()[0]
-    np.testing.assert_array_equal(leak.get_ydata(), diagnosis.course.lpm)
+    np.testing.assert_array_equal(axes.get_lines()[0].get_ydata(), leak.course.lpm)

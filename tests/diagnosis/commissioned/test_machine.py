@@ -23,16 +23,15 @@ def figures(diagnosis: ss.Diagnosis) -> tuple:
     return diagnosis.verdict, diagnosis.score, diagnosis.leak_lpm, diagnosis.bound_lpm, diagnosis.cause
 
 
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=3, deadline=None)
 @given(
     leak=st.sampled_from(["none", "0.002 L/min", "0.02 L/min", "0.05 L/min from 10 s"]),
     channels=st.sampled_from([None, ("u", "p_A", "p_B")]),
     seed=st.integers(10, 99),
 )
-def test_the_file_judges_as_the_recordings_do(folder, file, by_pressures, leak, channels, seed):
+def test_the_file_judges_as_the_recordings_do(healthy, file, by_pressures, leak, channels, seed):
     """All methods, with every digit, whichever channels the judged recording has."""
     recording = ss.simulate(command="3 sin(4t)", duration="20 s", leak=leak, seed=seed)
-    healthy = [ss.read(path) for path in sorted(folder.iterdir())]
     machine = ss.load_machine(file)
     if channels is not None:
         recording, healthy = recording.only(channels), [own.only(channels) for own in healthy]
@@ -148,14 +147,14 @@ def test_a_file_is_whole_whenever_its_writer_is_killed(machine, folder, tmp_path
 
 
 HOSTILE = {
-    "format = 1": ("format = 7", "machine.format must be 1, got 7"),
-    'name = "actuator7"': ("name = 7", "name must be a text, got 7"),
-    "seconds = 20": ("seconds = nan\nlater = 20", "seconds must be a finite number, got nan"),
-    'digest = "': ('digest = 3 # "', "digest must be a text, got 3"),
-    "\npressure = ": ("\npressure = inf # ", "pressure must be a finite number"),
+    "format = 1": ("format = 7", "machine.format"),
+    'name = "actuator7"': ("name = 7", "machine.name"),
+    "seconds = 20": ("seconds = nan\nlater = 20", "healthy.0.seconds"),
+    'digest = "': ('digest = 3 # "', "healthy.0.digest"),
+    "\npressure = ": ("\npressure = inf # ", "pressure"),
     "sums = [[[": ("sums = [[[[", "must be TOML"),
     'terms = ["': ('terms = ["x", "', "sums must be of the shape"),
-    "levels = [": ('levels = ["a", ', "levels must hold numbers"),
+    "levels = [": ('levels = ["a", ', "levels"),
 }
 
 

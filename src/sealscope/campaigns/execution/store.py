@@ -83,8 +83,7 @@ def made_from(plan: SimulatedPlan, mode: str = RUN_BY_RUN) -> dict[str, Any]:
 
 def _plug_ins(plan: SimulatedPlan) -> dict[str, str]:
     """Return the detectors of other distributions that a plan runs, each with a hash of its source."""
-    from sealscope.diagnosis.plugins import PlugIn
-    from sealscope.diagnosis.registry import detectors
+    from sealscope.diagnosis.registry import PlugIn, detectors
 
     run = {detector.of for name in plan.detectors if (detector := plan_detector(name)).scorer is None}
     return {

@@ -63,13 +63,13 @@ class LeakDetector(OutlierMixin, BaseEstimator):  # type: ignore[misc]
 
     def score_samples(self, X: Paths) -> Array:
         """Return the negative score of each file: the lower, the more it leaks; nan where it cannot be judged."""
-        return np.array([np.nan if own.score is None else -own.score for own in self._diagnoses(X)], dtype=float)
+        return -np.array([own.score for own in self._diagnoses(X)], dtype=float)
 
     def decision_function(self, X: Paths) -> Array:
         """Return threshold less score of each file: < 0 for a leak, nan where it cannot be judged."""
-        judged = ((own.score, own.threshold) for own in self._diagnoses(X))
-        margins = [np.nan if score is None or least is None else least - score for score, least in judged]
-        return np.array(margins, dtype=float)
+        judged = self._diagnoses(X)
+        score: Array = np.array([own.score for own in judged], dtype=float)
+        return np.array([own.threshold for own in judged], dtype=float) - score
 
     def predict(self, X: Paths) -> NDArray[np.int64]:
         """Return -1 for each file with a leak, 1 for one without, 0 where it cannot be told."""
@@ -78,4 +78,5 @@ class LeakDetector(OutlierMixin, BaseEstimator):  # type: ignore[misc]
 
     def _diagnoses(self, X: Paths) -> list[Diagnosis]:
         check_is_fitted(self)
-        return [self.machine_.diagnose(path, false_alarm_probability=self.false_alarm_probability) for path in X]
+        p = self.false_alarm_probability
+        return [self.machine_.diagnose(path, false_alarm_probability=p, quick=True) for path in X]

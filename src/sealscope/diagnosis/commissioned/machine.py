@@ -4,20 +4,26 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
 
 from sealscope.calls import checked_call
+from sealscope.diagnosis.detector import failure, unusable
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.inspection import inspected
 from sealscope.diagnosis.learnt import Learnt, Lesson
+from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
+from sealscope.diagnosis.verdict.machine import assumed_rig
+from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError, SealscopeError, UnreadableFile
-from sealscope.parameters import Rig
+from sealscope.parameters import Rig, load_rig
 from sealscope.recordings import read
 from sealscope.recordings.formats.columns import ChannelMap, counted
 from sealscope.recordings.joining import start_seconds
@@ -74,8 +80,6 @@ class CommissionedMachine:
         Sampling rate [Hz] of logs without a time column.
     limit : str, optional
         Leak from which it is to be repaired, such as "5 mL/min".
-    about : mapping of str to mapping, optional
-        Of each healthy recording, by its digest, what people read: checksum of the file, pressure, oil, noise.
     left_out : tuple of str, optional
         Recordings that could not be used, each with the reason.
     alarms : tuple of JudgedAlarm, optional
@@ -94,7 +98,6 @@ class CommissionedMachine:
     channel_map: ChannelMap = field(default_factory=dict)
     rate: float | None = None
     limit: str | None = None
-    about: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     left_out: tuple[str, ...] = ()
     alarms: tuple[JudgedAlarm, ...] = ()
 
@@ -103,7 +106,7 @@ class CommissionedMachine:
         """What the healthy recordings say of the machine, of its sensors and of the smallest leak."""
         from sealscope.diagnosis.commissioned.summary import summarised
 
-        return summarised(self.healthy, self.rig, self.about, self.left_out)
+        return summarised(self.healthy, self.rig, self.left_out)
 
     def read(self, path: str | os.PathLike[str]) -> Recording:
         """Read a log of the machine by its map; a recording of Sealscope's own is read as it is."""
@@ -146,18 +149,21 @@ class CommissionedMachine:
         Raises InputError where it is judged leaking, or a person found a leak then, or it is known already, or cannot
         be trusted.
         """
-        digest = inspected(recording).digest
-        known = next((own for own in self.healthy if own.digest == digest), None)
-        if known is not None:
-            raise InputError(f"a healthy recording must be new, got the samples of {known.file} ({file})")
-        if self.healthy and (result := self.diagnose(recording)).verdict == "leak":
+        added = self._with(recording, file, checksum)
+        if self.healthy and (result := self.diagnose(recording, quick=True)).verdict == "leak":
             raise InputError(f"a healthy recording must not leak, got one that does: {result.reason} ({file})")
         start_s = start_seconds(recording, file)
         if start_s is not None and (leak := self._leak_at(start_s)) is not None:
             raise InputError(f"a healthy recording must be of a time without a leak, got {leak} ({file})")
-        learnt, about = learn(recording, self.known_rig(recording), file, checksum)
+        return added
+
+    def _with(self, recording: Recording, file: str, checksum: str) -> CommissionedMachine:
+        """Return the machine with one more recording, whether it leaks or not."""
+        learnt = learn(recording, assumed_rig(self.rig, recording)[0], file, checksum)
+        if twin := next((own for own in self.healthy if own.digest == learnt.digest), None):
+            raise InputError(f"a healthy recording must be new, got the samples of {twin.file} ({file})")
         healthy = sorted((*self.healthy, learnt), key=lambda own: (own.start_s or 0.0, own.file))
-        return replace(self, healthy=tuple(healthy), about={**self.about, digest: about})
+        return replace(self, healthy=tuple(healthy))
 
     def _leak_at(self, moment: float) -> JudgedAlarm | None:
         """Return the alarm of a leak that a person found, and that was not repaired at a moment [s since 1970]."""
@@ -174,21 +180,14 @@ class CommissionedMachine:
         if not left:
             raise InputError(f"a machine must keep a healthy recording, got none of {_date(start_s)} or later")
         alarms = tuple(own for own in self.alarms if own.onset_s >= start_s)
-        about = {own.digest: self.about.get(own.digest, {}) for own in left}
-        return replace(self, healthy=left, about=about, alarms=alarms)
-
-    def known_rig(self, recording: Recording) -> Rig:
-        """Return the rig that detectors assume."""
-        from sealscope.diagnosis.verdict.machine import assumed_rig
-
-        return assumed_rig(self.rig, recording)[0]
+        return replace(self, healthy=left, alarms=alarms)
 
     def __repr__(self) -> str:
         return f"<CommissionedMachine {self.name}: {counted(len(self.healthy), 'healthy recording')}>"
 
     def __str__(self) -> str:
         alarms = [f"  {'alarm':<14}{own}" for own in self.alarms]
-        return "\n".join([self.summary.text(self.healthy, self.rig, self.about), *alarms])
+        return "\n".join([self.summary.text(self.healthy, self.rig), *alarms])
 
 
 def read_of_machine(path: str | os.PathLike[str], channel_map: ChannelMap, rate: float | None) -> Recording:
@@ -234,17 +233,14 @@ def _is_written(file: Path) -> bool:
         return False  # it is read again, and the error then is named
 
 
-def learn(recording: Recording, rig: Rig, file: str, checksum: str = "") -> tuple[Learnt, dict[str, Any]]:
-    """Return what a healthy recording teaches every built-in detector, and what people read of it.
+def learn(recording: Recording, rig: Rig, file: str, checksum: str = "") -> Learnt:
+    """Return what a healthy recording teaches every detector.
 
     Raises InputError where it cannot be trusted, or teaches nothing.
     """
-    import numpy as np
     from threadpoolctl import threadpool_limits
 
     from sealscope.diagnosis.commissioned.summary import about_recording
-    from sealscope.diagnosis.detector import failure, unusable
-    from sealscope.diagnosis.registry import detectors
 
     inspection = inspected(recording)
     part = inspection.part
@@ -265,7 +261,7 @@ def learn(recording: Recording, rig: Rig, file: str, checksum: str = "") -> tupl
     units = {name: part.units[name] for name in part.channels}
     about = {"sha256": checksum, **about_recording(recording, inspection)}
     start = start_seconds(recording)
-    return Learnt(file, inspection.digest, units, part.rate, recording.duration, start, lessons), about
+    return Learnt(file, inspection.digest, units, part.rate, recording.duration, start, lessons, about)
 
 
 @checked_call
@@ -317,9 +313,6 @@ def commission(
     >>> machine.diagnose(ss.simulate(duration="20 s", leak="0.02 L/min", seed=4)).verdict
     'leak'
     """
-    from sealscope.diagnosis.verdict.severity import RepairLimit
-    from sealscope.parameters import load_rig
-
     RepairLimit.of(limit)
     known = None if rig is None else load_rig(rig)
     channel_map = map if map is not None else {} if known is None else known.channel_map
@@ -327,20 +320,12 @@ def commission(
     problems: list[str] = []
     for path in recordings_in(paths):
         try:
-            recording = machine.read(path)
-            learnt, about = learn(recording, machine.known_rig(recording), path.name, checksum_of(path))
+            machine = machine._with(machine.read(path), path.name, checksum_of(path))
         except SealscopeError as error:
             problems.append(str(error))
-            continue
-        twin = next((own for own in machine.healthy if own.digest == learnt.digest), None)
-        if twin is not None:
-            problems.append(f"{path}: the same samples as {twin.file}")
-            continue
-        machine = replace(machine, healthy=(*machine.healthy, learnt), about={**machine.about, learnt.digest: about})
     if not machine.healthy:
         raise InputError(f"a machine must have a healthy recording that can be used, got none: {problems[0]}")
-    ordered = sorted(machine.healthy, key=lambda own: (own.start_s or 0.0, own.file))
-    return replace(machine, healthy=tuple(ordered), left_out=tuple(problems))
+    return replace(machine, left_out=tuple(problems))
 
 
 def checksum_of(path: str | os.PathLike[str]) -> str:

@@ -8,14 +8,14 @@ recording: the checksum of its file, and what it has taught each method. `[[alar
 from __future__ import annotations
 
 import json
-import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, create_model
 
 from sealscope.calls import checked_call
 from sealscope.diagnosis.commissioned.machine import CommissionedMachine, JudgedAlarm
@@ -26,24 +26,100 @@ from sealscope.parameters import Rig
 from sealscope.parameters.load import OF_MACHINES
 from sealscope.recordings.formats.columns import REST, check_call
 from sealscope.storage.atomic import atomic_write
+from sealscope.storage.plain_values import as_type
 from sealscope.storage.toml_file import read_toml
 
-#: Version of the file's format, and the largest file read [bytes]: some 10 kB a recording.
-FORMAT, LARGEST = 1, 50_000_000
+#: Largest file read [bytes]: some 10 kB a recording.
+LARGEST = 50_000_000
 #: What persons say of alarms.
-MARKS = ("valid", "invalid", "repaired")
+Mark = Literal["valid", "invalid", "repaired"]
+MARKS: tuple[Mark, ...] = get_args(Mark)
 _HEAD = """\
 # A machine commissioned by Sealscope: what its healthy recordings have taught. [machine], [map] and [rig] may be
 # edited; [learnt] is written anew with each change; [[healthy]] is what diagnoses compare with.
 """
-_HEALTHY = {"file": str, "digest": str, "rate": float, "seconds": float, "units": dict, "lessons": dict}
-_ABOUT = {"sha256": str, "pressure_bar": float, "oil_degC": float, "noise": dict, "wrong": list}
-#: What a lesson of each built-in method holds: its entries, numbers of which by their count of dimensions.
-_LESSONS: Mapping[str, Mapping[str, Any]] = {
-    "volume balance": {"terms": list, "scale": 0, "sums": 3, "flow": 0, "pressure": 0},
-    "pressure response": {"by": str, "level": 0},
-    "rms change": {"chambers": list, "rate": 0, "levels": 1, "duty": 1},
+
+
+def _moment(text: Any) -> float:
+    try:
+        return datetime.fromisoformat(text).timestamp()
+    except (TypeError, OverflowError):
+        raise ValueError("must be a time as ISO 8601 writes it") from None
+
+
+def _numbers(values: list[Any]) -> np.ndarray:
+    try:
+        array = np.array(values, dtype=float)
+    except (TypeError, OverflowError):
+        raise ValueError("must hold numbers in equal rows") from None
+    if not np.isfinite(array).all():
+        raise ValueError("must hold finite numbers")
+    return array
+
+
+_Moment = Annotated[float, BeforeValidator(_moment)]
+_Positive = Annotated[float, Field(gt=0)]
+_Numbers = Annotated[Any, AfterValidator(_numbers)]
+
+
+def _table(extra: Literal["allow", "ignore"] = "ignore", **kinds: Any) -> Any:
+    """Return the type of a table by the types of its values, in a tuple with None where a value may be absent."""
+    config = ConfigDict(strict=True, allow_inf_nan=False, extra=extra)
+    fields = {name: kind if isinstance(kind, tuple) else (kind, ...) for name, kind in kinds.items()}
+    return create_model("Table", __config__=config, **fields)  # type: ignore[call-overload]
+
+
+def _with_sums_of_its_terms(lesson: Any) -> Any:
+    size = len(lesson.terms) + 1
+    if lesson.sums.ndim != 3 or lesson.sums.shape[1:] != (size, size):
+        raise ValueError(f"sums must be of the shape (E, {size}, {size}), got {lesson.sums.shape}")
+    return lesson
+
+
+_BALANCE = _table(
+    "allow",
+    terms=list[str],
+    scale=float,
+    sums=_Numbers,
+    flow=float,
+    pressure=float,
+    start_s=(float, None),
+    oil_degC=(float, None),
+)
+#: What Sealscope's own methods were taught; those of others are plain tables.
+_LESSONS = {
+    "volume balance": (Annotated[_BALANCE, AfterValidator(_with_sums_of_its_terms)], None),
+    "pressure response": (_table("allow", by=str, level=float), None),
+    "rms change": (
+        _table("allow", chambers=list[str], rate=float, start_s=(float, None), levels=_Numbers, duty=_Numbers),
+        None,
+    ),
 }
+_ABOUT = {"sha256": str, "pressure_bar": float, "oil_degC": float, "noise": dict[str, float], "wrong": list[str]}
+_HEALTHY = _table(
+    file=str,
+    digest=str,
+    units=dict[str, str],
+    rate=_Positive,
+    seconds=_Positive,
+    start_s=(Annotated[_Moment, Field(alias="start")], None),
+    lessons=_table("allow", **_LESSONS),
+    about=(_table("allow", **{name: (kind, None) for name, kind in _ABOUT.items()}), None),
+)
+_ALARM = _table(
+    alarm=str,
+    mark=Mark,
+    date_s=Annotated[_Moment, Field(alias="date")],
+    onset_s=Annotated[_Moment, Field(alias="onset")],
+    leak_lpm=(float, None),
+    reason=(str, None),
+)
+_FILE = _table(
+    machine=_table(format=Literal[1], name=str, rate=(float, None), limit=(str, None)),
+    map=(dict[str, str], None),
+    healthy=Annotated[list[_HEALTHY], Field(min_length=1)],  # type: ignore[valid-type]
+    alarms=(list[_ALARM], None),  # type: ignore[valid-type]
+)
 
 
 @checked_call
@@ -81,7 +157,7 @@ def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) ->
     target = Path(path)
     if target.suffix.lower() != ".toml":
         raise InputError(f"a machine's file must end in .toml, got {target}")
-    text = _HEAD + "\n".join(_tables(_tree(machine))) + "\n"
+    text = _HEAD + "\n".join(_lines(_tree(machine))) + "\n"
     if target.is_file():
         with atomic_write(target.with_suffix(".toml.bak")) as temporary:
             temporary.write_bytes(target.read_bytes())
@@ -94,87 +170,67 @@ def _tree(machine: CommissionedMachine) -> dict[str, Any]:
     """Return the tables of a machine's file."""
     from importlib.metadata import version
 
-    summary = machine.summary
-    head: dict[str, Any] = {"format": FORMAT, "name": machine.name, "sealscope": version("sealscope")}
-    head["written"] = datetime.now(UTC).isoformat(timespec="seconds")
-    head |= {name: value for name in ("rate", "limit") if (value := getattr(machine, name)) is not None}
-    tree: dict[str, Any] = {"machine": head}
-    if columns := machine.channel_map:
-        tree["map"] = {REST: columns} if isinstance(columns, str) else dict(columns)
+    summary, columns, now = machine.summary, machine.channel_map, datetime.now(UTC).isoformat(timespec="seconds")
+    head = {"format": 1, "name": machine.name, "sealscope": version("sealscope"), "written": now}
+    tree: dict[str, Any] = {"machine": head | {"rate": machine.rate, "limit": machine.limit}}
+    if columns:
+        tree["map"] = {REST: columns} if isinstance(columns, str) else columns
     if machine.rig is not None:
         tree |= machine.rig.as_dict()
-    learnt = tree["learnt"] = {"problems": summary.problems, "noise": dict(summary.noise)}
-    if summary.smallest is not None:
-        learnt["smallest_leak"] = _known(summary.smallest)
-    learnt["terms"] = {name: _known(term) for name, term in summary.terms.items()}
-    tree["healthy"] = [_row(own, machine.about.get(own.digest, {})) for own in machine.healthy]
-    if machine.alarms:
-        tree["alarms"] = [
-            {"alarm": own.alarm, "mark": own.mark, "date": _stamp(own.date_s), "onset": _stamp(own.onset_s)}
-            | {name: value for name in ("leak_lpm", "reason") if (value := getattr(own, name))}
-            for own in machine.alarms
-        ]
+    smallest = {} if summary.smallest is None else {"smallest_leak": summary.smallest._asdict()}
+    terms = {name: term._asdict() for name, term in summary.terms.items()}
+    tree["learnt"] = {"problems": summary.problems, "noise": summary.noise, **smallest, "terms": terms}
+    tree["healthy"] = [
+        {"file": own.file, "digest": own.digest, "rate": own.rate, "seconds": own.seconds}
+        | {"start": _stamp(own.start_s), "units": own.units, "about": own.about, "lessons": own.lessons}
+        for own in machine.healthy
+    ]
+    tree["alarms"] = [
+        {"alarm": own.alarm, "mark": own.mark, "date": _stamp(own.date_s), "onset": _stamp(own.onset_s)}
+        | {"leak_lpm": own.leak_lpm or None, "reason": own.reason or None}
+        for own in machine.alarms
+    ]
     return tree
 
 
-def _known(values: Any) -> dict[str, Any]:
-    return {name: value for name, value in values._asdict().items() if value is not None}
+def _stamp(moment: float | None) -> str | None:
+    return None if moment is None else datetime.fromtimestamp(moment, UTC).isoformat()
 
 
-def _stamp(moment: float) -> str:
-    return datetime.fromtimestamp(moment, UTC).isoformat()
+def _lines(tree: Mapping[str, Any], path: str = "", head: str = "") -> list[str]:
+    """Return the lines of a table: its values, tables of figures alone among them, then the tables within."""
+    lines, within = list[str](), list[str]()
+    for name, value in tree.items():
+        place = f"{path}.{_key(name)}" if path else _key(name)
+        if isinstance(value, Mapping) and not (path and _is_figures(value)):
+            within += _lines(value, place, f"[{place}]")
+        elif isinstance(value, list) and not path:
+            within += [line for row in value for line in _lines(row, place, f"[[{place}]]")]
+        elif value is not None:
+            lines.append(f"{_key(name)} = {_value(value)}")
+    return [*(["", head, *lines] if lines else []), *within]
 
 
-def _row(own: Learnt, about: Mapping[str, Any]) -> dict[str, Any]:
-    start = {} if own.start_s is None else {"start": _stamp(own.start_s)}
-    plain = {"file": own.file, "digest": own.digest, "rate": own.rate, "seconds": own.seconds}
-    lessons = {
-        name: {key: value for key, value in lesson.items() if value is not None} for name, lesson in own.lessons.items()
-    }
-    return {**plain, **start, "units": dict(own.units), "about": dict(about), "lessons": lessons}
+def _is_figures(table: Mapping[str, Any]) -> bool:
+    return bool(table) and all(isinstance(value, str | float | int | None) for value in table.values())
 
 
-def _tables(tree: Mapping[str, Any], prefix: tuple[str, ...] = ()) -> Iterator[str]:
-    """Yield the lines of nested tables: plain values first, then the tables within, then lists of tables."""
-    name = ".".join(map(_key, prefix))
-    plain = {key: value for key, value in tree.items() if not _stands_apart(value, bool(prefix))}
-    if plain and prefix:
-        yield from ("", f"[{name}]")
-    for key, value in plain.items():
-        yield f"{_key(key)} = {_value(value)}"
-    for key, value in tree.items():
-        if isinstance(value, Mapping) and key not in plain:
-            yield from _tables(value, (*prefix, key))
-        elif key not in plain:
-            for row in value:
-                own = _tables(row, (*prefix, key))
-                yield from (next(own), f"[{next(own)}]", *own)
-
-
-def _stands_apart(value: Any, within: bool) -> bool:
-    """Whether a value is a table of its own, or the list of them that all others are in; figures alone are a line."""
-    if isinstance(value, Mapping):
-        return not within or not all(isinstance(own, str | float | int) for own in value.values()) or not value
-    return isinstance(value, list) and not within
-
-
-def _key(key: str) -> str:
-    return key if key.replace("_", "").replace("-", "").isalnum() and key.isascii() else _value(key)
+def _key(name: str) -> str:
+    return name if name.replace("_", "").replace("-", "").isalnum() and name.isascii() else _value(name)
 
 
 def _value(value: Any) -> str:
-    """Return a plain value as TOML; numbers to the last digit."""
+    """Return a plain value as TOML, without what is None; numbers to the last digit."""
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{_key(key)} = {_value(own)}" for key, own in value.items()) + " }"
+        stated = (f"{_key(name)} = {_value(own)}" for name, own in value.items() if own is not None)
+        return "{ " + ", ".join(stated) + " }"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(_value, value)) + "]"
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, int | float):
+    if isinstance(value, float):
         return repr(value)
-    return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
+    return json.dumps(value, ensure_ascii=False, default=str).replace("\x7f", "\\u007f")
 
 
 @checked_call
@@ -205,116 +261,20 @@ def load_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
     """
     place = os.fspath(path)
     tree = read_toml(Path(path), "a machine's file", place, LARGEST)
-    head = _part(tree, "machine", dict, place)
-    if head.get("format") != FORMAT:
-        raise InputError(f"machine.format must be {FORMAT}, got {head.get('format')!r} ({place})")
-    name = _part(head, "name", str, place)
-    channel_map = _part(tree, "map", dict, place) if "map" in tree else {}
-    if not all(isinstance(column, str) for column in channel_map.values()):
-        raise InputError(f"map must be a table of channels and their columns, got {channel_map!r:.80} ({place})")
-    rate = _part(head, "rate", float, place) if "rate" in head else None
-    limit = _part(head, "limit", str, place) if "limit" in head else None
-    try:
-        check_call(channel_map, rate)
-        RepairLimit.of(limit)
-    except InputError as error:
-        raise InputError(f"{error} ({place})") from None
-    rows = _part(tree, "healthy", list, place)
-    if not rows:
-        raise InputError(f"healthy must hold a recording, got none ({place})")
-    healthy = tuple(_healthy(row, f"healthy[{k}] of {place}") for k, row in enumerate(rows))
-    about = {
-        own.digest: _about(row, f"healthy[{k}] of {place}")
-        for k, (own, row) in enumerate(zip(healthy, rows, strict=True))
-    }
     rig = {name: table for name, table in tree.items() if name not in OF_MACHINES and name != "map"}
-    known = Rig.from_dict(rig, place=place) if rig else None
-    alarms = tuple(
-        _alarm(row, f"alarms[{k}] of {place}")
-        for k, row in enumerate(_part(tree, "alarms", list, place) if "alarms" in tree else ())
+    try:
+        stated = as_type(_FILE, tree).model_dump(exclude_unset=True)
+        head, columns = stated["machine"], stated.get("map", {})
+        check_call(columns, head.get("rate"))
+        RepairLimit.of(head.get("limit"))
+    except ValueError as error:
+        raise InputError(f"{str(error).replace(': Input should be', ' must be')} ({place})") from None
+    return CommissionedMachine(
+        name=head["name"],
+        healthy=tuple(Learnt(**{"start_s": None, **row}) for row in stated["healthy"]),
+        rig=Rig.from_dict(rig, place=place) if rig else None,
+        channel_map=columns,
+        rate=head.get("rate"),
+        limit=head.get("limit"),
+        alarms=tuple(JudgedAlarm(**row) for row in stated.get("alarms", ())),
     )
-    return CommissionedMachine(name, healthy, known, channel_map, rate, limit, about, alarms=alarms)
-
-
-def _part(tree: Mapping[str, Any], name: str, kind: type, place: str) -> Any:
-    value = tree.get(name)
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
-    if not isinstance(value, kind) or (isinstance(value, float) and not math.isfinite(value)):
-        names = {dict: "a table", list: "a list", str: "a text", float: "a finite number"}
-        raise InputError(f"{name} must be {names[kind]}, got {value!r:.60} ({place})")
-    return value
-
-
-def _healthy(row: Any, place: str) -> Learnt:
-    """Return a healthy recording of the file."""
-    if not isinstance(row, dict):
-        raise InputError(f"a healthy recording must be a table, got {row!r:.60} ({place})")
-    values = {name: _part(row, name, kind, place) for name, kind in _HEALTHY.items()}
-    for name in ("rate", "seconds"):
-        if not values[name] > 0.0:
-            raise InputError(f"{name} must be > 0, got {values[name]:g} ({place})")
-    if not all(isinstance(unit, str) for unit in values["units"].values()):
-        raise InputError(f"units must be texts, got {values['units']!r:.60} ({place})")
-    start_s = _moment(row, "start", place) if "start" in row else None
-    lessons = {name: _lesson(name, values["lessons"], place) for name in values["lessons"]}
-    units, rate, seconds = values["units"], values["rate"], values["seconds"]
-    return Learnt(values["file"], values["digest"], units, rate, seconds, start_s, lessons)
-
-
-def _about(row: Mapping[str, Any], place: str) -> dict[str, Any]:
-    """Return what people read of a healthy recording."""
-    about: dict[str, Any] = _part({"about": {}, **row}, "about", dict, place)
-    for name in _ABOUT.keys() & about.keys():
-        _part(about, name, _ABOUT[name], place)
-    for name in about.get("noise", {}):
-        _part(about["noise"], name, float, place)
-    if not all(isinstance(text, str) for text in about.get("wrong", ())):
-        raise InputError(f"wrong must hold texts, got {about['wrong']!r:.60} ({place})")
-    return about
-
-
-def _moment(row: Mapping[str, Any], name: str, place: str) -> float:
-    try:
-        return datetime.fromisoformat(row[name]).timestamp()
-    except (KeyError, TypeError, ValueError, OverflowError):
-        got = repr(row.get(name))
-        raise InputError(f"{name} must be a time as ISO 8601 writes it, got {got:.60} ({place})") from None
-
-
-def _alarm(row: Any, place: str) -> JudgedAlarm:
-    """Return what a person said of an alarm."""
-    if not isinstance(row, dict):
-        raise InputError(f"an alarm must be a table, got {row!r:.60} ({place})")
-    texts = {name: _part({"reason": "", **row}, name, str, place) for name in ("alarm", "mark", "reason")}
-    if texts["mark"] not in MARKS:
-        raise InputError(f"mark must be one of {', '.join(MARKS)}, got {texts['mark']!r:.60} ({place})")
-    leak = _part(row, "leak_lpm", float, place) if "leak_lpm" in row else None
-    return JudgedAlarm(**texts, date_s=_moment(row, "date", place), onset_s=_moment(row, "onset", place), leak_lpm=leak)
-
-
-def _lesson(name: str, lessons: Mapping[str, Any], place: str) -> dict[str, Any]:
-    """Return what a method was taught, its arrays of their shape and finite."""
-    lesson = dict(_part(lessons, name, dict, place))
-    for key, kind in _LESSONS.get(name, {}).items():
-        if isinstance(kind, type):
-            lesson[key] = _part(lesson, key, kind, place)
-        elif kind:
-            lesson[key] = _array(_part(lesson, key, list, place), kind, key, place)
-        else:
-            lesson[key] = _part(lesson, key, float, place)
-    for key in {"start_s", "oil_degC"} & lesson.keys():
-        _part(lesson, key, float, place)
-    if name == "volume balance" and lesson["sums"].shape[1:] != (size := (len(lesson["terms"]) + 1,) * 2):
-        raise InputError(f"sums must be of the shape (E, {size[0]}, {size[1]}), got {lesson['sums'].shape} ({place})")
-    return lesson
-
-
-def _array(values: Sequence[Any], dimensions: int, name: str, place: str) -> np.ndarray:
-    try:
-        array = np.array(values, dtype=float)
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{name} must hold numbers in equal rows, got {values!r:.60} ({place})") from None
-    if array.ndim != dimensions or not np.isfinite(array).all():
-        raise InputError(f"{name} must hold finite numbers in {dimensions} dimensions, got {values!r:.60} ({place})")
-    return array

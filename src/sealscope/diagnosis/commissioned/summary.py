@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.blocks import Columns, solve
 from sealscope.diagnosis.inference.detector import VolumeBalance
-from sealscope.diagnosis.inference.scatter import Rise
 from sealscope.diagnosis.inference.terms import ATMOSPHERE, equations
 from sealscope.diagnosis.inspection import Inspection
 from sealscope.diagnosis.verdict.machine import unstated
@@ -24,15 +24,7 @@ if TYPE_CHECKING:
     from sealscope.diagnosis.learnt import Learnt
     from sealscope.parameters import Rig
 
-#: Probability with which the smallest leak is found, and of a false alarm for which it is stated.
-POWER, FALSE_ALARM = 0.9, 0.01
-#: How many times as many recordings are tried for half of the smallest leak.
-_REPEATED = (2, 3, 5, 10)
-_BALANCE = VolumeBalance.name
-#: Columns of a terminal.
-WIDTH = 80
-#: Of each healthy recording, by its digest, what people read.
-About = Mapping[str, Mapping[str, Any]]
+_BALANCE, _ASKED = VolumeBalance.name, beliefs("commissioned")["smallest"]
 
 
 class TermEstimate(NamedTuple):
@@ -73,40 +65,51 @@ class Summary:
     smallest: Smallest | None
     problems: list[str] = field(default_factory=list)
 
-    def text(self, healthy: Sequence[Learnt], rig: Rig | None, about: About) -> str:
+    def text(self, healthy: Sequence[Learnt], rig: Rig | None) -> str:
         """Return it in some ten lines."""
         dates = sorted(own.start_s for own in healthy if own.start_s is not None)
-        seconds = sum(own.seconds for own in healthy)
-        known = [{**about.get(own.digest, {}), **_flow(own)} for own in healthy]
+        first, last = (
+            (datetime.fromtimestamp(at, UTC).date().isoformat() for at in (min(dates), max(dates)))
+            if dates
+            else ("", "")
+        )
+        span = "" if not dates else f", {first}" if first == last else f", {first} to {last}"
+        noise = []
+        for name, value in self.noise.items():
+            unit, size = _SHOWN.get(healthy[0].units.get(name, ""), (healthy[0].units.get(name, ""), 1.0))
+            noise.append(f"{name} {value / size:.2g} {unit}")
         rows = [
-            ("recordings", f"{len(healthy)} healthy, {seconds:.4g} s in all" + (f", {_span(dates)}" if dates else "")),
+            ("recordings", f"{len(healthy)} healthy, {sum(own.seconds for own in healthy):.4g} s in all{span}"),
             ("channels", ", ".join(f"{name} [{unit}]" for name, unit in healthy[0].units.items())),
             ("machine", _stated(rig)),
-            (
-                "duty",
-                _ranges(
-                    known, (("flow_lpm", "L/min"), ("pressure_bar", "bar between the chambers"), ("oil_degC", "deg C"))
-                ),
-            ),
-            ("noise", ", ".join(f"{name} {value:.2g} {unit}" for name, value, unit in _shown(self.noise, healthy[0]))),
+            ("duty", _duty(healthy)),
+            ("noise", ", ".join(noise)),
         ]
         if self.smallest is not None:
-            rows.append(("smallest leak", _smallest_text(self.smallest)))
-            rows.append(("half of that", _half_text(self.smallest, len(healthy), bool(dates))))
+            share = 100.0 * _ASKED["power"]
+            rows.append(("smallest leak", f"the next recording shows {self.smallest} ({share:g} % of the time)"))
+            half = "twice the pressure difference at the same flow; more recordings alone do not"
+            if (times := self.smallest.halved_by) is not None:
+                half = f"{times * len(healthy)} healthy recordings instead of {len(healthy)}"
+                half += ", of as many more days" if dates else ""
+            rows.append(("half of that", half))
         rows += [("check", problem) for problem in self.problems]
-        indent = " " * 16
         return "\n".join(
-            fill(f"  {name:<14}{text}", WIDTH, subsequent_indent=indent, break_on_hyphens=False)
+            fill(f"  {name:<14}{text}", 80, subsequent_indent=" " * 16, break_on_hyphens=False)
             for name, text in rows
             if text
         )
 
 
+#: Units in which people read others, and their sizes.
+_SHOWN = {"Pa": ("bar", 1e5), "m": ("mm", 1e-3)}
+
+
 def _stated(rig: Rig | None) -> str:
     """Return what is stated of the machine, in words."""
+    parts = []
     if rig is not None and rig.states("cylinder.M_eq"):
         return rig.title or rig.name
-    parts = []
     if rig is not None and rig.states("cylinder.A_A", "cylinder.A_B"):
         areas = dict.fromkeys(f"{1e6 * area:.4g}" for area in (rig.cylinder.A_A, rig.cylinder.A_B))
         parts.append(f"piston {' and '.join(areas)} mm^2")
@@ -115,11 +118,22 @@ def _stated(rig: Rig | None) -> str:
     return ", ".join(parts) or "size not stated: L/min needs a rig, an area or a displacement"
 
 
-def _flow(healthy: Learnt) -> dict[str, float]:
-    """Return the pump's mean flow in a healthy recording [L/min], as far as the machine's size is stated."""
-    lesson = healthy.lessons.get(_BALANCE, {})
-    flow = lesson.get("flow", 0.0) * lesson.get("scale", 0.0)
-    return {"flow_lpm": flow / LITRE_PER_MINUTE} if flow > 0.0 else {}
+def _duty(healthy: Sequence[Learnt]) -> str:
+    """Return the ranges of the pump's mean flow, where the machine's size is stated, of pressure and temperature."""
+    lessons = [own.lessons.get(_BALANCE, {}) for own in healthy]
+    flows = [lesson.get("flow", 0.0) * lesson.get("scale", 0.0) / LITRE_PER_MINUTE for lesson in lessons]
+    pressures, oils = (
+        [own.about[name] for own in healthy if name in own.about] for name in ("pressure_bar", "oil_degC")
+    )
+    texts = []
+    for values, unit in (
+        ([flow for flow in flows if flow > 0.0], "L/min"),
+        (pressures, "bar between the chambers"),
+        (oils, "deg C"),
+    ):
+        ends = dict.fromkeys(f"{end:.3g}" for end in (min(values), max(values))) if values else ()
+        texts += [f"{' to '.join(ends)} {unit}"] if ends else []
+    return ", ".join(texts)
 
 
 def about_recording(recording: Recording, inspection: Inspection) -> dict[str, Any]:
@@ -138,39 +152,36 @@ def about_recording(recording: Recording, inspection: Inspection) -> dict[str, A
     return about
 
 
-def summarised(healthy: Sequence[Learnt], rig: Rig | None, about: About, left_out: Sequence[str] = ()) -> Summary:
+def summarised(healthy: Sequence[Learnt], rig: Rig | None, left_out: Sequence[str] = ()) -> Summary:
     """Return the summary of a machine's healthy recordings; `left_out`: those that could not be used, and why."""
-    known = [about.get(own.digest, {}) for own in healthy]
-    problems = list(left_out)
-    problems += _collected([(own.file, about.get("wrong", ())) for own, about in zip(healthy, known, strict=True)])
-    noises = [about.get("noise", {}) for about in known]
+    problems = [*left_out, *_collected(healthy)]
+    noises = [own.about.get("noise", {}) for own in healthy]
     names = dict.fromkeys(name for own in noises for name in own)
     noise = {name: float(np.median([own[name] for own in noises if name in own])) for name in names}
     taught = [own for own in healthy if _BALANCE in own.lessons]
-    if not taught:
-        return Summary({}, noise, None, problems)
     alike = [own for own in taught if own.lessons[_BALANCE]["terms"] == taught[0].lessons[_BALANCE]["terms"]]
-    for own in (own for own in taught if own not in alike):
-        problems.append(f"{own.file} has other channels than {taught[0].file}")
-    rig = rig or unstated()
-    lessons = [own.lessons[_BALANCE] for own in alike]
-    channels = frozenset(alike[0].units)
-    if not equations(rig, channels):
+    problems += [f"{own.file} has other channels than {taught[0].file}" for own in taught if own not in alike]
+    rig, channels = rig or unstated(), frozenset(alike[0].units if alike else ())
+    if not (alike and equations(rig, channels)):
         return Summary({}, noise, None, problems)
-    columns = Columns(equations(rig, channels)[0])
-    terms = _terms([np.asarray(lesson["sums"], dtype=float)[0] for lesson in lessons], columns, rig, channels)
-    smallest = None
-    if len(alike) > 1:
-        rises = VolumeBalance(rig).rises(lessons, channels)
-        problems += _unlike(alike, rises)
-        smallest = _smallest(VolumeBalance(rig), lessons, channels)
-    return Summary(terms, noise, smallest, problems)
+    lessons, balance = [own.lessons[_BALANCE] for own in alike], VolumeBalance(rig)
+    terms = _terms([np.asarray(lesson["sums"], dtype=float)[0] for lesson in lessons], rig, channels)
+    if len(alike) == 1:
+        return Summary(terms, noise, None, problems)
+    rises = balance.rises(lessons, channels)
+    problems += [
+        f"{own.file} is not like the others: its leakage differs from theirs by {abs(rise.score):.2g} deviations"
+        for own, rise in zip(alike, rises, strict=True)
+        if len(rises) > 2 and 2.0 * min(rise.chance, 1.0 - rise.chance) < _ASKED["false_alarm"]
+    ]
+    return Summary(terms, noise, _smallest(balance, lessons, channels), problems)
 
 
-def _terms(sums: Sequence[Array], columns: Columns, rig: Rig, channels: frozenset[str]) -> dict[str, TermEstimate]:
+def _terms(sums: Sequence[Array], rig: Rig, channels: frozenset[str]) -> dict[str, TermEstimate]:
     """Return the estimates of the terms from all recordings together, and how each scatters between them."""
+    equation = equations(rig, channels)[0]
+    columns, units = Columns(equation), {term.name: term.unit for term in equation.terms}
     chosen = list(columns.nuisance)
-    units = {term.name: term.unit for term in equations(rig, channels)[0].terms}
 
     def fitted(own: Array) -> Array:
         return solve(own[np.ix_(chosen, chosen)], own[chosen, columns.left])
@@ -180,25 +191,9 @@ def _terms(sums: Sequence[Array], columns: Columns, rig: Rig, channels: frozense
     variance = np.diag(solve(together[np.ix_(chosen, chosen)], np.eye(len(chosen))))
     scatter = apart.std(axis=0, ddof=1).tolist() if len(sums) > 1 else [None] * len(chosen)
     return {
-        columns.names[k]: TermEstimate(
-            float(values[i]),
-            float(np.sqrt(max(variance[i], 0.0))),
-            scatter[i],
-            units[columns.names[k]],
-        )
-        for i, k in enumerate(chosen)
+        name: TermEstimate(float(values[i]), float(np.sqrt(max(variance[i], 0.0))), scatter[i], units[name])
+        for i, name in enumerate(columns.names[k] for k in chosen)
     }
-
-
-def _unlike(healthy: Sequence[Learnt], rises: Sequence[Rise]) -> list[str]:
-    """Return the recordings that are not like the others, as one in a hundred of healthy ones."""
-    if len(rises) <= 2:
-        return []
-    return [
-        f"{own.file} is not like the others: its leakage differs from theirs by {abs(rise.score):.2g} deviations"
-        for own, rise in zip(healthy, rises, strict=True)
-        if 2.0 * min(rise.chance, 1.0 - rise.chance) < FALSE_ALARM
-    ]
 
 
 def _smallest(balance: VolumeBalance, lessons: Sequence[Mapping[str, Any]], channels: frozenset[str]) -> Smallest:
@@ -211,34 +206,24 @@ def _smallest(balance: VolumeBalance, lessons: Sequence[Mapping[str, Any]], chan
 
     def findable(repeated: int) -> float:
         coming = balance.next_rise(lessons, channels, repeated)
-        return float((coming.threshold(FALSE_ALARM) + ndtri(POWER)) * coming.deviation)
+        return float((coming.threshold(_ASKED["false_alarm"]) + ndtri(_ASKED["power"])) * coming.deviation)
 
     pressure, flow = (float(np.median([own[name] for own in lessons])) for name in ("pressure", "flow"))
     scale, own = float(np.median([lesson["scale"] for lesson in lessons])), findable(1)
-    halved = next((times for times in _REPEATED if findable(times) <= 0.5 * own), None)
+    halved = next((times for times in _ASKED["repeats"] if findable(times) <= 0.5 * own), None)
     share = own * pressure / flow if flow > 0.0 else float("nan")
     return Smallest(own * pressure * scale / LITRE_PER_MINUTE if scale > 0.0 else None, share, halved)
 
 
-def _smallest_text(smallest: Smallest) -> str:
-    return f"the next recording shows {smallest} ({100.0 * POWER:g} % of the time)"
-
-
-def _half_text(smallest: Smallest, count: int, dated: bool) -> str:
-    if smallest.halved_by is not None:
-        days = ", of as many more days" if dated else ""
-        return f"{smallest.halved_by * count} healthy recordings instead of {count}{days}"
-    return "twice the pressure difference at the same flow; more recordings alone do not"
-
-
-def _collected(wrong: Sequence[tuple[str, Sequence[str]]]) -> list[str]:
-    """Return what is wrong, each kind of it once, with the file or the number of files."""
-    files: dict[str, list[tuple[str, str]]] = {}
-    for file, texts in wrong:
-        for text in texts:
-            files.setdefault(text.partition(":")[0], []).append((text, file))
+def _collected(healthy: Sequence[Learnt]) -> list[str]:
+    """Return what looks wrong, each kind of it once, with the file or the number of files."""
+    kinds: dict[str, list[tuple[str, str]]] = {}
+    for own in healthy:
+        for text in own.about.get("wrong", ()):
+            kinds.setdefault(text.partition(":")[0], []).append((text, own.file))
     return [
-        f"{max(own)[0]} ({own[0][1] if len(own) == 1 else f'in {len(own)} of {len(wrong)}'})" for own in files.values()
+        f"{max(own)[0]} ({own[0][1] if len(own) == 1 else f'in {len(own)} of {len(healthy)}'})"
+        for own in kinds.values()
     ]
 
 
@@ -269,27 +254,3 @@ def _glitches(part: Recording, name: str) -> str:
 
 def _rounded(value: float) -> float:
     return float(f"{value:.4g}")
-
-
-def _span(dates: Sequence[float]) -> str:
-    first, last = (datetime.fromtimestamp(at, UTC).date().isoformat() for at in (dates[0], dates[-1]))
-    return first if first == last else f"{first} to {last}"
-
-
-def _ranges(known: Sequence[Mapping[str, Any]], rows: Sequence[tuple[str, str]]) -> str:
-    texts = []
-    for name, unit in rows:
-        values = [own[name] for own in known if name in own]
-        if values:
-            low, high = min(values), max(values)
-            texts.append(f"{low:.3g} {unit}" if f"{low:.3g}" == f"{high:.3g}" else f"{low:.3g} to {high:.3g} {unit}")
-    return ", ".join(texts)
-
-
-def _shown(noise: Mapping[str, float], healthy: Learnt) -> list[tuple[str, float, str]]:
-    usual = {"Pa": ("bar", 1e5), "m": ("mm", 1e-3)}
-    shown = []
-    for name, value in noise.items():
-        unit, size = usual.get(healthy.units.get(name, ""), (healthy.units.get(name, ""), 1.0))
-        shown.append((name, value / size, unit))
-    return shown

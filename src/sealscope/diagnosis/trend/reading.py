@@ -31,8 +31,8 @@ DAY = 86_400.0
 #: What a level rests on, the most specific first: a conductance, but for `ringing`, the damping of the pressures'
 #: details.
 Basis = Literal["volume balance", "pressure response", "ringing"]
-UNKNOWN = Level(np.nan, np.nan)
 BASES: tuple[Basis, ...] = ("volume balance", "pressure response", "ringing")
+_UNKNOWN = Level(np.nan, np.nan)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -51,7 +51,7 @@ class LeakReading:
     start: float | None
     duration: float
     basis: Basis | None = None
-    level: Level = UNKNOWN
+    level: Level = _UNKNOWN
     states_flow: bool = False
     area: float | None = None
     pressure: float
@@ -70,12 +70,8 @@ def reading_of(recording: Recording, rig: Rig | str | os.PathLike[str] | None = 
     known, machine = assumed_rig(rig, recording)
     inspection = inspected(recording)
     part = inspection.part
-    stated: dict[str, Any] = {"problem": inspection.defect or ""}
-    if not inspection.defect:
-        with np.errstate(all="ignore"):
-            stated = _stated(part, known, machine)
     both = len(chambers_of(part)) == len(CHAMBERS) and len(part) > 0
-    return LeakReading(
+    reading = LeakReading(
         file=file or str(recording.provenance.get("file", "recording")),
         start=start_seconds(recording, file),
         duration=recording.duration,
@@ -83,8 +79,12 @@ def reading_of(recording: Recording, rig: Rig | str | os.PathLike[str] | None = 
         temperature=oil_temperature(recording),
         machine=machine,
         digest=inspection.digest,
-        **stated,
+        problem=inspection.defect or "",
     )
+    if reading.problem:
+        return reading
+    with np.errstate(all="ignore"):
+        return replace(reading, **_stated(part, known, machine))
 
 
 def _stated(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[str, Any]:
@@ -164,16 +164,16 @@ def timeline(readings: Sequence[LeakReading], every: float | None = None) -> Tim
 
     `every`: time between them [s], in the order of their names. Raises InputError where the time of one is not known.
     """
+    ordered = sorted(readings, key=lambda reading: natural(reading.file))
     if every is not None:
-        ordered = sorted(readings, key=lambda reading: natural(reading.file))
-        readings = [replace(reading, start=k * every) for k, reading in enumerate(ordered)]
-    if unknown := [reading.file for reading in readings if reading.start is None]:
+        ordered = [replace(reading, start=k * every) for k, reading in enumerate(ordered)]
+    if unknown := [reading.file for reading in ordered if reading.start is None]:
         raise InputError(
             f"the time of every recording must be known, got none of {_names(unknown)}: put the date into the names "
             "(press_20240531.csv, press_20240531_0730.csv), or give every (such as 1d) where they were made at equal "
             "intervals, in the order of their names"
         )
-    ordered = sorted(readings, key=lambda reading: (reading.start or 0.0, natural(reading.file)))
+    ordered.sort(key=lambda reading: reading.start or 0.0)
     first: dict[str, str] = {}
     notes = []
     for reading in ordered:
@@ -188,8 +188,8 @@ def timeline(readings: Sequence[LeakReading], every: float | None = None) -> Tim
             notes[k] = f"its channels allow the {reading.basis}, not the {basis}"
         group = -1 if notes[k] else next((n for n, own in enumerate(scales) if _alike(reading.scale, own)), len(scales))
         scales += [reading.scale] if group == len(scales) else []
-        start, first_start = reading.start or 0.0, ordered[0].start or 0.0
-        day = (start - first_start) / DAY
+        start = reading.start or 0.0
+        day = (start - (ordered[0].start or 0.0)) / DAY
         points.append(TrendPoint(reading.file, start, day, None, None, None, group, reading.temperature, notes[k]))
     others = (
         f"position or angle is scaled by {100.0 * _change(scale, scales[0]):+.2g} %: a sensor exchanged, or another "
@@ -213,21 +213,24 @@ def _clock(ordered: Sequence[LeakReading]) -> list[Finding]:
 
     Recordings of one date without times of day have the same start.
     """
-    timed = [(reading.start or 0.0, reading) for reading in ordered]
     overlaps = [
         f"{early.file} was still recording when {late.file} began: a clock was set back, or they are of two machines"
-        for (begin, early), (start, late) in pairwise(timed)
-        if early.digest != late.digest and begin < start < begin + 0.99 * early.duration
+        for early, late in pairwise(ordered)
+        if early.digest != late.digest and 0.0 < _wait(early, late) < 0.99 * early.duration
     ]
     back = [
         f"{late.file} is numbered after {early.file} and has an earlier time: a clock was set back"
-        for (begin, early), (start, late) in pairwise(sorted(timed, key=lambda own: natural(own[1].file)))
-        if start < begin
+        for early, late in pairwise(sorted(ordered, key=lambda reading: natural(reading.file)))
+        if _wait(early, late) < 0.0
     ]
     alike = len({re.split(r"[\d\W_]", reading.file, maxsplit=1)[0].lower() for reading in ordered}) == 1
     # numbers that fall more often are no order
     texts = overlaps or (back if alike and len(back) <= max(2, len(ordered) // 10) else [])
     return [Finding("clock", "warning", None, len(texts), None, texts[0])] if texts else []
+
+
+def _wait(early: LeakReading, late: LeakReading) -> float:
+    return (late.start or 0.0) - (early.start or 0.0)
 
 
 def _named(points: Sequence[TrendPoint], groups: Sequence[str]) -> list[Finding]:

@@ -17,7 +17,6 @@ from sealscope.diagnosis.trend.reading import (
     DAY,
     Basis,
     LeakReading,
-    Timeline,
     TrendPoint,
     reading_of,
     scatter_of,
@@ -139,10 +138,15 @@ class Trend:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the trend as plain JSON values; a number that is not finite becomes null."""
-        wear, alarm = self.wear, self.alarm
-        first, last = (self.points[0].day, self.points[-1].day) if self.points else (math.nan, math.nan)
-        figures = ("now", "healthy", "growth", "step", "onset", "reach", "scatter")
-        now, healthy, growth, step, onset, reach, scatter = (wear and getattr(wear, name) for name in figures)
+        alarm, days = self.alarm, [point.day for point in self.points] or [math.nan]
+        names = ("now", "healthy", "scatter", "growth", "step", "onset", "reach")
+        now, healthy, scatter, growth, step, onset, reach = (self.wear and getattr(self.wear, name) for name in names)
+        points = [
+            {"file": own.file, "time": self._moment(own.day), "day": own.day}
+            | {"value": own.value, "low": own.low, "high": own.high, "group": None if own.group < 0 else own.group}
+            | {"temperature_C": own.temperature, "note": own.note}
+            for own in self.points
+        ]
         return plain(  # type: ignore[no-any-return]
             {
                 "verdict": self.verdict,
@@ -150,40 +154,27 @@ class Trend:
                 "basis": self.basis,
                 "unit": self.unit,
                 "pressure_Pa": self.pressure,
-                "recordings": len(self.points),
+                "recordings": len(points),
                 "compared": len(self.rows),
-                "first": self._moment(first),
-                "last": self._moment(last),
+                "first": self._moment(days[0]),
+                "last": self._moment(days[-1]),
                 "now": now,
                 "healthy": healthy,
                 "day_to_day": scatter,
                 "growth_per_month": growth,
                 "step": step,
                 "onset": self._moments(onset),
-                "alarm": None if alarm is None else {"file": alarm.file, "time": self._moment(alarm.day)},
+                "alarm": alarm and {"file": alarm.file, "time": self._moment(alarm.day)},
                 "repairs": [{"file": point.file, "time": self._moment(point.day)} for point in self.repairs],
                 "limit": self.limit,
                 "repair_limit": self.repair.as_dict(),
                 "days_to_limit": reach,
-                "limit_reached": self._moments(reach and Interval(*(last + days for days in reach))),
+                "limit_reached": self._moments(reach and Interval(*(days[-1] + wait for wait in reach))),
                 "false_alarm_years": self.years,
                 "healthy_recordings": self.healthy,
-                "rig": None if self.machine is None else self.machine.as_dict(),
+                "rig": self.machine and self.machine.as_dict(),
                 "groups": self.groups,
-                "points": [
-                    {
-                        "file": point.file,
-                        "time": self._moment(point.day),
-                        "day": point.day,
-                        "value": point.value,
-                        "low": point.low,
-                        "high": point.high,
-                        "group": None if point.group < 0 else point.group,
-                        "temperature_C": point.temperature,
-                        "note": point.note,
-                    }
-                    for point in self.points
-                ],
+                "points": points,
                 "findings": [
                     {name: getattr(finding, name) for name in ("code", "count", "severity", "text")}
                     for finding in self.findings
@@ -204,7 +195,7 @@ class Trend:
 
 @checked_call
 def trend(
-    recordings: Iterable[Recording],
+    recordings: Iterable[Recording | LeakReading],
     *,
     rig: Rig | str | os.PathLike[str] | None = None,
     healthy: int = 1,
@@ -217,7 +208,7 @@ def trend(
     Parameters
     ----------
     recordings : iterable of Recording
-        Recordings of the machine, in any order; copies count once.
+        Recordings of the machine, in any order, or readings of them; copies count once.
     rig : Rig, str or path-like, optional
         What may be assumed of the machine, as for `diagnose`; without it, and where the recordings do not tell, levels
         are relative.
@@ -250,27 +241,15 @@ def trend(
     >>> ss.trend(days).verdict
     'no leak'
     """
-    readings = [reading_of(recording, rig) for recording in recordings]
-    return trend_of(readings, healthy=healthy, limit=limit, years=years, every=every)
-
-
-def trend_of(
-    readings: Sequence[LeakReading],
-    *,
-    healthy: int = 1,
-    limit: str | None = None,
-    years: float = 10.0,
-    every: float | None = None,
-) -> Trend:
-    """Return the trend of readings; arguments and errors as for `trend`."""
     if not (isinstance(healthy, int) and healthy >= 1):
         raise InputError(f"the number of healthy recordings must be 1 or more, got {healthy!r}")
     if not 0.1 <= years <= 1000.0:
         raise InputError(f"machine-years to a false alarm must be 0.1 to 1000, got {years!r}")
     if every is not None and not (math.isfinite(every) and every > 0.0):
         raise InputError(f"every must be > 0 s, got {every!r}")
-    line, repair = timeline(readings, every), RepairLimit.of(limit)
-    kept = [k for k, point in enumerate(line.points) if point.group >= 0]
+    readings = [own if isinstance(own, LeakReading) else reading_of(own, rig) for own in recordings]
+    line = timeline(readings, every)
+    kept = tuple(k for k, point in enumerate(line.points) if point.group >= 0)
     flows = bool(kept) and all(line.readings[k].states_flow for k in kept)
     stated = Trend(
         verdict="cannot tell",
@@ -281,8 +260,8 @@ def trend_of(
         points=tuple(line.points),
         groups=line.groups,
         episodes=(),
-        rows=tuple(kept),
-        repair=repair,
+        rows=kept,
+        repair=RepairLimit.of(limit),
         machine=line.readings[0].machine if line.readings else None,
         findings=tuple(line.findings),
         years=years,
@@ -290,29 +269,31 @@ def trend_of(
         dated=every is None,
     )
     if kept:
-        stated = _with_levels(stated, line)
+        stated = _with_levels(stated, [line.readings[k] for k in kept])
     verdict, reason = _verdict(stated)
     return replace(stated, verdict=verdict, reason=reason)
 
 
-def _with_levels(trend: Trend, line: Timeline) -> Trend:
+def _with_levels(trend: Trend, readings: Sequence[LeakReading]) -> Trend:
     """Return the trend with its levels and what they say, of one recording or more that can be compared."""
-    levels, prior, allowed = _levels(trend, [line.readings[k] for k in trend.rows])
-    few, points, findings = levels.merged(), [*trend.points], trend.findings
+    levels, prior, allowed = _levels(trend, readings)
+    few, points, rows = levels.merged(), [*trend.points], trend.rows
     alone = np.flatnonzero(beyond(levels, prior)[1])
     apart = "apart from the recordings before and after: it counts as if it were near"
-    if alone.size:
-        files = ", ".join(points[trend.rows[k]].file for k in alone[:3])
-        text = f"{alone.size} of {len(points)} {apart} ({files})"
-        findings = (*findings, Finding("outlier", "warning", None, int(alone.size), None, text))
-    for k, row in enumerate(trend.rows):
+    files = ", ".join(points[rows[k]].file for k in alone[:3])
+    outliers = Finding("outlier", "warning", None, alone.size, None, f"{alone.size} of {len(points)} {apart} ({files})")
+    for k, row in enumerate(rows):
         value, half = float(levels.value[k]), 1.96 * float(levels.error[k])
         note = apart if k in alone else ""
         points[row] = replace(points[row], value=value, low=value - half, high=value + half, note=note)
     known = max(1, round(trend.healthy * len(few) / len(levels)))
-    stretches = episodes(few, prior, years=trend.years, known=known, allowed=allowed)
-    rows = [trend.rows[int(np.argmin(np.abs(levels.t - t)))] for t in few.t] if few is not levels else trend.rows
-    return replace(trend, points=tuple(points), findings=findings, episodes=tuple(stretches), rows=tuple(rows))
+    return replace(
+        trend,
+        points=tuple(points),
+        findings=(*trend.findings, *([outliers] if alone.size else [])),
+        episodes=tuple(episodes(few, prior, years=trend.years, known=known, allowed=allowed)),
+        rows=tuple(rows[int(np.argmin(np.abs(levels.t - t)))] for t in few.t) if few is not levels else rows,
+    )
 
 
 def _levels(trend: Trend, readings: Sequence[LeakReading]) -> tuple[Levels, DayToDay, float | None]:
@@ -343,31 +324,29 @@ def _levels(trend: Trend, readings: Sequence[LeakReading]) -> tuple[Levels, DayT
 
 def _verdict(trend: Trend) -> tuple[Verdict, str]:
     """Return the verdict and why."""
-    wear = trend.wear
+    rate, wear = f"1 false alarm in {trend.years:g} machine-years", trend.wear
     if wear is None:
         reasons = dict.fromkeys(point.note for point in trend.points if point.note)
-        return "cannot tell", "no recording states a level" + (f": {next(iter(reasons))}" if reasons else "")
+        return "cannot tell", ": ".join(["no recording states a level", *list(reasons)[:1]])
     last = trend.episodes[-1]
-    rate = f"1 false alarm in {trend.years:g} machine-years"
+    beyond_scatter = f"beyond the machine's own scatter ({rate})"
     if trend.basis == "ringing":
+        ringing = "the damping of the pressures' ringing"
         if last.alarm is None:
-            return "cannot tell", (
-                f"the damping of the pressures' ringing did not change beyond the machine's own scatter ({rate}); it "
-                "states no flow"
-            )
+            return "cannot tell", f"{ringing} did not change {beyond_scatter}; it states no flow"
         return "cannot tell", (
-            f"the damping of the pressures' ringing rose beyond the machine's own scatter ({rate}): a leak, warmer "
-            "oil, or another machine; without angle and position, or command, they cannot be told apart"
+            f"{ringing} rose {beyond_scatter}: a leak, warmer oil, or another machine; without angle and position, or "
+            "command, they cannot be told apart"
         )
     if last.alarm is not None:
         shape = "grows" if wear.step is None else "stepped up"
-        return "leak", (
-            f"the leakage {shape} beyond the machine's own scatter ({rate}); pump and piston are not told apart"
-        )
+        return "leak", f"the leakage {shape} {beyond_scatter}; pump and piston are not told apart"
     count = last.end - last.begin
     if count < 3:
         return "cannot tell", f"{count} comparable recordings are too few, 3 are needed"
-    detectable = 5.0 * max(wear.scatter, (wear.healthy.high - wear.healthy.low) / 3.92)
+    detectable = beliefs("trend")["course"]["detectable"] * max(
+        wear.scatter, (wear.healthy.high - wear.healthy.low) / 3.92
+    )
     if trend.limit is not None and wear.healthy.value + detectable > trend.limit:
         return "cannot tell", (
             f"the level scatters so much from recording to recording that a rise to the limit would not surely show: "

@@ -111,15 +111,15 @@ class Levels:
 def beyond(levels: Levels, prior: DayToDay) -> tuple[Array, Array]:
     """Return what of each value does not count while it is the last one, and what not once the next one is known.
 
-    That is what is beyond 3.5 deviations of the three before it, unless its neighbour lies as far out.
+    That is what lies beyond some deviations of the three before it, unless its neighbour lies as far out.
     """
-    last, later = np.zeros((2, len(levels)))
+    (last, later), outlier = np.zeros((2, len(levels))), beliefs("trend")["course"]["outlier"]
     for k in range(1, len(levels)):
         same = np.flatnonzero(levels.group == levels.group[k])
         place = int(np.searchsorted(same, k))
         before, after = levels.value[same[max(place - 3, 0) : place]], levels.value[same[place + 1 : place + 2]]
         if before.size:
-            reach, middle = 3.5 * levels.part(slice(0, k)).scatter(prior), float(np.median(before))
+            reach, middle = outlier * levels.part(slice(0, k)).scatter(prior), float(np.median(before))
             apart = levels.value[k] - middle
             agree = [np.sign(apart) * (other - middle) > reach for other in (before[-1], *after)]
             last[k] = 0.0 if agree[0] else np.sign(apart) * max(abs(apart) - reach, 0.0)

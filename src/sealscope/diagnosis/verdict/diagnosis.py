@@ -25,18 +25,13 @@ if TYPE_CHECKING:
     import matplotlib.axes
     import pandas
 
-#: Figures of a diagnosis that stand in its plain form as they are, and those of a detector, and of a finding.
-_FIGURES = (
-    *("file", "verdict", "reason", "onset_s", "onset_interval_s", "leak_lpm", "leak_interval_lpm", "bound_lpm"),
-    *("unused", "false_alarm_probability", "score", "threshold"),
-)
-_OF_METHOD = ("score", "threshold", "verdict", "reason")
-_OF_FINDING = ("code", "channel", "count", "first_t", "severity", "text")
 #: Columns of a table of diagnoses, beside those of the intervals.
 _COLUMNS = (
     *("file", "start", "machine", "verdict", "reason", "onset_s", "leak_lpm", "bound_lpm", "score", "threshold"),
     *("chance", "odds", "false_alarm_probability", "cause", "summary", "next_check"),
 )
+#: What the file of a recording may call its machine.
+_MACHINES = ("machine", "actuator", "asset", "serial number", "serial", "rig", "test rig", "maschine", "prüfstand")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,13 +109,8 @@ class Diagnosis(Evidence):
     @property
     def severity(self) -> Severity | None:
         """How bad the leak is; None where there is none, or nothing is known of its size."""
-        contradicted = (
-            "leak_lpm" in self.refuses
-            and self.machine is not None
-            and self.machine.stated
-            and self.measured_ratio is not None
-        )
-        return severity(self, self.limit, trusts_position=not contradicted)
+        measured, stated = self.measured_ratio is not None, self.machine is not None and self.machine.stated
+        return severity(self, self.limit, trusts_position=not ("leak_lpm" in self.refuses and stated and measured))
 
     @property
     def limit_lpm(self) -> float | None:
@@ -139,7 +129,7 @@ class Diagnosis(Evidence):
         course, level = self.course, self.limit_lpm
         if course is None or level is None or not course.whole:
             return None if course is None else level
-        onset = self.onset_s if self.onset_s is not None and math.isfinite(self.onset_s) else np.inf
+        onset = math.inf if self.onset_s is None or not math.isfinite(self.onset_s) else self.onset_s
         before = course.lpm[(course.t < onset) & np.isfinite(course.lpm)]
         return level + float(np.median(before)) if before.size else None
 
@@ -154,19 +144,8 @@ class Diagnosis(Evidence):
     @property
     def machine_name(self) -> str | None:
         """What the file calls the machine; None where it does not say."""
-        of_machine = (
-            "machine",
-            "actuator",
-            "asset",
-            "serial number",
-            "serial",
-            "rig",
-            "test rig",
-            "maschine",
-            "prüfstand",
-        )
         names = {name.lower(): text for name, text in self.about.items()}
-        return next((names[name] for name in of_machine if name in names), None)
+        return next((names[name] for name in _MACHINES if name in names), None)
 
     @property
     def methods(self) -> tuple[Evidence, ...]:
@@ -204,31 +183,34 @@ class Diagnosis(Evidence):
 
         A number that is not finite becomes null.
         """
-        ratio = self.measured_ratio or (None, None)
-        of_passage = {} if self.passage is None else vars(self.passage)
-        passage = {("pressure_Pa" if name == "pressure" else name): value for name, value in of_passage.items()}
+        ratio, passage = self.measured_ratio or (None, None), self.passage and dict(vars(self.passage))
+        if passage:
+            passage["pressure_Pa"] = passage.pop("pressure")
         methods = [
-            {"name": own.detector}
-            | {name: getattr(own, name) for name in _OF_METHOD}
-            | {"chance": own.stated_chance, "odds": own.odds}
+            {"name": own.detector, "score": own.score, "threshold": own.threshold, "verdict": own.verdict}
+            | {"reason": own.reason, "chance": own.stated_chance, "odds": own.odds}
             for own in self.methods
         ]
-        evidence = {
-            "detector": self.detector or None,
-            "share": self.share,
-            "baselines": self.baselines,
-            "ratio": ratio[0],
-            "ratio_interval": ratio[1],
-            "refuses": sorted(self.refuses),
-        }
+        names = ("code", "channel", "count", "first_t", "severity", "text")
         return plain(  # type: ignore[no-any-return]
             {
-                **{name: getattr(self, name) for name in _FIGURES},
+                "file": self.file,
+                "verdict": self.verdict,
+                "reason": self.reason,
+                "onset_s": self.onset_s,
+                "onset_interval_s": self.onset_interval_s,
+                "leak_lpm": self.leak_lpm,
+                "leak_interval_lpm": self.leak_interval_lpm,
+                "bound_lpm": self.bound_lpm,
+                "unused": self.unused,
+                "false_alarm_probability": self.false_alarm_probability,
+                "score": self.score,
+                "threshold": self.threshold,
                 "methods": methods,
-                "quality": [{name: getattr(own, name) for name in _OF_FINDING} for own in self.quality],
+                "quality": [{name: getattr(own, name) for name in names} for own in self.quality],
                 "cause": self.cause,
                 "next_check": self.next_check,
-                "passage": passage or None,
+                "passage": passage,
                 "chance": self.stated_chance,
                 "odds": self.odds,
                 "summary": self.summary,
@@ -238,8 +220,15 @@ class Diagnosis(Evidence):
                 "rig": self.machine and self.machine.as_dict(),
                 "severity": self.severity and self.severity.as_dict(),
                 "limit": self.limit.as_dict(),
-                "evidence": evidence,
-                "state": self.state.as_dict(),
+                "evidence": {
+                    "detector": self.detector or None,
+                    "share": self.share,
+                    "baselines": self.baselines,
+                    "ratio": ratio[0],
+                    "ratio_interval": ratio[1],
+                    "refuses": sorted(self.refuses),
+                },
+                "state": self.state,
             }
         )
 
@@ -278,17 +267,16 @@ class Diagnosis(Evidence):
         MissingExtra
             matplotlib is not installed.
         """
-        if self.course is None:
-            raise InputError(
-                f"a diagnosis must state the leak over time to be drawn, got one that does not ({self.file})"
-            )
+        if (course := self.course) is None:
+            rule = "a diagnosis must state the leak over time to be drawn"
+            raise InputError(f"{rule}, got one that does not ({self.file})")
         try:
             from matplotlib.figure import Figure
         except ImportError:
             raise MissingExtra("a drawing needs matplotlib: pip install 'sealscope[report]'") from None
         axes = Figure(layout="constrained").subplots() if ax is None else ax
-        axes.plot(self.course.t, self.course.lpm, label="leak" if not self.course.whole else "pump and piston together")
-        axes.fill_between(self.course.t, self.course.low, self.course.high, alpha=0.3, label="95 % interval")
+        axes.plot(course.t, course.lpm, label="pump and piston together" if course.whole else "leak")
+        axes.fill_between(course.t, course.low, course.high, alpha=0.3, label="95 % interval")
         if self.onset_s is not None:
             axes.axvline(self.onset_s, color="C3", label="onset")
         if self.repair_lpm is not None:
@@ -309,9 +297,9 @@ class Diagnosis(Evidence):
     def _repr_html_(self) -> str:
         """Return the diagnosis as a table for notebooks."""
 
-        def shown(value: float | None, interval: tuple[float, float] | None = None) -> str | None:
+        def shown(value: float | None, interval: tuple[float, float] | None = None) -> str:
             ends = "" if interval is None else f" ({interval[0]:.4g} to {interval[1]:.4g})"
-            return None if value is None else f"{value:.4g}{ends}"
+            return "" if value is None else f"{value:.4g}{ends}"
 
         rows = [
             ("reason", self.reason),

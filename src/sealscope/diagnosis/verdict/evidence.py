@@ -25,10 +25,10 @@ NO_RIG = "L/min is not stated: no rig was stated (--rig)"
 Figure = Literal["onset_s", "leak_lpm"]
 #: The causes for which the verdict is `leak`: piston and pump lie in parallel, and often no channel tells them apart.
 LEAKS: tuple[Cause, ...] = ("piston leak", "piston or pump leak")
-
-
 #: Smallest chance that is stated: no null distribution is known further out.
 RAREST = 1e-4
+#: The detector that judges where no other can: it sees that something changed, and states no size.
+LEAST_SPECIFIC = "rms change"
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,26 +46,15 @@ class LeakCourse:
     whole: bool = False
 
 
-#: The detector that judges where no other can: it sees that something changed, and states no size.
-LEAST_SPECIFIC = "rms change"
-
-
 @dataclass(frozen=True)
 class Passage:
     """What pump and piston together pass over a whole recording, a leak included that was there from the start.
 
-    Parameters
-    ----------
-    lpm, interval_lpm : float and pair of floats, or None
-        Mean flow, and its 95 % interval [L/min]; None where the machine's size is not known.
-    pressure : float
-        Mean size of the pressure difference at which it flows [Pa].
-    findable_lpm : float, optional
-        Smallest step of that flow that would have been found [L/min]; None where a step was found.
-    healthy_lpm : float, optional
-        The most that a healthy machine passes at that pressure [L/min], by the rig; None where the rig does not say.
-    pump_share, findable_share : float, optional
-        The flow, and the smallest step, over the pump's mean flow.
+    `lpm`: mean flow, and its 95 % interval [L/min], None where the machine's size is not known; `pressure`: mean size
+    of the pressure difference at which it flows [Pa]; `findable_lpm`: smallest step of that flow that would have been
+    found [L/min], None where a step was found; `healthy_lpm`: the most that a healthy machine passes at that pressure
+    [L/min], None where the rig does not say; `pump_share`, `findable_share`: the flow, and the smallest step, over the
+    pump's mean flow.
     """
 
     lpm: float | None
@@ -87,13 +76,9 @@ class Passage:
 class RelativeLeak:
     """A leak beside what the recording itself measures: known without area and displacement.
 
-    Parameters
-    ----------
-    pump_share, pump_share_interval : float and pair of floats, optional
-        Leak over the pump's mean flow, and its 95 % interval; None where the pump's motion is not recorded.
-    creep, creep_interval : float and pair of floats, optional
-        Leak over the piston's area: the speed at which the piston would creep with its lines shut [m/s], and its 95 %
-        interval; None where the position has no unit.
+    `pump_share`: leak over the pump's mean flow, None where the pump's motion is not recorded; `creep`: leak over the
+    piston's area, the speed at which it would creep with its lines shut [m/s], None where the position has no unit;
+    each with its 95 % interval.
     """
 
     pump_share: float | None = None
@@ -104,7 +89,7 @@ class RelativeLeak:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Verdict on one recording and the figures it rests on.
+    """Verdict on one recording and the figures it rests on; what is not known is None.
 
     Parameters
     ----------
@@ -112,7 +97,7 @@ class Evidence:
     reason : str
         Why, in one line.
     score, threshold : float, optional
-        A leak is reported where the score exceeds the threshold; None where it could not be computed.
+        A leak is reported where the score exceeds the threshold.
     onset_s, onset_interval_s : float and pair of floats, optional
         Time since when oil leaks, on the recording's time axis, and its 95 % interval [s].
     leak_lpm, leak_interval_lpm : float and pair of floats, optional
@@ -120,33 +105,29 @@ class Evidence:
     parts : tuple of Evidence
         The detector's own parts, each with a score and a threshold; of a fused verdict, the evidence of every detector.
     cause : str, optional
-        What the change is attributed to. None where there is no change, or where its cause cannot be told. A detector
-        that attributes a change to something other than a piston leak says `no leak` or `cannot tell`, and the cause.
+        What the change is attributed to. A detector that attributes one to something other than a piston leak says
+        `no leak` or `cannot tell`, and the cause.
     course : LeakCourse, optional
         The leak over the recording, where the detector follows it.
     refuses : frozenset of {"onset_s", "leak_lpm"}
-        Figures that the detector has a reason not to state, as opposed to those it cannot compute. No other detector's
-        figure takes their place in the fused verdict.
+        Figures that the detector has a reason not to state, as opposed to those it cannot compute.
     passage : Passage, optional
         What pump and piston pass together, where the detector measures it.
     share : float
-        Share of the recording, 0 to 1, that the verdict rests on: less than 1 where blocks with missing samples are
-        left out.
+        Share of the recording, 0 to 1, that the verdict rests on.
     detector : str
         Name of the detector, or of the part; of a fused verdict, the detector that judged, "" where none did.
     usable : bool
         Whether the recording had what the detector needs.
     chance : float, optional
         Probability that a leak-free recording scores as high, by the detector's own null distribution; at most the
-        false-alarm probability where the score is over the threshold. None where the detector does not state it. Less
-        than `RAREST` is not told apart from it.
+        false-alarm probability where the score is over the threshold.
     relative : RelativeLeak, optional
-        The leak beside the pump's flow and as a speed of the piston, where the recording itself measures these; stated
-        also where L/min is refused.
+        The leak beside what the recording itself measures; stated also where L/min is refused.
     ratio, ratio_interval : float and pair of floats, optional
-        Displacement over area as measured, over the assumed one, and its 95 % interval, where the detector measures it.
+        Displacement over area as measured, over the assumed one, and its 95 % interval.
     bound_lpm : float, optional
-        95 % upper bound of a leak [L/min] where none is reported; None where the channels do not allow one.
+        95 % upper bound of a leak [L/min] where none is reported.
     """
 
     verdict: Verdict

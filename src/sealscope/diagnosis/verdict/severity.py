@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.verdict.evidence import Evidence, RelativeLeak
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.errors import InputError
@@ -25,17 +26,10 @@ _ML_PER_MINUTE, _MM_PER_MINUTE = 1e-3 * LITRE_PER_MINUTE, 1e-3 / 60.0
 class RepairLimit:
     """Leak from which a machine is to be repaired.
 
-    By default 8 mm/min: what a maker of excavators allows a boom cylinder in service, 24 mm in 3 minutes (Caterpillar,
-    330D, 336D and 340D, Testing and Adjusting, Cylinder Drift - Check (Loaded Bucket); new 6 mm, rebuilt 12 mm). As a
-    speed it holds for a piston of any area: 5.1 mL/min for one of 633 mm^2.
+    By default the creep of `priors.toml`: as a speed it holds for a piston of any area.
 
-    Parameters
-    ----------
-    value : float
-        Flow [m^3/s], or speed at which the piston creeps with its lines shut [m/s].
-    kind : {"flow", "creep"}
-    stated : bool
-        Whether the caller stated it.
+    `value`: flow [m^3/s], or speed at which the piston creeps with its lines shut [m/s], by `kind`; `stated` by the
+    caller.
     """
 
     value: float
@@ -46,7 +40,7 @@ class RepairLimit:
     def of(cls, text: str | None) -> RepairLimit:
         """Return the limit that a text states as a flow or a speed with its unit, the default one for None."""
         if text is None:
-            return cls(8.0 * _MM_PER_MINUTE, "creep", stated=False)
+            return cls(beliefs("verdict")["repair"]["creep"] * _MM_PER_MINUTE, "creep", stated=False)
         for kind, unit in (("flow", "m^3/s"), ("creep", "m/s")):
             try:
                 value = parse_quantity(text, unit, name="limit")
@@ -75,18 +69,9 @@ class RepairLimit:
 class Severity:
     """How bad a leak is, as far as the recording and what is known of the machine tell.
 
-    Each figure is None, where it is not known, or the figure and its 95 % interval.
-
-    Parameters
-    ----------
-    mL_per_min : triple of floats, optional
-        Mean flow while the leak is open [mL/min].
-    pump_share : triple of floats, optional
-        That flow over the pump's mean flow.
-    creep_mm_per_min : triple of floats, optional
-        Speed at which the piston would creep with its lines shut under the same pressure difference [mm/min].
-    of_limit : triple of floats, optional
-        The leak over the repair limit.
+    Each figure is None, where it is not known, or the figure and its 95 % interval: `mL_per_min`, mean flow while the
+    leak is open; `pump_share`, that flow over the pump's mean flow; `creep_mm_per_min`, the speed at which the piston
+    would creep with its lines shut under the same pressure difference; `of_limit`, the leak over the repair limit.
     """
 
     mL_per_min: _Figure
@@ -144,12 +129,11 @@ def beside_the_pump(evidence: Evidence, recording: Recording, machine: AssumedMa
     """
     if evidence.leak_lpm is None or evidence.leak_interval_lpm is None:
         return None
-    leak, *interval = (LITRE_PER_MINUTE * value for value in (evidence.leak_lpm, *evidence.leak_interval_lpm))
-    area, pump = machine.area, _mean_speed(recording) / (2.0 * math.pi) * machine.displacement
-    creep = leak / area, (interval[0] / area, interval[1] / area)
-    if not pump > 0.0:
-        return RelativeLeak(None, None, *creep)
-    return RelativeLeak(leak / pump, (interval[0] / pump, interval[1] / pump), *creep)
+    ends = LITRE_PER_MINUTE * np.array([evidence.leak_lpm, *evidence.leak_interval_lpm])
+    pump = _mean_speed(recording) / (2.0 * math.pi) * machine.displacement
+    creep, *creeps = (ends / machine.area).tolist()
+    share, *shares = (ends / pump).tolist() if pump > 0.0 else (None,)
+    return RelativeLeak(share, tuple(shares) or None, creep, tuple(creeps))
 
 
 def _mean_speed(recording: Recording) -> float:

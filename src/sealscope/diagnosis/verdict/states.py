@@ -20,25 +20,12 @@ LEAKING = ("leak", "leak over the limit")
 
 @dataclass(frozen=True, kw_only=True)
 class MachineState:
-    """State of a machine.
+    """State of a machine, from `states.toml`.
 
-    Parameters
-    ----------
-    name : {"good", "check function", "out of specification", "maintenance required", "failure"}
-    symbol : str
-        Its letter: N, C, S, M, F.
-    health : int
-        Number in DeviceHealthEnumeration of OPC UA.
-    severity : int
-        1 to 1000, as of an event of OPC UA; 0 for good.
-    condition : str
-        What it follows from, such as "leak" or "no data".
-    since_s : float, optional
-        Clock of the samples since when it holds [s]; None where it is not known.
-    cause : str, optional
-        What the change is taken for.
-    action : str
-        What is to be done.
+    `name`: good, check function, out of specification, maintenance required or failure; `symbol`: its letter; `health`:
+    its number in DeviceHealthEnumeration; `severity`: 1 to 1000, as of an event of OPC UA, 0 for good; `condition` that
+    it follows from, such as "leak" or "no data"; `since_s`: clock of the samples since when it holds [s], None where
+    not known; `cause` that the change is taken for; `action`: what is to be done.
     """
 
     name: str

@@ -14,12 +14,9 @@ from sealscope.diagnosis.trend.reading import DAY
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
-from sealscope.reporting import charts, messages, picture, template
-from sealscope.reporting.trend.chart import SIZES, Scale, day_ticks, with_margin
+from sealscope.reporting import charts, messages, template
+from sealscope.reporting.trend.page import SIZES, Scale, with_margin
 from sealscope.reporting.trend.text import stamp
-
-#: A figure of more than so many times the median one is not drawn to scale: it would press the others flat.
-_FAR = 8.0
 
 
 class Judged(NamedTuple):
@@ -30,12 +27,8 @@ class Judged(NamedTuple):
     read: Callable[[], Recording]
 
 
-class _Level(NamedTuple):
-    """What a recording states of the leak [L/min]: figure and interval, or a bound where `low` is None."""
-
-    lpm: float
-    low: float | None
-    high: float
+#: What a recording states of the leak [L/min]: figure, ends of its interval; a bound where the lower one is None.
+_Level = tuple[float, float | None, float]
 
 
 def write_history_page(
@@ -46,21 +39,9 @@ def write_history_page(
 
 
 def render_history_page(judged: Sequence[Judged], title: str, left_out: int = 0) -> str:
-    """Return the page of a machine as HTML.
+    """Return the page of a machine as HTML: its recordings and their diagnoses, in any order.
 
-    Parameters
-    ----------
-    judged : sequence of Judged
-        Its recordings and their diagnoses, in any order.
-    title : str
-        Name of the machine.
-    left_out : int, optional
-        Files that could not be read.
-
-    Raises
-    ------
-    InputError
-        There is no recording.
+    `title`: name of the machine; `left_out`: files that could not be read. Raises InputError without a recording.
     """
     if not judged:
         raise InputError("the page of a machine must have at least 1 recording, got 0")
@@ -101,47 +82,37 @@ def history_chart(ordered: Sequence[Judged], size: str) -> dict[str, Any] | None
     dated = all(own.start_s is not None for own in ordered)
     days = [(own.start_s or 0.0) / DAY if dated else float(k + 1) for k, own in enumerate(ordered)]
     limit = ordered[-1].diagnosis.limit_lpm
-    far = _FAR * float(np.median([level.lpm for level in known])) or math.inf
-    near = [value for level in known for value in (level.lpm, level.high) if value <= far and value < math.inf]
+    far = 8.0 * float(np.median([lpm for lpm, *_ in known])) or math.inf  # beyond it others would be pressed flat
+    near = [value for lpm, _, high in known for value in (lpm, high) if value <= far and value < math.inf]
     near += [] if limit is None or limit > far else [limit]
-    top = 1.08 * max(near, default=0.0) or 1.0
-    scale = Scale(*SIZES[size], with_margin(days[0], days[-1]), (0.0, top))
-    drawn: dict[str, list[dict[str, Any]]] = {"points": [], "bounds": [], "beyond": []}
+    scale = Scale(size, with_margin(days[0], days[-1]), (0.0, 1.08 * max(near, default=0.0) or 1.0))
+    drawn: dict[str, list[Any]] = {"points": [], "bounds": [], "beyond": [], "absent": []}
     for own, day, level in zip(ordered, days, levels, strict=True):
         if level is None:
+            drawn["absent"].append(scale.x(day))
             continue
-        mark = {"x": scale.x(day), "y": scale.y(min(level.lpm, top)), "kind": "first"}
-        mark["title"] = f"{Path(own.diagnosis.file).name}: {messages.flow(own.diagnosis)}"
-        if level.lpm > top:
+        lpm, low, high = level
+        title = f"{Path(own.diagnosis.file).name}: {messages.flow(own.diagnosis)}"
+        mark = {"x": scale.x(day), "y": scale.y(lpm), "kind": "first", "title": title}
+        if lpm > scale.levels[1]:
             drawn["beyond"].append(mark)
-        elif level.low is None:
+        elif low is None:
             drawn["bounds"].append(mark)
         else:
-            ends = {"low": scale.y(max(level.low, 0.0)), "high": scale.y(min(level.high, top))}
-            drawn["points"].append(mark | ends)
-    span = days[-1] - days[0]
-    ticks = day_ticks(scale, days[0])
-    ticks = ticks if dated else [day for day in ticks if day.is_integer()]
-    return {
-        **scale.frame,
-        **drawn,
-        "course": [],
-        "bands": [],
-        "marks": [],
-        "absent": [scale.x(day) for day, level in zip(days, levels, strict=True) if level is None],
-        "limit": None if limit is None or limit > top else scale.y(limit),
-        "x_ticks": [(scale.x(day), stamp(day * DAY, span) if dated else f"{day:g}") for day in ticks],
-        "y_ticks": [(scale.y(level), f"{level:.6g}") for level in picture.ticks(0.0, top, 4)],
-    }
+            drawn["points"].append(mark | {"low": scale.y(low), "high": scale.y(high)})
+    ticks = [day for day in scale.day_ticks(days[0]) if dated or day.is_integer()]
+    labels = [stamp(day * DAY, days[-1] - days[0]) if dated else f"{day:g}" for day in ticks]
+    return scale.picture(list(zip(map(scale.x, ticks), labels, strict=True)), limit=scale.limit(limit), **drawn)
 
 
 def _level(diagnosis: Diagnosis) -> _Level | None:
     leak, bound = diagnosis.leak_lpm, diagnosis.bound_lpm
-    if diagnosis.verdict == "leak" and leak is not None and math.isfinite(leak):
-        low, high = diagnosis.leak_interval_lpm or (leak, leak)
-        return _Level(leak, low if math.isfinite(low) else 0.0, high)
-    bounded = diagnosis.verdict != "leak" and bound is not None and math.isfinite(bound)
-    return _Level(bound, None, bound) if bounded else None  # type: ignore[arg-type]
+    if diagnosis.verdict != "leak":
+        return None if bound is None or not math.isfinite(bound) else (bound, None, bound)
+    if leak is None or not math.isfinite(leak):
+        return None
+    low, high = diagnosis.leak_interval_lpm or (leak, leak)
+    return leak, low if math.isfinite(low) else 0.0, high
 
 
 def _dates(ordered: Sequence[Judged]) -> list[str]:
