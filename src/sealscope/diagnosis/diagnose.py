@@ -17,7 +17,7 @@ from sealscope.diagnosis.judgement import ORDER, judged, judging, rank
 from sealscope.diagnosis.learnt import Healthy, Learnt
 from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
-from sealscope.diagnosis.verdict.evidence import Evidence
+from sealscope.diagnosis.verdict.evidence import RAREST, Evidence
 from sealscope.diagnosis.verdict.machine import assumed_rig
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
@@ -124,7 +124,7 @@ class Examination:
                 evidences.append(self.evidence(name))
                 if judging(evidences) is not None:
                     break
-        other = None if self.distrust else other_step(self.recording, self.false_alarm_probability)
+        other = None if self.distrust else other_step(self.recording, RAREST)
         return judged(evidences, other, self.refusal)
 
 

@@ -79,21 +79,18 @@ def hypotheses(
     orifice = columns[0].names.index(ORIFICE)
     tested.append((SCALE, "sensor fault", information(_with_scale(recorded, columns, orifice), columns, orifice)))
     stepped = []
-    cost = cost_of_zero(zero_of(blocks, columns))
     root = 2.0 * float(np.mean(blocks.driving(root=True)))  # dp over d sqrt(p)
-    costs = {
-        LEAK: cost,
-        PUMP: cost,
-        ORIFICE: cost_of_zero(root * zero_of(blocks, columns, orifice) + float(np.mean(blocks.zero))),
-    }
+    of_root = root * zero_of(blocks, columns, orifice) + float(np.mean(blocks.zero))
+    # the law of a leak lies between both: it needs the lesser zero of them at least
+    cost = min(map(cost_of_zero, (zero_of(blocks, columns), of_root)))
     for name, cause, own in tested:
         signs = (1.0,) if cause in (*LEAKS, "pump leak", "external leak") else (1.0, -1.0)
         best = step_test(own, signs)
         if best is not None:
             stored = lost.get(name.removesuffix(MADE_UP)) if cause == "external leak" else None
             beside = 0.0 if stored is None else _agree(best, stored)
-            if name in costs:
-                beside -= costs[name]
+            if name in (LEAK, ORIFICE, PUMP):
+                beside -= cost
             elif name == SCALE:
                 beside -= _unlikely(best)
             stepped.append(StepHypothesis(name, cause, best, beside))
@@ -139,20 +136,18 @@ def probabilities(
     """
     if not tested:
         return {}
-    believed, scores, beside = beliefs("inference")["causes"], dict[Cause, float](), dict[Cause, float]()
-    for each in reversed(tested):
-        scores[each.cause], beside[each.cause] = each.test.score, each.beside
+    believed = beliefs("inference")["causes"]
+    terms = [(own.cause, own.test.score, own.beside) for own in tested]
     if other is not None and _coincides(tested[0].test, other):
-        own = max(scores.values()) if other.cause == "changed duty" else max(scores.get(other.cause, 0.0), 0.0)
+        with_it = [score for cause, score, _ in terms if other.cause in (cause, "changed duty")]
         slowed = min(max(share, 0.0) / beliefs("inference")["worth"]["share"], 1.0)
-        scores[other.cause] = own + other.score * (1.0 - slowed if other.cause == "friction change" else 1.0)
-    temper = 2.0 * (1.0 + believed["model"] * max(*scores.values(), 0.0))
-    logs = {
-        cause: float(np.log(believed["leak" if cause in (*LEAKS, "pump leak") else cause]))
-        + score / temper
-        + 0.5 * beside.get(cause, 0.0)
-        for cause, score in scores.items()
-    }
+        own = other.score * (1.0 - slowed if other.cause == "friction change" else 1.0)
+        terms.append((other.cause, max(*with_it, 0.0, 0.0) + own, 0.0))
+    temper = 2.0 * (1.0 + believed["model"] * max(score for _, score, _ in terms))
+    logs = dict[Cause, float]()
+    for cause, score, beside in terms:
+        odds = float(np.log(believed["leak" if cause in (*LEAKS, "pump leak") else cause]))
+        logs[cause] = max(odds + score / temper + 0.5 * beside, logs.get(cause, -np.inf))
     total = float(np.logaddexp.reduce(list(logs.values())))
     return {cause: float(np.exp(own - total)) for cause, own in sorted(logs.items(), key=lambda item: -item[1])}
 

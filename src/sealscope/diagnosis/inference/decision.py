@@ -25,7 +25,7 @@ from sealscope.diagnosis.inference.causes import stepped as stepped_cause
 from sealscope.diagnosis.inference.onset import Course, Information, Interval, StepTest, course, step_test
 from sealscope.diagnosis.inference.other_steps.step import other_step
 from sealscope.diagnosis.inference.scatter import Rise, Taught, rise
-from sealscope.diagnosis.inference.terms import LAG, LEAK, ORIFICE, PUMP, Equation
+from sealscope.diagnosis.inference.terms import LAG, ORIFICE, PUMP, Equation
 from sealscope.diagnosis.verdict.evidence import (
     LEAKS,
     NO_RIG,
@@ -236,17 +236,17 @@ def judge(balance: RecordedBalance, probability: float, baseline: Sequence[Taugh
     questions = _questions(balance, against, probability)
     answered = next((own for own in questions if own.chance < own.probability), None)
     causes: dict[Cause, float] = {}
-    other = other_step(balance.recording, probability)
     if answered is not None and answered.name == WITHIN and test is not None:
         flow, pump = test.fitted[0] * balance.mean(0), balance.mean(2)
-        causes = probabilities(balance.hypotheses, other, flow / pump if pump > 0.0 else 0.0)
+        beside = other_step(balance.recording, RAREST)  # it takes a leak away
+        causes = probabilities(balance.hypotheses, beside, flow / pump if pump > 0.0 else 0.0)
         answered = answered if is_leak(causes) else None
     if answered is None:
         judging = questions[0]
         bound = bound_of(balance, against)
         enough = balance.moving > 0.0 and bound <= beliefs("inference")["worth"]["share"] * balance.moving
         enough &= sum(causes.get(own, 0.0) for own in LEAKS) < 1.0 - _SURE  # a change that may as well be a leak
-        cause = stepped_cause(balance.hypotheses, probability, other)
+        cause = stepped_cause(balance.hypotheses, probability, other_step(balance.recording, probability))
         evidence = Evidence("no leak" if enough else "cannot tell", "", cause=None if cause in LEAKS else cause)
     else:
         judging = answered
@@ -332,13 +332,12 @@ def _step(balance: RecordedBalance, causes: dict[Cause, float]) -> Evidence:
     assert test is not None
     onset = test.onset()
     flows, deviations, scores = [], [], []
-    beside = {own.name: own.beside for own in balance.hypotheses}
-    for name, own, mean in ((LEAK, test, 0), (ORIFICE, orifice, 1)):
+    for own, mean in ((test, 0), (orifice, 1)):
         if own is not None:
             pressure = balance.mean(mean, onset.value)
             flows.append(own.fitted[0] * pressure)
             deviations.append(own.fitted[1] * pressure)
-            scores.append(own.score + beside.get(name, 0.0))
+            scores.append(own.score)
     weights = np.exp(0.5 * (np.array(scores) - max(scores)))
     weights /= weights.sum()
     value = float(weights @ flows)

@@ -74,13 +74,14 @@ def _features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[str, A
     own, other = (np.log(np.nanmedian(np.diff(p, ORDER, axis=1) ** 2, axis=1)) for p in (p_A, p_B))
     yield "noise of the pressures", own + other
     yield "noise of p_A beside that of p_B", own - other
-    length, values = p_A.shape[1], p_A + p_B
+    length = p_A.shape[1] // 2
+    values = (p_A + p_B)[:, : 2 * length].reshape(-1, 2, length)
     bins = np.array([0.0, *_BESIDE, *np.negative(_BESIDE)])
     for hertz in _BELIEVED["mains"]:
         if hertz + _BESIDE[-1] * rate / length < _BELIEVED["highest"] * rate:
             turns = np.outer(np.arange(length), hertz / rate + bins / length)
             window = np.hanning(length)[:, None] * np.exp(-2j * np.pi * turns)
-            power = np.log(np.abs((values - values.mean(axis=1, keepdims=True)) @ window) ** 2)
+            power = np.log((np.abs((values - values.mean(axis=2, keepdims=True)) @ window) ** 2).mean(axis=1))
             # a line over what is beside it: ringing is wider
             yield f"hum of {hertz:g} Hz", power[:, 0] - power[:, 1:].mean(axis=1)
 
