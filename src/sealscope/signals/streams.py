@@ -94,8 +94,8 @@ class DetailStream:
         late = len(low) // 2 * (2**self.levels - 2 * holes)
         self._history = max(self.delay, int(np.max(late + (len(low) - 1) * holes)))
         groups = -(-self._table[1] // WIDTH)
-        #: What the kernels take: taps (taps, WIDTH) of low- and high-pass, and the levels' buffers (groups, rows of the
-        #: table, levels, history and CHUNK, WIDTH).
+        # the kernels take taps (taps, WIDTH) of low- and high-pass, and the levels' buffers (groups, rows of the table,
+        # levels, history and CHUNK, WIDTH)
         self.taps = low, high
         self.buffers = aligned((groups, self._table[0], self.levels, self._history + CHUNK, WIDTH))
         self._fill, self.samples = self._history, 0
