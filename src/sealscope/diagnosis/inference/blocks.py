@@ -382,6 +382,11 @@ def _eliminated(gram: Array, blocks: Blocks, columns: Columns, test: int, others
     return 0.5 * (precision + precision.T), vector
 
 
+def _beside(columns: Columns) -> list[int]:
+    """Return the columns whose coefficients are unknown beside the leak's."""
+    return [k for k in columns.nuisance if k != columns.leak]
+
+
 def cost_of_zero(zero: float) -> float:
     """Return minus twice the logarithm of what is believed of a zero of the pressures [Pa], over that of none."""
     usual, far, odds = (beliefs("inference")["zero"][name] for name in ("pressure", "far", "odds"))
@@ -394,7 +399,7 @@ def zero_of(blocks: Blocks, columns: Sequence[Columns], test: int | None = None)
     `test`: the column of the leak through an orifice, then the zero is that of its root [Pa^0.5], beside the sums'.
     """
     fits = [
-        _fit(blocks.gram[:, e], blocks, own, test or own.leak, [k for k in own.nuisance if k != own.leak])
+        _fit(blocks.gram[:, e], blocks, own, own.leak if test is None else test, _beside(own))
         for e, own in enumerate(columns)
     ]
     own = float(np.mean([fit.zero for fit in fits]))
@@ -410,11 +415,11 @@ def pair(blocks: Blocks, columns: Columns) -> tuple[Array, Array, Array]:
     assert bias is not None
     gram = blocks.gram[:, 0].copy()
     middle = gram[:, leak, bias] / np.maximum(gram[:, bias, bias], np.finfo(float).tiny)
-    fit = _fit(gram, blocks, columns, leak, [k for k in columns.nuisance if k != leak])
+    fit = _fit(gram, blocks, columns, leak, _beside(columns))
     gram[:, leak] -= middle[:, None] * gram[:, bias]
     gram[:, :, leak] -= middle[:, None] * gram[:, :, bias]
     others = [k for k in columns.nuisance if k not in (leak, bias)]
-    at = [k for k in columns.nuisance if k != leak].index(bias)
+    at = _beside(columns).index(bias)
     powers, _ = _drifts(blocks)
     belief = np.delete(fit.fitted.precision.reshape(-1, powers.shape[1])[:-1], at, axis=0).ravel()
     of_leak, of_bias = (_normal(gram, powers, others, k, columns.left) for k in (leak, bias))
@@ -427,7 +432,7 @@ def pair(blocks: Blocks, columns: Columns) -> tuple[Array, Array, Array]:
 
 def mean_of(blocks: Blocks, columns: Columns, shares: Mapping[int, float]) -> tuple[float, float]:
     """Return a mean of coefficients, by their columns' `shares`, and its deviation; the leak is free in each block."""
-    others = [k for k in columns.nuisance if k != columns.leak]
+    others = _beside(columns)
     normal, fitted, _ = _fit(blocks.gram[:, 0], blocks, columns, columns.leak, others)
     weights = np.zeros((len(others) + 1, len(fitted.coefficients) // (len(others) + 1)))
     for column, share in shares.items():
@@ -442,7 +447,7 @@ def total(blocks: Blocks, columns: Sequence[Columns]) -> Array:
     """Return a recording's sums (E, m, m), over the rows' variance."""
     sums = []
     for e, own in enumerate(columns):
-        others = [k for k in own.nuisance if k != own.leak]
+        others = _beside(own)
         fit = _fit(blocks.gram[:, e], blocks, own, own.leak, others)
         sums.append(blocks.gram[:, e].sum(axis=0) / fit.fitted.variance)
     return np.array(sums)

@@ -5,6 +5,8 @@ The duty is asked for first: it is the operator's, and whatever else moved may h
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -34,41 +36,42 @@ class OtherStep(NamedTuple):
 
 
 def other_step(recording: Recording, chance: float) -> OtherStep | None:
-    """Return what stepped beside a leak, computed once; None where nothing does that is as rare as `chance`."""
-    return remembered(recording, ("other step", chance), lambda own: _other_step(own, chance))
+    """Return what stepped beside a leak; None where nothing does that is as rare as `chance`."""
+    steps = remembered(recording, ("other steps",), _other_steps)
+    return next((step for step, own in steps if own < chance), None)
 
 
 @np.errstate(all="ignore")
-def _other_step(recording: Recording, chance: float) -> OtherStep | None:
+def _other_steps(recording: Recording) -> list[tuple[OtherStep, float]]:
+    """Return what may have stepped, in the order in which it is asked for, with its chance."""
     shortest = beliefs("inference.other_steps")["features"]["shortest"]
     if len(recording) < BLOCKS * max(ORDER + 2, shortest * recording.rate):
-        return None
-    try:
-        return _duty(recording, chance) or _sensor(recording, chance) or _level(recording, chance)
-    except (ArithmeticError, np.linalg.LinAlgError):  # numbers that cannot be computed with are no machine's
-        return None
+        return []
+    steps: list[tuple[OtherStep, float]] = []
+    for asked in (_duty, _sensors, _levels):
+        # numbers that cannot be computed with are no machine's
+        with suppress(ArithmeticError, np.linalg.LinAlgError):
+            steps += asked(recording)
+    return steps
 
 
-def _duty(recording: Recording, chance: float) -> OtherStep | None:
-    """Return a step of command and motion nearer to (1, 1) than to (1, 0) and (0, 1): not the answer to a leak."""
+def _duty(recording: Recording) -> Iterator[tuple[OtherStep, float]]:
+    """Yield a step of command and motion nearer to (1, 1) than to (1, 0) and (0, 1): not the answer to a leak."""
     sizes = duty_tests(recording)
     steps = np.abs([test.fitted[0] for test in sizes])
-    rare = bool(sizes) and max(2.0 * test.chance for test in sizes) < chance
-    if not rare or not steps.min() > np.tan(np.pi / 8.0) * steps.max():
-        return None
-    return OtherStep.of("changed duty", "size of the duty", min(sizes, key=lambda test: test.score))
+    if sizes and steps.min() > np.tan(np.pi / 8.0) * steps.max():
+        least = min(sizes, key=lambda test: test.score)
+        yield OtherStep.of("changed duty", "size of the duty", least), max(2.0 * test.chance for test in sizes)
 
 
-def _sensor(recording: Recording, chance: float) -> OtherStep | None:
+def _sensors(recording: Recording) -> Iterator[tuple[OtherStep, float]]:
     tests = sensor_tests(recording)
-    rare = ((name, test) for name, test in tests if 2.0 * len(tests) * test.chance < chance)
-    return next((OtherStep.of("sensor fault", name, test) for name, test in rare), None)
+    for name, test in tests:
+        yield OtherStep.of("sensor fault", name, test), 2.0 * len(tests) * test.chance
 
 
-def _level(recording: Recording, chance: float) -> OtherStep | None:
+def _levels(recording: Recording) -> Iterator[tuple[OtherStep, float]]:
     patterns = level_tests(recording)
-    best = patterns[0] if patterns else None
-    if best is None or best.cause is None or len(patterns) * best.chance >= chance:
-        return None
-    text = f"near {best.onset:.0f} s the pressures step as of {best.name}"
-    return OtherStep(best.cause, text, best.score, best.onset, 2.0 * best.block)
+    if patterns and (best := patterns[0]).cause is not None:
+        text = f"near {best.onset:.0f} s the pressures step as of {best.name}"
+        yield OtherStep(best.cause, text, best.score, best.onset, 2.0 * best.block), len(patterns) * best.chance
