@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.diagnosis.beliefs import beliefs
-from sealscope.diagnosis.inference.causes import StepHypothesis, probabilities
-from sealscope.diagnosis.inference.causes import stepped as stepped_cause
 from sealscope.diagnosis.inference.decision import WITHIN, Question, asked, is_leak, questions
 from sealscope.diagnosis.inference.onset import StepTest, course, two_sided
+from sealscope.diagnosis.inference.other_steps.causes import StepHypothesis, probabilities
+from sealscope.diagnosis.inference.other_steps.causes import stepped as stepped_cause
 from sealscope.diagnosis.inference.pressures import response, ring_down
 from sealscope.diagnosis.inference.pressures.evidence import BELIEVED, PressureEvidence, flow_scale, unusable
 from sealscope.diagnosis.inference.scatter import Rise, student
