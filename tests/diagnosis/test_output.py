@@ -58,7 +58,7 @@ def test_contract_of_a_leak(leaky: Recording) -> None:
     ]
 
 
-def test_contract_of_a_leak(leaky: Recording) -> None:
+def test_contract_of_all_methods_beside_the_verdict(leaky: Recording) -> None:
     result = diagnose(leaky)
     assert result.verdict == "leak"
     check(result)

@@ -1,4 +1,4 @@
-"""What the providers of evidence from pressures and command share: blocks, lines of the mains, and their result."""
+"""Evidence from pressures and command: blocks, lines of the mains, and what blocks say of the conductance."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 BELIEVED = beliefs("inference.pressures")
-Provider = Literal["response", "ring"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,8 +28,6 @@ class PressureEvidence:
 
     Parameters
     ----------
-    by : {"response", "ring"}
-        The provider.
     information : Information
         What K blocks say of g, all nuisance parameters eliminated.
     pressure : array of float, shape (K,)
@@ -43,7 +40,6 @@ class PressureEvidence:
         What they say of other parameters that may have stepped, by name.
     """
 
-    by: Provider
     information: Information
     pressure: Array
     pump: float
@@ -51,14 +47,14 @@ class PressureEvidence:
     others: Mapping[str, Information] = field(default_factory=dict)
 
     @staticmethod
-    def of(by: Provider, recording: Recording, rig: Rig, said: Mapping[str, Information]) -> PressureEvidence:
+    def of(recording: Recording, rig: Rig, said: Mapping[str, Information]) -> PressureEvidence:
         """Return it from what the blocks of a recording say of parameters, `said["G"]` of g."""
         edges, dp = block_edges(recording), np.abs(recording["p_A"] - recording["p_B"])
         pressure = np.add.reduceat(dp, edges[:-1]) / np.diff(edges)
         speed = rig.motor.omega_per_volt * float(np.mean(np.abs(recording["u"])))
         others = {name: own for name, own in said.items() if name != "G"}
         pump = speed * rig.pump.q_b / (2.0 * np.pi)
-        return PressureEvidence(by, said["G"], pressure, pump, states_flow(rig), others)
+        return PressureEvidence(said["G"], pressure, pump, states_flow(rig), others)
 
     @cached_property
     def test(self) -> StepTest | None:
@@ -74,7 +70,7 @@ class PressureEvidence:
     @property
     def orifice(self) -> float:
         """Mean flow over g times `pressure` of an orifice; that of a worn seal is 1."""
-        return float(BELIEVED["conductance"][f"orifice_{self.by}"])
+        return float(BELIEVED["conductance"]["orifice"])
 
     def flow(self, step: float, deviation: float) -> tuple[float, tuple[float, float]]:
         """Return the mean flow [L/min] of a step of g [m^3/(s Pa)] with its `deviation`, and the 95 % interval.
