@@ -91,7 +91,15 @@ _LESSONS = {
     "volume balance": (Annotated[_BALANCE, AfterValidator(_with_sums_of_its_terms)], None),
     "pressure response": (_table("allow", level=float), None),
     "rms change": (
-        _table("allow", chambers=list[str], rate=float, start_s=(float, None), levels=_Numbers, duty=_Numbers),
+        _table(
+            "allow",
+            chambers=list[str],
+            recorded=(list[str], None),
+            rate=float,
+            start_s=(float, None),
+            levels=_Numbers,
+            duty=_Numbers,
+        ),
         None,
     ),
 }

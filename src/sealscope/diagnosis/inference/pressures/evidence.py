@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import FEWEST, Information, StepTest, step_test
+from sealscope.recordings.quality import mostly_clipped
 from sealscope.recordings.recording import Array, Recording
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -123,6 +124,8 @@ def unusable(recording: Recording, rig: Rig) -> str | None:
     for name in ("u", "p_A", "p_B"):
         if not np.all(np.isfinite(recording[name])) or not np.ptp(recording[name]) > 0.0:
             return f"{name} is constant or has missing samples"
+        if name != "u" and mostly_clipped(recording[name]):
+            return f"{name} is mostly cut off at an end of its range"
     return None
 
 
