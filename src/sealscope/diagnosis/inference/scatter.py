@@ -5,8 +5,8 @@ all terms; what a recording's own rows leave of them along the leak's column is 
 recording against the others measures how recordings differ; whatever the model does not describe is in it, once. With
 r_j the rise of recording j of n against the n - 1 others, y_j = r_j (n - 1)/n; for the judged one y is its rise.
 
-All y are normal about a mean near that of the sums, with the variance sigma^2 of each by itself and a covariance between them of
-which there are several candidates, all as likely (`Among`). sigma^2 has a scaled inverse chi square prior (s_0, nu_0):
+All y are normal about a mean near that of the sums, with the variance sigma^2 of each by itself and a covariance
+between them of which there are several candidates (`Among`). sigma^2 has a scaled inverse chi square prior (s_0, nu_0):
 the rise, y beyond what the others let expect, follows a mixture over both; with no covariance it is Student's with
 nu_0 + n - 1 degrees of freedom. Recordings of one session, by their dates, share oil and set-up: a deviation tau of
 sessions, half-normal beforehand, of leakage in proportion to its level, for it goes with the inverse of the oil's
@@ -122,7 +122,8 @@ def rise(judged: Taught, baseline: Sequence[Taught], columns: Sequence[Columns])
     beyond = np.array([_rise(own.sums, everything - own.sums, columns) for own in baseline] if count > 1 else [0.0])
     *by_oil, warmer, oil = _of_oil([*baseline, judged], *_level(everything, columns))
     value, deviations = _rise(judged.sums, everything, columns) - warmer, beyond * ((count - 1) / count) - by_oil
-    sessions = np.array(_sessions([*baseline, judged]))
+    starts, pause = [own.start_s for own in (*baseline, judged)], 3600.0 * beliefs("inference")["oil"]["shift"]
+    sessions = np.array(sessions_of(starts, pause))
     usual, apart = believed["leak"] * by_flow, float(np.hypot(oil, believed["session"] * by_flow))
     if len(set(sessions)) == 1:
         return student(value, deviations * (count / max(count - 1, 1)), usual)
@@ -186,12 +187,11 @@ class Among:
         return Rise(value - middle, float(np.sqrt(total)), np.inf, parts)
 
 
-def _sessions(taught: Sequence[Taught]) -> list[int]:
-    """Return the session of each recording: a number of its own after every gap in which the oil may have warmed."""
-    apart = 3600.0 * beliefs("inference")["oil"]["shift"]
-    dates = sorted(own.start_s for own in taught if own.start_s is not None)
-    begins = [date for before, date in zip([-np.inf, *dates], dates, strict=False) if date - before > apart]
-    return [-1 if own.start_s is None else int(np.searchsorted(begins, own.start_s, "right")) for own in taught]
+def sessions_of(starts: Sequence[float | None], pause: float) -> list[int]:
+    """Return the session of each recording: a number of its own after every gap [s] longer than `pause`."""
+    dates = sorted(own for own in starts if own is not None)
+    begins = [date for before, date in zip([-np.inf, *dates], dates, strict=False) if date - before > pause]
+    return [-1 if own is None else int(np.searchsorted(begins, own, "right")) for own in starts]
 
 
 def _of_oil(taught: Sequence[Taught], level: float, error: float) -> list[float]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Information
-from sealscope.diagnosis.inference.scatter import Among, Rise
+from sealscope.diagnosis.inference.scatter import Among, Rise, sessions_of
 from sealscope.diagnosis.rms_change.blocks import DUTY, QUANTITIES, RmsBlocks
 from sealscope.recordings.recording import Array
 
@@ -68,16 +68,19 @@ def rises(
 
     `log_rms` (5 per chamber,), `duty` (4,); `known` (n, 5 per chamber), `known_duty` (n, 4). The quantities of healthy
     recordings are normal about a mean, what the duty explains, and a deviation that fades with the time between them,
-    an Ornstein-Uhlenbeck process: it grows as a walk of a rate nobody knows, up to what sessions differ by. `times`
-    (n + 1,) of these and of the recording [s], None where they are not known: then all are of one time.
+    an Ornstein-Uhlenbeck process: it grows as a walk of a rate nobody knows, up to what sessions differ by; a session
+    begins anew after a pause. `times` (n + 1,) of these and of the recording [s], None where they are not known.
     """
     belief, walk, n = beliefs("rms_change")["recordings"], beliefs("rms_change")["walk"], len(known)
     exponents = np.array([float(beliefs("rms_change")["duty"][name]) for name in DUTY])
     apart = (np.vstack([known_duty, duty]) - duty) * exponents
     gained = walk["machine"] * np.tan(0.5 * np.pi * (np.arange(WALKS) + 0.5) / WALKS)
     rates = (gained / belief["session"]) ** 2 / (2.0 * walk["time"])
-    since = np.zeros((n + 1, n + 1)) if times is None else np.abs(np.subtract.outer(times, times))
-    fading = belief["session"] ** 2 * np.exp(-rates[:, None, None] * since)
+    since, alike = np.zeros((n + 1, n + 1)), np.ones((n + 1, n + 1))
+    if times is not None:
+        sessions = sessions_of(list(times), belief["pause"])
+        since, alike = np.abs(np.subtract.outer(times, times)), np.equal.outer(sessions, sessions).astype(float)
+    fading = belief["session"] ** 2 * np.exp(-rates[:, None, None] * since) * alike
     among = Among(fading + apart @ apart.T, np.zeros(WALKS))
     values, weights = beyond_noise(np.vstack([log_rms, known]), known)
     weight = weights[1:].mean(axis=0)
