@@ -14,13 +14,13 @@ from typing import Any
 import pytest
 from sqlalchemy.exc import DataError, OperationalError
 
+from sealscope.diagnosis.live.watch import STATE_VERSION
 from sealscope.errors import InputError
 from sealscope.monitor.memory.store import MonitorStore, StoredRows
 from sealscope.monitor.outputs.prometheus import metrics_text
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import read_settings, template
 from sealscope.monitor.sources.source_block import digest_of
-from sealscope.monitor.stream.watch import STATE_VERSION
 from sealscope.simulation.simulate import simulate
 
 from .plant import LINES, WORN, kill_often, lines_of, rows_of, served, settings_in, until, write_files

@@ -12,9 +12,9 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 import sealscope as ss
+from sealscope.diagnosis.live.estimates import BlockEstimate
+from sealscope.diagnosis.live.watch import Watch
 from sealscope.errors import InputError
-from sealscope.monitor.stream.estimates import BlockEstimate
-from sealscope.monitor.stream.watch import Watch
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.changes import Linear, ParameterDrift
 

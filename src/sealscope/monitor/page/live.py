@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sealscope.diagnosis.live.joining import CHANNELS
 from sealscope.errors import InputError
-from sealscope.monitor.stream.joining import CHANNELS
 from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.details import Details, details, shortest
 from sealscope.signals.windows import WINDOW_SIZE, windowed_rms
