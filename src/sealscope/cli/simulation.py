@@ -8,54 +8,26 @@ import sys
 from pathlib import Path
 from shutil import get_terminal_size
 from textwrap import fill, wrap
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from typer import Argument, Context, Option, echo
 
 from sealscope.cli import options as opt
 from sealscope.errors import InputError
 
-_COMMAND = (
-    "Command, e.g. '3 sin(4t)', 'chirp 3 from 0.1 Hz to 5 Hz over 60 s'; or a target for the piston: 'position 50 mm "
-    "sin(2t)'."
-)
-_LOAD = (
-    "Force against +x beside the rig's own, e.g. '2 kN', 'step 500 N at 3 s', '200 N/mm over x', '2 kN s/m over v', "
-    "'file LOAD.csv' (F [N] over t, x or v)."
-)
-_CONTROLLER = (
-    "What controls the position: pi, flatness, fault-tolerant, fault-tolerant-flatness, or your own as FILE.py:NAME or "
-    "MODULE:NAME. [default: pi]"
-)
-_LEAK = "Leak, e.g. '0.0042 L/min from 90 s'; repeat to combine."
-_FAULT = "Other fault, e.g. 'air 1 % from 90 s', 'sensor p_A offset 2 psi'; repeat."
-_RATE = "Sampling rate [Hz]; by default the rig's own (daq.sample_rate)."
-_ERROR = "Error that a pressure may have, e.g. '20[Pa]', instead of a step. [default: 100]"
+if TYPE_CHECKING:
+    from sealscope.simulation.experiment import Experiment
+
 _PROVE = "Halve the step and report how far everything moves; fail if too far."
 _FMU = "Record this unit (.fmu, a program that runs with your rights) instead of the rig, by the rig's instruments."
 _MAP = "The unit's own name of a channel or an input; repeat."
 
 
+@opt.simulating
 def simulate(
     output: Annotated[Path, Option("--output", "-o", help="Recording to write (.nc, .h5, .csv, .parquet).")],
-    rig: opt.RigOption = "thesis",
-    command: Annotated[str, Option(help=_COMMAND)] = "3 sin(4t)",
-    load: Annotated[str | None, Option(help=_LOAD)] = None,
-    controller: Annotated[str | None, Option(help=_CONTROLLER)] = None,
-    leak: Annotated[list[str] | None, Option(help=_LEAK)] = None,
-    fault: Annotated[list[str] | None, Option(help=_FAULT)] = None,
-    duration: Annotated[str, Option(help="Length, e.g. '180', '3 min' [s].")] = "180",
-    rate: Annotated[str | None, Option(help=_RATE)] = None,
-    start: Annotated[str, Option("--start-position", help="Position at the start, from mid-stroke [m].")] = "0",
-    seed: opt.SeedOption = 0,
-    overrides: opt.SetOption = None,
-    method: Annotated[str, Option(help="auto, rk4 or imex.")] = "auto",
-    step: Annotated[str | None, Option(help="Largest step of the solver [s].")] = None,
-    error: Annotated[str | None, Option(help=_ERROR)] = None,
+    experiment: Experiment,
     prove: Annotated[bool, Option("--prove", help=_PROVE)] = False,
-    allow_unresolved: Annotated[
-        bool, Option("--allow-unresolved", help="Let an unstable or unresolved run through, marked.")
-    ] = False,
     truth: Annotated[Path | None, Option(help="Write what was put in (leaks, onset) to this JSON file.")] = None,
     fmu: Annotated[Path | None, Option(help=_FMU)] = None,
     maps: Annotated[list[str] | None, Option("--map", metavar="CHANNEL=NAME", help=_MAP)] = None,
@@ -63,7 +35,6 @@ def simulate(
     """Simulate the rig, or run somebody else's unit, and record it as the rig's instruments would."""
     from sealscope.recordings import write
     from sealscope.recordings.files import check_target
-    from sealscope.simulation.experiment import Experiment
     from sealscope.simulation.simulate import simulate_with_truth, write_truth
     from sealscope.units import LITRE_PER_MINUTE
 
@@ -73,11 +44,6 @@ def simulate(
         opt.check_folder(truth)
         if truth.resolve() == output.resolve():
             raise InputError(f"recording and truth must be two files, got {output} for both")
-    experiment = Experiment.of(
-        rig=opt.rig_with(rig, overrides), command=command, load=load, controller=controller, leak=leak, fault=fault,
-        duration=duration, rate=rate, x_0=start, seed=seed, step=step, error=error, allow_unresolved=allow_unresolved,
-        method=method,  # type: ignore[arg-type]  # checked by Experiment
-    )  # fmt: skip
     if fmu is not None:
         if truth is not None or prove:
             raise InputError("--truth and --prove are of the rig, got them with --fmu")
