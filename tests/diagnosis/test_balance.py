@@ -74,7 +74,7 @@ def test_pieces_of_any_size_make_the_same_blocks(sizes: list[int], support: int)
     cuts = np.cumsum(sizes)
     whole, pieces = made(np.array([], dtype=int)), made(cuts[cuts < recording.t.size])
     assert len(whole) == len(pieces) >= 17
-    for name in ("start", "end", "rows", "means", "pressures"):
+    for name in ("start", "end", "rows", "flow", "pressures"):
         np.testing.assert_allclose(getattr(pieces, name), getattr(whole, name), rtol=1e-9)
     size = np.sqrt(np.einsum("keii->kei", whole.gram))
     scale = np.maximum(size[..., :, None] * size[..., None, :], 1e-300)

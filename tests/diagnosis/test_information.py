@@ -47,7 +47,7 @@ def blocks(values: np.ndarray, seconds: float = 3.0) -> Blocks:
         start + seconds,
         gram,
         np.full(count, float(each)),
-        np.ones((count, 3)),
+        np.ones(count),
         np.ones((count, 9)),
         np.zeros(count),
     )
@@ -102,7 +102,7 @@ def test_two_equations_of_one_coefficient_add() -> None:
         one.end,
         np.concatenate([one.gram, blocks(second).gram], axis=1),
         one.rows,
-        one.means,
+        one.flow,
         one.pressures,
         one.zero,
     )
@@ -120,7 +120,7 @@ def test_sums_add(most: int) -> None:
     assert merged.rows.sum() == whole.rows.sum()
     assert (merged.start[0], merged.end[-1]) == (whole.start[0], whole.end[-1])
     assert (merged.start[1:] >= merged.end[:-1]).all()
-    np.testing.assert_allclose(merged.means, 1.0)
+    np.testing.assert_allclose(merged.flow, 1.0)
     np.testing.assert_allclose(merged.pressures, 1.0)
 
 

@@ -48,7 +48,7 @@ def recording(random: np.random.Generator, leak: float, noise: float = 1e-5, shi
         start + 2.9,
         gram,
         np.full(8, 30.0),
-        np.tile([PRESSURE, PRESSURE**0.5, FLOW], (8, 1)),
+        np.full(8, FLOW),
         np.full((8, 9), PRESSURE),
         np.zeros(8),
     )

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.beliefs import beliefs
-from sealscope.diagnosis.inference.blocks import PRESSURE_PARTS, SMOOTHED, Blocks, Columns, Weighting
+from sealscope.diagnosis.inference.blocks import Blocks, Columns, Weighting
+from sealscope.diagnosis.inference.distribution import distribution
 from sealscope.diagnosis.inference.onset import FEWEST
 from sealscope.diagnosis.inference.row_weights import SUPPORT
 from sealscope.diagnosis.inference.terms import (
@@ -189,9 +189,9 @@ class BlockStream:
         index = np.arange(first, end, dtype=float)
         start = self._begin + (index * self._strides + 0.5 * SPAN) * (self._stride / self._rate)
         last = start + (self._strides - 1) * self._stride / self._rate
-        means, pressures = (np.concatenate([getattr(cut, name) for cut in cuts]) for name in ("means", "pressures"))
+        flow, pressures = (np.concatenate([getattr(cut, name) for cut in cuts]) for name in ("flow", "pressures"))
         zeros = np.full(end - first, self._zero)
-        return Blocks(start, last, gram, weights.astype(float), means, pressures, zeros)
+        return Blocks(start, last, gram, weights.astype(float), flow, pressures, zeros)
 
     def _cut(self, samples: Mapping[str, Array], first: int, end: int) -> _Cut:
         """Return the rows of blocks `first` to `end`."""
@@ -210,50 +210,22 @@ class BlockStream:
             made = rows([column[inner] for column in columns], self._rate)
             whole &= made.whole
             cut_rows.append(made.values)
-        pressure = (signals.pressure_difference + self._zero)[inner][: (end - first) * length].reshape(-1, length)
-        rate = self._balances[0].left(signals)[inner][: (end - first) * length].reshape(-1, length) * self._rate
-        return _Cut(tuple(cut_rows), whole, _means(pressure, rate), self._pressures(pressure))
-
-    def _pressures(self, pressure: Array) -> Array:
-        """Return the distribution of the smoothed p_A - p_B (K, n) over each block (K, PRESSURE_PARTS)."""
-        piece = max(1, round(SMOOTHED * self._rate))
-        count, length = pressure.shape
-        smooth = pressure[:, : length // piece * piece].reshape(count, -1, piece).mean(axis=2)
-        smooth.sort(axis=1)  # what is missing goes last
-        there = smooth.shape[1] - np.isnan(smooth).sum(axis=1)
-        return np.array([pressure_parts(own[:size]) for own, size in zip(smooth, there, strict=True)])
+        within = slice(start - begin, start - begin + (end - first) * length)
+        pressure = (cut["p_A"] - cut["p_B"])[within].reshape(-1, length)
+        rate = np.abs(self._balances[0].left(signals)[within].reshape(-1, length)) * self._rate
+        known = np.isfinite(rate)
+        flow = np.where(known, rate, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+        parts = np.array([distribution(own, self._rate) for own in pressure])
+        return _Cut(tuple(cut_rows), whole, flow, parts)
 
 
 class _Cut(NamedTuple):
-    """Rows (r, m) of each equation, whether each is `whole` (r,), and `Blocks.means` and `Blocks.pressures`."""
+    """Rows (r, m) of each equation, whether each is `whole` (r,), and `Blocks.flow` and `Blocks.pressures`."""
 
     rows: tuple[Array, ...]
     whole: NDArray[np.bool_]
-    means: Array
+    flow: Array
     pressures: Array
-
-
-def _means(pressure: Array, rate: Array) -> Array:
-    """Return the means of abs(p_A - p_B), of its root and of the left side's rate, (K, n) each, over each block."""
-    size = np.abs(pressure)
-    missing = np.isnan(pressure) | np.isnan(rate)
-    number = np.maximum((~missing).sum(axis=1), 1)
-    means = [np.where(missing, 0.0, of).sum(axis=1) / number for of in (size, np.sqrt(size), np.abs(rate))]
-    return np.column_stack(means)
-
-
-@lru_cache(maxsize=64)
-def _parts(count: int) -> Array:
-    """Return the shares by which sorted values make the means of PRESSURE_PARTS equal parts of them, as a matrix."""
-    ends = np.linspace(0.0, count, PRESSURE_PARTS + 1)
-    index = np.arange(count)[:, None]
-    within = np.minimum(index + 1, ends[1:]) - np.maximum(index, ends[:-1])
-    return np.asarray(np.maximum(within, 0.0) * PRESSURE_PARTS / max(count, 1))
-
-
-def pressure_parts(ordered: Array) -> Array:
-    """Return the means of PRESSURE_PARTS equal parts of values in rising order, 0 without any."""
-    return np.asarray(ordered @ _parts(len(ordered)))
 
 
 def _zero(pressure: Array) -> float:

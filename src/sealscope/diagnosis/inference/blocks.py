@@ -36,8 +36,6 @@ from sealscope.storage.plain_state import array_of, part_of, plain_array
 MOST_BLOCKS = 240
 #: Degree of the drifts.
 DRIFT_DEGREE = 2
-#: Parts of a block's distribution of pressure, and the time over which the pressure is averaged for it [s].
-PRESSURE_PARTS, SMOOTHED = 9, 0.025
 #: Beliefs of the coefficients that are free in each block while its rows are weighted.
 UNSTEADY = ("leak", "pump", "bias", "outside")
 _RIDGE = 1e-10  # of a matrix whose diagonal is 1
@@ -58,19 +56,19 @@ class Blocks:
         side last.
     rows : array of float, shape (K,)
         Number of rows that no missing sample touches.
-    means : array of float, shape (K, 3)
-        Means of abs(p_A - p_B) [Pa], of its root, and of the size of the left side's rate [m^3/s].
-    pressures : array of float, shape (K, PRESSURE_PARTS)
-        Distribution of p_A - p_B [Pa], averaged over `SMOOTHED` seconds: means of its equal parts, in rising order.
+    flow : array of float, shape (K,)
+        Mean size of the left side's rate [m^3/s].
+    pressures : array of float, shape (K, p)
+        Distribution of p_A - p_B [Pa]: means of p equal parts of it, in rising order (`distribution`).
     zero : array of float, shape (K,)
-        What the sums have taken off p_A - p_B [Pa] (`zero.about_zero`); `means` and `pressures` are as recorded.
+        What the sums have taken off p_A - p_B [Pa] (`zero.about_zero`); `pressures` are as recorded.
     """
 
     start: Array
     end: Array
     gram: Array
     rows: Array
-    means: Array
+    flow: Array
     pressures: Array
     zero: Array
 
@@ -96,7 +94,7 @@ class Blocks:
             self.end[last],
             np.add.reduceat(self.gram, first, axis=0),
             rows,
-            np.add.reduceat(self.means * shares, first, axis=0),
+            np.add.reduceat(self.flow * shares[:, 0], first),
             np.add.reduceat(self.pressures * shares, first, axis=0),
             self.zero[first],
         )

@@ -138,7 +138,7 @@ class RecordedBalance:
     def mean(self, column: int, since: float = -np.inf) -> float:
         """Return a mean over the blocks whose middle is at `since` or later, of pressures about their zero."""
         zero = self.root_zero if column == 1 else self.zero
-        values = self.blocks.means[:, 2] if column == 2 else self.blocks.driving(zero, root=column == 1)
+        values = self.blocks.flow if column == 2 else self.blocks.driving(zero, root=column == 1)
         chosen = self.blocks.time >= since
         if not chosen.any():
             chosen[-1] = True
@@ -147,7 +147,7 @@ class RecordedBalance:
     @cached_property
     def moving(self) -> float:
         """Mean flow while it flows [m^3/s]: the mean weighted by itself, so that standstills do not count."""
-        flow = self.blocks.means[:, 2]
+        flow = self.blocks.flow
         return float(flow @ flow / max(float(flow.sum()), np.finfo(float).tiny))
 
     @cached_property

@@ -110,7 +110,7 @@ class Taught(NamedTuple):
     ) -> Taught:
         """Return that of a recording's blocks."""
         weights = np.maximum(blocks.rows, 1e-9)
-        flow, pressure = (float(np.average(of, weights=weights)) for of in (blocks.means[:, 2], blocks.driving()))
+        flow, pressure = (float(np.average(of, weights=weights)) for of in (blocks.flow, blocks.driving()))
         return cls(_about_own(total(blocks, columns), columns), flow, pressure, start_s, oil_degC)
 
 

@@ -25,9 +25,10 @@ from numpy.typing import NDArray
 
 from sealscope.control.drive import Drive
 from sealscope.diagnosis.beliefs import beliefs
-from sealscope.diagnosis.inference.balance import LONGEST, pressure_parts, whole_samples
-from sealscope.diagnosis.inference.blocks import SMOOTHED, Blocks, Columns, Weighting
+from sealscope.diagnosis.inference.balance import LONGEST, whole_samples
+from sealscope.diagnosis.inference.blocks import Blocks, Columns, Weighting
 from sealscope.diagnosis.inference.circuit.store import cycle_length, lost_oil
+from sealscope.diagnosis.inference.distribution import distribution
 from sealscope.diagnosis.inference.onset import FEWEST, StepTest
 from sealscope.diagnosis.inference.terms import (
     LEAK,
@@ -162,9 +163,9 @@ def _blocks(
     gram = Weighting((Columns(equation),)).close([whole], np.cumsum(kept))
     ends = np.array([[rows.time[part][0], rows.time[part][-1]] for part in parts]) + np.array([-0.25, 0.25]) * half
     measured = [_measured(dp[a:b], left[a:b], rate) for a, b in np.round(ends * rate).astype(int)]
-    means, pressures = (np.array(of) for of in zip(*measured, strict=True))
+    flow, pressures = (np.array(of) for of in zip(*measured, strict=True))
     start, end = begin + ends.T
-    return Blocks(start, end, gram, kept.astype(float), means, pressures, np.zeros(len(parts))).merged()
+    return Blocks(start, end, gram, kept.astype(float), flow, pressures, np.zeros(len(parts))).merged()
 
 
 def _rows(increments: list[Array], counts: NDArray[np.bool_], half: float, rate: float) -> _WideRows:
@@ -197,11 +198,7 @@ def _less_the_zero(values: Array, names: list[str]) -> None:
         values[:, names.index(name)] *= share
 
 
-def _measured(dp: Array, left: Array, rate: float) -> tuple[list[float], Array]:
-    """Return `Blocks.means` and `Blocks.pressures` of a block's samples."""
-    piece = max(1, round(SMOOTHED * rate))
-    smooth = dp[: len(dp) // piece * piece].reshape(-1, piece).mean(axis=1)
-    smooth = smooth[np.isfinite(smooth)] if np.isfinite(smooth).any() else np.zeros(1)
-    size, flow = np.abs(smooth), left[np.isfinite(left)]
-    moved = float(np.abs(flow).mean()) * rate if flow.size else 0.0
-    return [float(size.mean()), float(np.sqrt(size).mean()), moved], pressure_parts(np.sort(smooth))
+def _measured(dp: Array, left: Array, rate: float) -> tuple[float, Array]:
+    """Return `Blocks.flow` and `Blocks.pressures` of a block's samples."""
+    flow = left[np.isfinite(left)]
+    return float(np.abs(flow).mean()) * rate if flow.size else 0.0, distribution(dp, rate)

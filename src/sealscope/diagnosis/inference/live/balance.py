@@ -195,7 +195,7 @@ class LiveBalance:
             return NotJudged(end, "at standstill", "blocks: at standstill")
         total = lead / precision
         offset = math.hypot(math.sqrt(leaning) / precision, self.size_error * lead / precision)
-        pressure, _, rate = (max(float(value), np.finfo(float).tiny) for value in block.means[0])
+        pressure, rate = (max(float(of[0]), np.finfo(float).tiny) for of in (block.driving(), block.flow))
         duty = math.log(pressure), math.log(rate)
         g, sd = total - shift / precision, precision**-0.5
         return BlockConductance(begin, end, g, sd, total, offset, pressure / LITRE_PER_MINUTE, duty)
