@@ -21,7 +21,7 @@ from sealscope.simulation.arguments import Method
 from sealscope.simulation.changes import Effect, Schedule
 from sealscope.simulation.closed_loop import Feedback, outputs_per_sample
 from sealscope.simulation.commands import Sine, check_command
-from sealscope.simulation.courses import Force, numbers_under
+from sealscope.simulation.courses import Force, numbers_under, state_under
 from sealscope.simulation.experiment import LONGEST_STEP, PRESSURE_TOLERANCE, Experiment, choose_method
 from sealscope.simulation.instruments import FILTER_REACH
 from sealscope.simulation.leaks import Leak
@@ -121,7 +121,7 @@ def oversampling(experiment: Experiment) -> int:
 
 def oversampling_of(rate: float, step: float) -> int:
     """Return the outputs per sample at `rate` [Hz] where the solver has a step about every `step` [s]."""
-    return max(1, min(_OVERSAMPLING, math.ceil(1.0 / (rate * step) * (1.0 - 1e-9))))
+    return min(_OVERSAMPLING, steps_per_output(rate, step))
 
 
 def steps_per_output(rate: float, step: float) -> int:
@@ -130,14 +130,22 @@ def steps_per_output(rate: float, step: float) -> int:
 
 
 def trajectory(
-    experiment: Experiment, leaks: tuple[Leak, ...], *, step: float | None = None, progress: Progress | None = None
+    experiment: Experiment,
+    leaks: tuple[Leak, ...],
+    *,
+    step: float | None = None,
+    error: float | None = None,
+    duration: float | None = None,
+    progress: Progress | None = None,
 ) -> Trajectory:
     """Integrate an experiment and report states and flows as often as its instruments need them.
 
     `leaks` take the place of the experiment's and have coefficients; `step` [s], if given, that of its own step, and is
-    not checked: the caller compares runs.
+    not checked: the caller compares runs. `error` [Pa] takes the place of its own, `duration` [s] of its length and of
+    what the anti-alias filter needs beyond.
     """
-    duration = (round(experiment.duration * experiment.rate) + FILTER_REACH) / experiment.rate
+    if duration is None:
+        duration = (round(experiment.duration * experiment.rate) + FILTER_REACH) / experiment.rate
     rate, target, controller = experiment.rate * oversampling(experiment), experiment.target, experiment.controlled
     feedback = None
     if target is not None and controller is not None:
@@ -152,7 +160,7 @@ def trajectory(
         x_0=experiment.x_0,
         method=experiment.method,
         step=step or experiment.step,
-        error=experiment.error_allowed if step is None else None,
+        error=(experiment.error_allowed if error is None else error) if step is None else None,
         allow_unresolved=experiment.allow_unresolved,
         progress=progress,
         effects=experiment.effects(),
@@ -246,11 +254,10 @@ def integrate(
     a pressure falls below vacuum; `allow_unresolved` lets all but a state that is not finite pass.
     """
     from sealscope.physics.solvers.limits import longest_step
-    from sealscope.physics.standstill import initial_state
     from sealscope.physics.state import OUTPUTS, P_2, P_A, STATES
 
     base = numbers_under(rig, load)
-    start_state = initial_state(rig, x_0, 0.0 if load is None else load.at_standstill(x_0))
+    start_state = state_under(rig, load, x_0)
     if step is not None and not (math.isfinite(step) and step > 0):
         raise InputError(f"step must be > 0 s, got {step}")
     if error is not None and not (math.isfinite(error) and error > 0):
