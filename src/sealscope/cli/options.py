@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 from textwrap import fill
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-from typer import Context, Option, echo
+from typer import Argument, Context, Option, echo
 
 from sealscope.errors import InputError, SealscopeError, UnreadableFile
 from sealscope.simulation.arguments import Arguments
@@ -68,13 +68,16 @@ complete_rigs = completing(_rig_names)
 
 def declared(name: str, *, option: str = "", several: bool = False, **shown: Any) -> Any:
     """Return the option for an argument of `Experiment.of`, with the text that is declared there."""
-    text = Arguments.__dataclass_fields__[name].metadata["text"]
-    return Option(
-        option or f"--{name.replace('_', '-')}", help=f"{text} Repeat for several." if several else text, **shown
-    )
+    text = _text_of(name) + (" Repeat for several." if several else "")
+    return Option(option or f"--{name.replace('_', '-')}", help=text, **shown)
+
+
+def _text_of(name: str) -> str:
+    return str(Arguments.__dataclass_fields__[name].metadata["text"])
 
 
 RigOption = Annotated[str, declared("rig", autocompletion=complete_rigs)]
+RigArgument = Annotated[str, Argument(help=_text_of("rig"), autocompletion=complete_rigs)]
 AssumeOption = Annotated[
     str | None,
     Option(

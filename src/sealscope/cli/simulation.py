@@ -10,7 +10,7 @@ from shutil import get_terminal_size
 from textwrap import fill, wrap
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from typer import Argument, Context, Option, echo
+from typer import Context, Option, echo
 
 from sealscope.cli import options as opt
 from sealscope.errors import InputError
@@ -87,7 +87,7 @@ def _pair(text: str) -> tuple[str, str]:
 
 
 def parameters(
-    rig: Annotated[str, Argument(help="Rig by name, or its TOML file.", autocompletion=opt.complete_rigs)] = "thesis",
+    rig: opt.RigArgument = "thesis",
     overrides: opt.SetOption = None,
     form: Annotated[Literal["table", "csv", "json"], Option("--format", help="Table, CSV or JSON.")] = "table",
 ) -> None:
