@@ -36,7 +36,6 @@ def simulate(
     from sealscope.recordings import write
     from sealscope.recordings.files import check_target
     from sealscope.simulation.simulate import simulate_with_truth, write_truth
-    from sealscope.units import LITRE_PER_MINUTE
 
     check_target(output)
     opt.check_folder(output)
@@ -44,38 +43,25 @@ def simulate(
         opt.check_folder(truth)
         if truth.resolve() == output.resolve():
             raise InputError(f"recording and truth must be two files, got {output} for both")
-    if fmu is not None:
-        if truth is not None or prove:
-            raise InputError("--truth and --prove are of the rig, got them with --fmu")
-        from sealscope.fmu.recording import record_fmu
-
-        pairs = dict(_pair(text) for text in maps or ())
-        with opt.progress() as report:
-            recording = record_fmu(fmu, experiment, map=pairs, progress=report)
-        write(recording, output)
-        opt.say_wrapped(
-            f"{output}: {len(recording)} samples at {recording.rate:g} Hz, {experiment.command} ({fmu.name})"
-        )
-        return
-    if maps:
+    if fmu is not None and (truth is not None or prove):
+        raise InputError("--truth and --prove are of the rig, got them with --fmu")
+    if fmu is None and maps:
         raise InputError("--map names the variables of a unit, got it without --fmu")
     with opt.progress() as report:
-        run = simulate_with_truth(experiment, report, prove=prove)
-    write(run.recording, output)
-    if truth is not None:
+        if fmu is None:
+            run = simulate_with_truth(experiment, report, prove=prove)
+            recording, (by, *lines) = run.recording, run.lines()
+        else:
+            from sealscope.fmu.recording import record_fmu
+
+            recording = record_fmu(fmu, experiment, map=dict(map(_pair, maps or ())), progress=report)
+            by, lines = fmu.name, []
+    write(recording, output)
+    if fmu is None and truth is not None:
         write_truth(run.truth, truth)
-    if run.proof is not None:
+    if fmu is None and run.proof is not None:
         echo(run.proof.text())
-    solver = run.recording.provenance["solver"]
-    lines = [f"{output}: {len(run.recording)} samples at {experiment.rate:g} Hz, {experiment.command}"]
-    lines[-1] += f" ({solver['method']}, h = {solver['step_s']:.3g} s)"
-    lines += [f"leak: {own}" for own in run.truth.leaks] + [f"fault: {own}" for own in run.truth.faults]
-    if run.truth.leaks:
-        lines.append(f"mean leak while open: {run.truth.mean_leak_lpm:.5g} L/min")
-    if "q_comp" in run.recording:
-        flow = float(run.recording["q_comp"][-max(1, round(experiment.rate)) :].mean()) / LITRE_PER_MINUTE
-        lines.append(f"the controller compensates: {flow:.4g} L/min at the end (channel q_comp)")
-    for line in lines:
+    for line in (f"{output}: {len(recording)} samples at {recording.rate:g} Hz, {experiment.command} ({by})", *lines):
         opt.say_wrapped(line)
 
 

@@ -109,6 +109,19 @@ class Run:
     truth: Truth
     proof: Proof | None = None
 
+    def lines(self) -> list[str]:
+        """Return the run in words: its solver and step, leaks, other faults, and mean flows."""
+        solver = self.recording.provenance["solver"]
+        lines = [f"{solver['method']}, h = {solver['step_s']:.3g} s"]
+        lines += [f"leak: {leak}" for leak in self.truth.leaks] + [f"fault: {fault}" for fault in self.truth.faults]
+        if self.truth.leaks:
+            lines.append(f"mean leak while open: {self.truth.mean_leak_lpm:.5g} L/min")
+        if "q_comp" in self.recording:
+            last_second = self.recording["q_comp"][-max(1, round(self.recording.rate)) :]
+            flow = float(last_second.mean()) / LITRE_PER_MINUTE
+            lines.append(f"the controller compensates: {flow:.4g} L/min at the end (channel q_comp)")
+        return lines
+
 
 @checked_call
 def simulate_with_truth(experiment: Experiment, progress: Progress | None = None, *, prove: bool = False) -> Run:
