@@ -118,11 +118,11 @@ def main() -> None:
     }
     pressures = [recording.only(["u", "p_A", "p_B"]) for recording in (healthy[0], leaky)]
     cases |= {
-        "the judge alone, no leak": lambda: diagnose(healthy[0], quick=True),
-        "the judge alone, leak": lambda: diagnose(leaky, quick=True),
+        "the judge alone, no leak": lambda: diagnose(healthy[0]),
+        "the judge alone, leak": lambda: diagnose(leaky),
         "pressures and command, no leak": lambda: diagnose(pressures[0]),
         "pressures and command, leak": lambda: diagnose(pressures[1]),
-        "the judge alone, from pressures": lambda: diagnose(pressures[0], quick=True),
+        "the judge alone, from pressures": lambda: diagnose(pressures[0]),
     }
     for command in COMMANDS:
         record = simulate(command=command, seed=1, leak="0.0042 L/min from 90 s")

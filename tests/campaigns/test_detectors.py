@@ -36,7 +36,7 @@ false_alarm = 0.2
 seed = 3
 keep_recordings = true
 detectors = ["watcher", "watcher @ pressures", "diagnose", "diagnose @ pressures",
-             "diagnose, quick", "diagnose, quick @ pressures", "rms change", "d3 of p_A changed"]
+             "rms change", "d3 of p_A changed"]
 
 [views]
 pressures = ["u", "p_A", "p_B"]
@@ -121,8 +121,7 @@ def test_rows_keep_what_was_stated_and_come_back_from_disk(plan, done):
     row = next(iter(rows.values()))
     assert set(row.scores) == set(plan.detectors)
     assert set(row.statements) == {
-        "watcher", "watcher @ pressures", "diagnose", "diagnose @ pressures", "diagnose, quick",
-        "diagnose, quick @ pressures", "rms change",
+        "watcher", "watcher @ pressures", "diagnose", "diagnose @ pressures", "rms change",
     }  # fmt: skip
     said = row.statements["watcher"]
     assert (said.verdict, said.threshold, said.onset_s, said.onset_interval_s) == ("leak", 2.0, 13.0, (11.0, 15.0))
@@ -150,16 +149,6 @@ def test_the_fused_verdict_is_that_of_diagnose(plan, done):
                     outcome.score / outcome.threshold if outcome.threshold > 0 else outcome.score - outcome.threshold
                 )
                 assert row.scores[key][0] == pytest.approx(beyond)
-
-
-def test_quick_states_the_same_verdict_and_nothing_of_its_own(plan, done):
-    """What it states is what all detectors together state, or nothing: a figure or cause that another would lend."""
-    for row in read_rows(done).values():
-        for view in ("", " @ pressures"):
-            whole, quick = row.statements[f"diagnose{view}"], row.statements[f"diagnose, quick{view}"]
-            assert (quick.verdict, quick.score, quick.threshold) == (whole.verdict, whole.score, whole.threshold)
-            for name in ("onset_s", "onset_interval_s", "leak_lpm", "leak_interval_lpm", "cause"):
-                assert getattr(quick, name) in (getattr(whole, name), None)
 
 
 def recall(confusion, fault):

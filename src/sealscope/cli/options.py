@@ -221,7 +221,7 @@ class StatedMachine:
         yield files[0], join(whole, names=[file.name for file in files]) if len(whole) == len(files) else None
 
     def diagnose(
-        self, recording: Recording, baseline: Sequence[Recording], file: Path, false_alarm: float, quick: bool
+        self, recording: Recording, baseline: Sequence[Recording], file: Path, false_alarm: float
     ) -> Diagnosis:
         """Diagnose a recording of this machine."""
         from dataclasses import replace
@@ -229,9 +229,9 @@ class StatedMachine:
         from sealscope.diagnosis.diagnose import diagnose
 
         if self.known is not None:
-            own = self.known.diagnose(recording, false_alarm_probability=false_alarm, quick=quick)
+            own = self.known.diagnose(recording, false_alarm_probability=false_alarm)
             return replace(own, file=str(file))
-        stated: dict[str, Any] = {"rig": self.rig, "limit": self.limit, "quick": quick, "file": file}
+        stated: dict[str, Any] = {"rig": self.rig, "limit": self.limit, "file": file}
         return diagnose(recording, baseline, false_alarm_probability=false_alarm, **stated)
 
 

@@ -49,7 +49,7 @@ def _evidence(detector: PlanDetector, examination: Examination) -> Evidence:
     if detector.online:
         return online(examination.recording, examination.rig, examination.false_alarm_probability)
     if detector.of == DIAGNOSE:
-        return examination.fused(detector.quick)
+        return examination.fused()
     return examination.evidence(detector.of)
 
 

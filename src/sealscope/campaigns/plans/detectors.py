@@ -1,10 +1,9 @@
-"""The names in a plan's `detectors`: scorers, registered detectors and the fused verdict, each on a set of channels.
+"""The names in a plan's `detectors`: scorers, registered detectors and `diagnose`, each on a set of channels.
 
 "d3 of p_A fell"            a scorer, its threshold from the plan's leak-free records
 "volume balance"            a registered detector by its own verdict at the plan's false-alarm probability
-"diagnose"                  the fused verdict of all registered detectors
+"diagnose"                  the verdict of `diagnose`
 "diagnose @ pressures"      the same, given the channels of the view `pressures` alone
-"diagnose, quick"           the same verdict, by the detectors down to the one that judges
 "volume balance, online"    what its stream has raised by the record's end, samples coming second by second
 """
 
@@ -21,7 +20,7 @@ from sealscope.errors import InputError
 from sealscope.recordings.recording import CHANNEL_UNITS
 
 DIAGNOSE = "diagnose"
-_QUICK, _ONLINE, _VIEW = ", quick", ", online", " @ "
+_ONLINE, _VIEW = ", online", " @ "
 #: Detectors that have a stream which raises alarms at a stated rate.
 _STREAMED = ("volume balance",)
 #: name -> channels; the name "" stands for what detectors see that name no view.
@@ -35,15 +34,13 @@ class PlanDetector:
     """One name of a plan's `detectors`, parsed.
 
     `of`: the scorer, the detector or `diagnose`; `scorer`: None where it is a detector, judged by its own verdict;
-    `view`: the set of channels it sees, "" where none is named; `quick`: whether it ends at the detector that judges
-    (`diagnose(..., quick=True)`); `online`: whether it is the detector's stream.
+    `view`: the set of channels it sees, "" where none is named; `online`: whether it is the detector's stream.
     """
 
     name: str
     of: str
     view: str
     scorer: Scorer | None = None
-    quick: bool = False
     online: bool = False
 
     @property
@@ -58,8 +55,7 @@ def plan_detector(name: str) -> PlanDetector:
     base, _, view = name.partition(_VIEW)
     if base in SCORERS:
         return PlanDetector(name, base, view, SCORERS[base])
-    quick, online = base == f"{DIAGNOSE}{_QUICK}", base.endswith(_ONLINE)
-    return PlanDetector(name, base.removesuffix(_QUICK if quick else _ONLINE), view, None, quick, online)
+    return PlanDetector(name, base.removesuffix(_ONLINE), view, online=base.endswith(_ONLINE))
 
 
 def check_detector(name: str, views: Views) -> None:

@@ -20,9 +20,9 @@ import numpy as np
 
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, information, mean_of, zero_of
-from sealscope.diagnosis.inference.causes import StepHypothesis, hypotheses, probabilities
-from sealscope.diagnosis.inference.causes import stepped as stepped_cause
 from sealscope.diagnosis.inference.onset import Course, Information, Interval, StepTest, course, step_test
+from sealscope.diagnosis.inference.other_steps.causes import StepHypothesis, hypotheses, probabilities
+from sealscope.diagnosis.inference.other_steps.causes import stepped as stepped_cause
 from sealscope.diagnosis.inference.other_steps.step import other_step
 from sealscope.diagnosis.inference.scatter import Rise, Taught, rise
 from sealscope.diagnosis.inference.terms import LAG, ORIFICE, PUMP, Equation

@@ -42,7 +42,7 @@ class PressureEstimator:
     """
 
     by, levels, cause = "pressures", False, "leak inside or outside"
-    size_error, orifice = flow_scale(), BELIEVED["conductance"]["orifice_ring"]
+    size_error, orifice = flow_scale(), BELIEVED["conductance"]["orifice"]
     inside: float = beliefs("inference.live")["watch"]["inside"]
     block_seconds: float = _BELIEVED["seconds"]
     states_flow = staticmethod(states_flow)
@@ -107,7 +107,7 @@ class PressureEstimator:
         apart = self._resume(self._follower, begin - self._next, block.rate)
         self._next = end
         own = self._follower.take(block.only(_READ))
-        variance, follower = own.squares / max(own.samples, 1.0), self._follower
+        variance, follower = float(own.gram[0, 0]) / max(own.samples, 1.0), self._follower
         settling, self._settling = self._settling > 0, max(self._settling - 1, 0)
         described = bool(np.isfinite(follower.theta).all()) and follower.excess < _BELIEVED["described"]
         ratio = float(np.clip(max(variance, 1.0) / follower.variance, 0.1, 10.0)) if math.isfinite(variance) else 1.0
