@@ -55,8 +55,7 @@ def noise_free_squares(
     from sealscope.signals.details import details
     from sealscope.simulation.experiment import Experiment
     from sealscope.simulation.instruments import decimate
-    from sealscope.simulation.integrate import oversampling
-    from sealscope.simulation.sizing import sized_run
+    from sealscope.simulation.integrate import oversampling, sized_run
 
     padded = USED + SETTLING + 128.0 / rig.daq.sample_rate  # the deepest detail looks 120 samples ahead
     values = {**experiment_values(condition), **(values or {})}

@@ -149,9 +149,9 @@ def with_leak(half: float, quick: bool) -> Iterator[SimulatedTest]:
 
     The first test of each condition is proved by halving the step, except in a quick reproduction.
     """
+    from sealscope.simulation.integrate import sized_leaks
     from sealscope.simulation.leaks import From
     from sealscope.simulation.simulate import prove, simulate_with_truth
-    from sealscope.simulation.sizing import sized_leaks
 
     proved: set[tuple[str, float]] = set()
     for condition in APPENDIX_C:
