@@ -115,10 +115,10 @@ def tables_of(
         ],
         "estimates": [
             {
-                "detector": flow.detector, leak: flow.leak_lpm, "with an estimate": flow.errors.bias.n,
+                "detector": flow.detector, leak: flow.leak_lpm, "with an estimate": flow.errors.n,
                 "without": flow.errors.without, **_interval("bias", f"bias [{unit}]", flow.errors.bias),
-                f"median error [{unit}]": flow.median.value,
-                f"median size of the error [{unit}]": flow.median_size.value,
+                f"median error [{unit}]": flow.errors.median.value,
+                f"median size of the error [{unit}]": flow.errors.median_size.value,
                 f"rms error [{unit}]": flow.errors.rmse.value, **_coverage("flow", flow.errors.coverage),
             }
             for flow in j.flows
