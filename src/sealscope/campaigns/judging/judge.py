@@ -57,6 +57,11 @@ class DetectorPod:
     why: str
     proven: float
 
+    @property
+    def how(self) -> str:
+        """How the curve was fitted, or why there is none."""
+        return self.curve.estimator if self.curve else self.why
+
 
 @dataclass(frozen=True)
 class SizeRoc:
