@@ -170,8 +170,8 @@ def recall(confusion, fault):
 def test_what_it_adds_up_to(plan, done):
     result = simulated_result(plan, done)
     table = {(one.detector, one.leak_lpm): one for one in result.judgement.table}
-    assert table["watcher", 0.02].detection.value == table["watcher", 0.02].false_alarm.value == 1.0
-    assert table["watcher @ pressures", 0.02].detection.count == 0
+    assert table["watcher", 0.02].alarms.value == table["watcher", 0.02].false_alarm.value == 1.0
+    assert table["watcher @ pressures", 0.02].alarms.count == 0
     flows = {(one.detector, one.leak_lpm): one for one in result.judgement.flows}
     assert flows["watcher", 0.0].errors.bias.value == pytest.approx(plan.rig.pump.q_b)
     assert flows["watcher", 0.02].errors.bias.value == pytest.approx(-0.02, rel=0.1)

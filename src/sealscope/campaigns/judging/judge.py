@@ -27,16 +27,18 @@ from sealscope.campaigns.cases.row import (
 )
 from sealscope.campaigns.plans.detectors import plan_detector
 from sealscope.errors import InputError
-from sealscope.evaluation.binomial import Proportion, proportion
+from sealscope.evaluation.binomial import IntervalEstimate, Proportion, proportion
 from sealscope.evaluation.estimates import EstimateErrors, estimate_errors
 from sealscope.evaluation.pod import HitMiss, SizeDetection, by_size, fit_hit_miss, proven_size
 from sealscope.evaluation.roc import Area, Roc, auc, roc_curve
-from sealscope.evaluation.table import ALWAYS, CANNOT_TELL, NEVER, Confusion, SummaryRow, confusion_matrix, summary
+from sealscope.evaluation.table import CANNOT_TELL, Confusion, confusion_matrix, events_per_hour
 from sealscope.evaluation.thresholds import Promise, Threshold, quantile_threshold, records_needed
 
 _T = TypeVar("_T")
 #: (detector, duty) -> threshold from leak-free records of that duty
 Thresholds = Mapping[tuple[str, str], Threshold]
+#: Two detectors that do not look, beside which the others are shown.
+ALWAYS, NEVER = "always fire", "never fire"
 #: What stands for all families together, and for all laws of a leak.
 ALL, ANY_LAW = "all", "any"
 #: Probability with which the best test finds a leak that the bound allows.
@@ -77,18 +79,21 @@ class SizeRoc:
 class AlarmShares:
     """Alarms of one detector on records that have something in common.
 
-    `leak_lpm` (0: no leak) and `law` of the leak, `fault` that is no leak, `family` of machines, `levels` of the
-    factors: what they have in common, where it was asked for. `coverage`: how often a stated interval holds the flow
-    that there was; `named`: alarms that name the fault's cause, alone or with the piston, None where the detector names
-    no cause; `reachable`: records whose leak the Cramer-Rao bound of their machine allows to find, over those that have
-    a bound, and `allowed`: alarms over these, both None where there is no bound; `failed`: records without a result,
-    which are among those that cannot be told.
+    `leak_lpm` (0: no leak, nan: any) and `law` of the leak, `fault` that is no leak, `family` of machines, `levels` of
+    the factors: what they have in common, where it was asked for. `coverage`: how often a stated interval holds the
+    flow that there was; `false_alarm` and `per_hour`: of that detector on its leak-free records, None where there are
+    none, or no hours; `named`: alarms that name the fault's cause, alone or with the piston, None where the detector
+    names no cause; `reachable`: records whose leak the Cramer-Rao bound of their machine allows to find, over those
+    that have a bound, and `allowed`: alarms over these, both None where there is no bound; `failed`: records without a
+    result, which are among those that cannot be told.
     """
 
     detector: str
     alarms: Proportion
     cannot_tell: Proportion
     coverage: Proportion
+    false_alarm: Proportion | None = None
+    per_hour: IntervalEstimate | None = None
     leak_lpm: float = 0.0
     law: str = ANY_LAW
     fault: str = ""
@@ -98,6 +103,11 @@ class AlarmShares:
     reachable: Proportion | None = None
     allowed: Proportion | None = None
     failed: int = 0
+
+    @property
+    def informedness(self) -> float:
+        """Share of alarms less that of false alarms, 0 for chance."""
+        return self.alarms.value - self.false_alarm.value if self.false_alarm else math.nan
 
 
 @dataclass(frozen=True)
@@ -139,8 +149,8 @@ class Judgement:
     leak_free: int
     judged: int
     failed: tuple[CaseRow, ...]
-    table: tuple[SummaryRow, ...]
-    overall: tuple[SummaryRow, ...]
+    table: tuple[AlarmShares, ...]
+    overall: tuple[AlarmShares, ...]
     onsets: tuple[StatedErrors, ...]
     flows: tuple[StatedErrors, ...]
     causes: tuple[NamedCauses, ...]
@@ -217,16 +227,13 @@ def judge(
     }
     these = _Judging(every, confidence, false_alarm)
     plain = [row for row in judged if not row.fault]
-    verdicts = {name: [of.verdict for of in own] for name, own in these.plain.items()}
-    sizes = [row.leak_lpm for row in plain]
-    any_size = summary([1.0 if size else 0.0 for size in sizes], verdicts, confidence, hours)
     return Judgement(
         thresholds=thresholds,
         leak_free=sum(row.use == "calibrate" and row.error is None for row in rows) if thresholds else 0,
         judged=sum(row.error is None for row in judged),
         failed=tuple(row for row in sorted(rows, key=lambda row: row.id) if row.error is not None),
-        table=tuple(summary(sizes, verdicts, confidence, hours)) if plain else (),
-        overall=tuple(replace(row, leak_lpm=math.nan) for row in any_size) if plain else (),
+        table=tuple(these.by_size(lambda of: of.leak, hours)),
+        overall=tuple(these.by_size(lambda of: math.nan, hours)),
         onsets=() if onset_s is None else tuple(these.onsets(onset_s)),
         flows=tuple(these.flows()),
         causes=tuple(these.causes()),
@@ -322,6 +329,29 @@ class _Judging:
         """Those on rows that have no fault beside the leak."""
         return {name: [of for of in own if not of.row.fault] for name, own in self.every.items()}
 
+    @property
+    def references(self) -> dict[str, list[_Judged]]:
+        """Two detectors that do not look."""
+        first = next(iter(self.every.values()), ())
+        verdicts = {ALWAYS: "leak", NEVER: "no leak"}
+        return {name: [_Judged(of.row, verdict, None) for of in first] for name, verdict in verdicts.items()}
+
+    def by_size(self, size_of: Callable[[_Judged], float], hours: float | None) -> Iterator[AlarmShares]:
+        """Yield alarms by size, and false alarms beside; those that do not look last.
+
+        A detector without a record with a leak has one row of size 0, with no detection.
+        """
+        for name, every in {**self.every, **self.references}.items():
+            own = [of for of in every if not of.row.fault]
+            free, leaky = ([of for of in own if bool(of.leak) == leaks] for leaks in (False, True))
+            groups = _by(leaky, size_of) or ({size_of(free[0]): free} if free else {})
+            alarms = proportion(sum(of.alarm for of in free), len(free), self.confidence) if free else None
+            hourly = events_per_hour(alarms.count, hours * alarms.n, self.confidence) if alarms and hours else None
+            for size, here in groups.items():
+                shares = self._shares(name, here, leak_lpm=size)
+                detected = shares.alarms if leaky else proportion(0, 0, self.confidence)
+                yield replace(shares, alarms=detected, false_alarm=alarms, per_hour=hourly)
+
     def by_cell(self) -> Iterator[AlarmShares]:
         """Yield the alarms at each size in each cell of the factors."""
         for name, own in self.plain.items():
@@ -330,12 +360,7 @@ class _Judging:
 
     def by_fault(self) -> Iterator[AlarmShares]:
         """Yield the alarms on records with each fault that is no piston leak."""
-        first = next(iter(self.every.values()), ())
-        references = {
-            name: [of._replace(verdict=verdict, stated=None) for of in first]
-            for name, verdict in ((ALWAYS, "leak"), (NEVER, "no leak"))
-        }
-        for name, own in {**self.every, **references}.items():
+        for name, own in {**self.every, **self.references}.items():
             faulty = (of for of in own if of.row.fault and of.leak == 0)
             for fault, here in _by(faulty, lambda of: of.row.fault).items():
                 yield self._shares(name, here, fault=fault)
