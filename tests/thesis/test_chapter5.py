@@ -236,7 +236,7 @@ def test_the_mean_slope_is_that_beside_the_sine() -> None:
 
 @pytest.mark.parametrize(("command", "omega"), [("3 sin(4t)", 4.0), ("8 sin(t)", 1.0)])
 def test_omega_of_a_command(command: str, omega: float) -> None:
-    assert ShownTest("5.2a", command, "large", 1).omega == omega
+    assert ShownTest("5.2a", command, "large", 1, 0, 90.0).omega == omega
 
 
 def test_best_step_finds_a_step_and_no_end_effect() -> None:

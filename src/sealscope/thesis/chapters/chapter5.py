@@ -15,7 +15,7 @@ from sealscope.thesis.chapters.appendix_c_runs import SETTLING, detail_rms, deta
 from sealscope.thesis.engine.context import Context, RunSpec, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Figure, FigureCurve, Number, Panel, Role
-from sealscope.thesis.engine.texts import note
+from sealscope.thesis.engine.texts import note, texts_of
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, QUANTITIES, UNITS, Condition, experiment_values
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -40,8 +40,8 @@ class ShownTest:
     command: str
     level: str
     first: int
-    inputs: int = 0
-    half: float = 90.0
+    inputs: int
+    half: float
 
     @property
     def parts(self) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -69,21 +69,7 @@ class ShownTest:
 
 
 #: The ten tests by section.
-TESTS: dict[str, ShownTest] = {
-    test.section: test
-    for test in (
-        ShownTest("5.2a", "3 sin(4t)", "large", 1, inputs=2, half=60.0),
-        ShownTest("5.2b", "5 sin(2t)", "large", 11, inputs=2),
-        ShownTest("5.3a", "3 sin(4t)", "medium", 21, inputs=2),
-        ShownTest("5.3b", "8 sin(t)", "medium", 31, inputs=1),
-        ShownTest("5.4a", "3 sin(4t)", "small", 40),
-        ShownTest("5.4b", "8 sin(t)", "small", 48),
-        ShownTest("5.5a", "3 sin(4t)", "extra-small", 56),
-        ShownTest("5.5b", "7 sin(4t)", "extra-small", 64, inputs=2),
-        ShownTest("5.5c", "5 sin(2t)", "extra-small", 74),
-        ShownTest("5.5d", "8 sin(t)", "extra-small", 82),
-    )
-}
+TESTS: dict[str, ShownTest] = {row[0]: ShownTest(*row) for row in texts_of("cases.toml")["shown"]}
 
 
 def spec_of(test: ShownTest) -> RunSpec:

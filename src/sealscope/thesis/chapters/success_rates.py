@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,7 @@ from sealscope.thesis.chapters.appendix_c_runs import simulated_sheet
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, ThesisTable
-from sealscope.thesis.engine.texts import note
+from sealscope.thesis.engine.texts import note, texts_of
 from sealscope.thesis.sheet import COLUMNS, DataSheet
 
 #: The direction in which each chamber's RMS is said to move when a leak opens, section 5.6.
@@ -34,7 +34,7 @@ class Rule:
     """
 
     name: str
-    details: tuple[tuple[str, str], ...]
+    details: Sequence[tuple[str, str]]
     printed: str = ""
 
     def fires(self, sheet: DataSheet) -> Fires:
@@ -43,18 +43,12 @@ class Rule:
         return np.asarray(np.all(moved, axis=0))
 
 
-def _rule(chamber: str, detail: str, printed: str = "") -> Rule:
-    return Rule(f"P_{chamber} {detail} {'down' if chamber == 'A' else 'up'}", ((f"p_{chamber}", detail),), printed)
+def _rules(name: str) -> tuple[Rule, ...]:
+    return tuple(Rule(*row) for row in texts_of("cases.toml")[name])
 
 
-#: The six cells of Table 5.1 and the cumulative one.
-CLAIMED: tuple[Rule, ...] = (
-    *(_rule("A", *cell) for cell in (("d3", "100"), ("d4", "64 (65 in the text)"), ("d3d4", "85"))),
-    *(_rule("B", *cell) for cell in (("d3", "48"), ("d4", "76"), ("d3d4", "76"))),
-    Rule("both d3d4", (("p_A", "d3d4"), ("p_B", "d3d4")), "65"),
-)
-#: The columns of Appendix C that Table 5.1 leaves out.
-UNCLAIMED: tuple[Rule, ...] = tuple(_rule(chamber, detail) for chamber in "AB" for detail in ("d1", "d2"))
+#: The six cells of Table 5.1 and the cumulative one; and the columns of Appendix C that the table leaves out.
+CLAIMED, UNCLAIMED = _rules("claimed"), _rules("unclaimed")
 
 
 def _counted(fires: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:

@@ -30,7 +30,7 @@ from sealscope.thesis.claims.evidence import (
     moves_beyond_chance,
 )
 from sealscope.thesis.engine.products import Claim
-from sealscope.thesis.engine.texts import judged
+from sealscope.thesis.engine.texts import judged, texts_of
 from sealscope.thesis.sheet import APPENDIX_C, DataSheet, mean_leaks
 
 _N = len(APPENDIX_C)
@@ -231,19 +231,6 @@ def claims(evidence: ClaimEvidence) -> Iterator[Claim]:
 #: What is said of a chamber's curves: that they fall, or only that they change.
 Statement = Literal["fall", "change"]
 
-#: Section, chamber, details named, and what is said of them.
-CURVES: tuple[tuple[str, str, tuple[str, ...], Statement], ...] = (
-    ("5.2a", "p_A", SENSITIVE, "change"),
-    ("5.2a", "p_B", ("d4", "d3d4"), "change"),
-    ("5.2b", "p_A", SENSITIVE, "fall"),
-    ("5.2b", "p_B", ("d3d4",), "change"),
-    ("5.3a", "p_A", SENSITIVE, "fall"),
-    ("5.3a", "p_B", SENSITIVE, "change"),
-    ("5.3b", "p_A", ("d3", "d3d4"), "change"),
-    ("5.3b", "p_B", ("d4", "d3d4"), "change"),
-    *((section, chamber, SENSITIVE, "change") for section in list(TESTS)[4:] for chamber in CHAMBERS),
-)
-
 
 def levels() -> Iterator[Claim]:
     """Judge claims 5.1.1 to 5.1.3."""
@@ -285,7 +272,7 @@ def _on_rows(
 
 def curves(evidence: ClaimEvidence) -> Iterator[Claim]:
     """Judge a claim for each chamber of each test."""
-    for number, (section, chamber, names, statement) in enumerate(CURVES, start=1):
+    for number, (section, chamber, names, statement) in enumerate(texts_of("cases.toml")["curves"], start=1):
         test, rms = TESTS[section], evidence.shown[section].rms[chamber]
         limits = (DIRECTION[chamber] * drift_threshold(evidence.drift, chamber, name) for name in names)
         parts: list[bool] = []

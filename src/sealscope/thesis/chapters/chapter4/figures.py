@@ -29,7 +29,7 @@ from sealscope.thesis.chapters.chapter4.cases import (
 from sealscope.thesis.engine.context import Context, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, Figure, FigureCurve, Number, Panel, Role, ThesisTable
-from sealscope.thesis.engine.texts import note
+from sealscope.thesis.engine.texts import note, texts_of
 from sealscope.units import LITRE_PER_MINUTE
 
 #: Unit and factor from SI of what the figures show.
@@ -45,15 +45,6 @@ _VACUUM = -0.101325
 _ALIKE, _MARKS = 0.005, 80
 _CLOSING_ROLES: dict[float, Role] = {25.0: "25 %", 50.0: "50 %", 75.0: "75 %"}
 _VOLUMES, _QUICK_VOLUMES = (10.0, 20.0, 44.0, 100.0, 234.0, 500.0), (10.0, 44.0, 234.0)
-#: Figures of measured curves alone, and the simulated ones in their place.
-_MEASURED = (
-    ("Fig. 4.15", "measured p_1 and p_A, 25 % closed", "fig-4.13"),
-    ("Fig. 4.16", "measured p_2 and p_B, 25 % closed", "fig-4.14"),
-    ("Fig. 4.37", "measured p_1 over the openings", "fig-4.33"),
-    ("Fig. 4.38", "measured p_2 over the openings", "fig-4.34"),
-    ("Fig. 4.39", "measured p_A over the openings", "fig-4.35"),
-    ("Fig. 4.40", "measured p_B over the openings", "fig-4.36"),
-)
 
 
 def reading_of(item: Item) -> Reading:
@@ -224,5 +215,5 @@ def volume_sweep(context: Context, item: Item) -> tuple[Figure, ...]:
 
 def measured_only(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate the figures of chapter 4 that show measured curves alone, and the simulated ones in their place."""
-    rows = ((*row, "cannot be reproduced: no numbers are given") for row in _MEASURED)
+    rows = ((*row, "cannot be reproduced: no numbers are given") for row in texts_of("cases.toml")["measured"])
     return (item.table(rows, note("measured-only")),)
