@@ -14,7 +14,7 @@ from sealscope.errors import InputError
 from sealscope.recordings.recording import COUNTS, Array, Recording
 from sealscope.reporting.features import NAMES, PRODUCT, ChamberDetails
 from sealscope.reporting.picture import Scale
-from sealscope.reporting.series import DrawnTimes, coded, coded_times, time_base
+from sealscope.reporting.series import DrawnTimes, coded, coded_times, ordered_time, time_base
 from sealscope.units import LITRE_PER_MINUTE, PSI
 
 SAMPLES = "samples"
@@ -214,11 +214,19 @@ def detail_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Ch
 
 
 class DrawnCharts(NamedTuple):
-    """All charts: `data` for the script (plain JSON values), `still` by chart key for the template, and their base."""
+    """All charts as a page shows them.
+
+    `data`: for the script (plain JSON values); `still`: by chart key, for the template; `events`: what is marked on
+    each; `base`: times at which the channels are drawn; `span`: their ends [s]; `fine`: ends of the stretch whose
+    samples are drawn one by one [s].
+    """
 
     data: dict[str, Any]
     still: dict[str, dict[str, Any]]
+    events: list[dict[str, Any]]
     base: DrawnTimes
+    span: tuple[float, float]
+    fine: tuple[float, float]
 
 
 def draw(
@@ -226,7 +234,7 @@ def draw(
     chambers: list[ChamberDetails],
     charts: list[Chart],
     diagnosis: Diagnosis,
-    marks: list[Mark],
+    marks: Sequence[Mark],
 ) -> DrawnCharts:
     """Decimate and code every chart's lines, and lay out the still picture of each.
 
@@ -240,7 +248,7 @@ def draw(
     axes: dict[str, Array] = {SAMPLES: base.t} | {f"windows-{c.channel}": c.window_t for c in chambers}
     if diagnosis.course is not None:
         axes[COURSE] = diagnosis.course.t
-    onset, interval = onset_within(diagnosis, span)
+    onset, interval = _onset_within(diagnosis, span)
     low, high = interval or (None, None)
     coded_charts, still = [], {}
     for chart in charts:
@@ -260,7 +268,11 @@ def draw(
         "marks": [{"t": mark.t, "label": mark.label, "known": mark.known} for mark in marks],
         "charts": coded_charts,
     }
-    return DrawnCharts(data, still, base)
+    events = [{"t": low, "width": high - low, "kind": ""}] if low is not None and high is not None else []
+    events += [] if onset is None else [{"t": onset, "width": None, "kind": ""}]
+    events += [{"t": mark.t, "width": None, "kind": "known" if mark.known else "other"} for mark in marks]
+    t = ordered_time(recording.t, recording.rate)[0]
+    return DrawnCharts(data, still, events, base, span, (float(t[base.fine.start]), float(t[base.fine.stop - 1])))
 
 
 def _drawable(values: Array) -> Array:
@@ -268,7 +280,7 @@ def _drawable(values: Array) -> Array:
     return np.where(np.isfinite(values), np.clip(values, -_LARGEST, _LARGEST), values)
 
 
-def onset_within(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[float | None, tuple[float, float] | None]:
+def _onset_within(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[float | None, tuple[float, float] | None]:
     """Return the onset and its interval [s] as drawn: an end outside the recording, or unbounded, is cut."""
     onset, interval = diagnosis.onset_s, diagnosis.onset_interval_s
     if onset is None or not isfinite(onset):
@@ -277,17 +289,6 @@ def onset_within(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[float
         return float(onset), None
     low, high = (float(np.clip(end, *span)) for end in interval)
     return float(onset), (low, high)
-
-
-def events(diagnosis: Diagnosis, span: tuple[float, float], marks: Sequence[Mark]) -> list[dict[str, Any]]:
-    """Return what is marked on a still picture: the onset with its interval, and the moments given."""
-    onset, interval = onset_within(diagnosis, span)
-    marked: list[dict[str, Any]] = []
-    if interval is not None:
-        marked.append({"t": interval[0], "width": interval[1] - interval[0], "kind": ""})
-    if onset is not None:
-        marked.append({"t": onset, "width": None, "kind": ""})
-    return marked + [{"t": mark.t, "width": None, "kind": "known" if mark.known else "other"} for mark in marks]
 
 
 def still_chart(chart: Chart, t: Array, lines: list[Array], span: tuple[float, float]) -> dict[str, Any]:

@@ -63,8 +63,7 @@ def render_history_page(judged: Sequence[Judged], title: str, left_out: int = 0)
         left_out=left_out,
         levels=history_chart(ordered),
         charts=shown,
-        still={} if drawn is None else drawn.still,
-        events=[] if drawn is None else charts.events(newest, drawn.data["span"], []),
+        drawn=drawn,
         files=files,
         chart_data=None if drawn is None else drawn.data,
     )
