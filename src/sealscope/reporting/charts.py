@@ -15,7 +15,7 @@ from sealscope.recordings.recording import COUNTS, Array, Recording
 from sealscope.reporting.features import NAMES, PRODUCT, ChamberDetails
 from sealscope.reporting.picture import Scale
 from sealscope.reporting.series import DrawnTimes, coded, coded_times, ordered_time, time_base
-from sealscope.units import LITRE_PER_MINUTE, PSI
+from sealscope.units import to_si
 
 SAMPLES = "samples"
 #: points of a series drawn by the script, and in the still picture
@@ -25,19 +25,10 @@ NEAR_SAMPLES = 6_000
 
 #: largest value drawn; least extent of an axis, and over the size of its values: what is less is a constant
 _LARGEST, _LEAST, _LEAST_SHARE = 1e100, 1e-100, 1e-12
-#: unit of pressures -> Pa per unit, unit of their details, Pa per that unit
-PRESSURE_UNITS: dict[str, tuple[float, str, float]] = {
-    "bar": (1e5, "kPa", 1e3),
-    "MPa": (1e6, "kPa", 1e3),
-    "kPa": (1e3, "kPa", 1e3),
-    "psi": (PSI, "psi", PSI),
-}
-#: SI unit of other channels -> unit shown, SI per unit
-_SHOWN = {
-    "m": ("mm", 1e-3),
-    "rad/s": ("rpm", np.pi / 30),
-    "m^3/s": ("L/min", LITRE_PER_MINUTE),
-}
+#: unit of pressures -> unit of their details
+_DETAIL_UNITS = {"bar": "kPa", "MPa": "kPa", "kPa": "kPa", "psi": "psi"}
+#: SI unit of other channels -> unit shown
+_SHOWN = {"m": "mm", "rad/s": "rpm", "m^3/s": "L/min"}
 
 
 @dataclass(frozen=True)
@@ -102,14 +93,13 @@ def shown_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tuple[
 
     Raises InputError for an unknown pressure unit.
     """
-    if pressure_unit not in PRESSURE_UNITS:
-        raise InputError(f"pressure unit must be one of {', '.join(PRESSURE_UNITS)}, got {pressure_unit!r}")
-    if unit == "Pa":
-        size, detail_unit, detail_size = PRESSURE_UNITS[pressure_unit]
-        return (detail_unit, detail_size) if detail else (pressure_unit, size)
+    if pressure_unit not in _DETAIL_UNITS:
+        raise InputError(f"pressure unit must be one of {', '.join(_DETAIL_UNITS)}, got {pressure_unit!r}")
     if unit == COUNTS:
         return "counts", 1.0
-    return _SHOWN.get(unit, (unit, 1.0))
+    pressure = _DETAIL_UNITS[pressure_unit] if detail else pressure_unit
+    shown = pressure if unit == "Pa" else _SHOWN.get(unit, unit)
+    return shown, to_si(1.0, shown, unit)
 
 
 def detail_unit(unit: str, name: str, pressure_unit: str) -> tuple[str, float]:
