@@ -27,7 +27,7 @@ _DATES = (
     "",
 )
 #: A number, which is no stamp but a date of eight digits.
-_PLAIN = re.compile(r"[+-]?\d*[.,]?\d*")
+_PLAIN = re.compile(r"[+-]?\d*(?:[.,]\d*)?")
 _CLOCK = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,:]\d{1,9})?|[.,]\d{1,9})?|\d{6}(?:[.,]\d{1,9})?"
 _STAMPS = [
     re.compile(
@@ -63,10 +63,9 @@ _Seconds = tuple[Array, dict[str, Any], list[str]]
 def _parsed_stamp(text: str) -> dict[str, str | None] | None:
     """Return the parts of a stamp by the names of their groups; None for any other text."""
     text = text.strip()
-    if _PLAIN.fullmatch(text) and len(text) != len("20240531"):
+    if len(text) > _LONGEST_STAMP or (_PLAIN.fullmatch(text) and len(text) != len("20240531")):
         return None
-    matches = (stamp.fullmatch(text) for stamp in _STAMPS) if len(text) <= _LONGEST_STAMP else ()
-    match = next(filter(None, matches), None)
+    match = next(filter(None, (stamp.fullmatch(text) for stamp in _STAMPS)), None)
     if match is None or not (match["clock"] or len(match.groupdict()) > len(("clock", "half"))):
         return None
     parts, month = match.groupdict(), match.groupdict().get("month")
