@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -16,30 +15,12 @@ from sealscope.errors import InputError
 from sealscope.reporting.trend.page import chart_of, render_trend_page, write_trend_page
 from sealscope.reporting.trend.text import trend_text
 
-
-class Tags(HTMLParser):
-    """Open tags that are not closed, and every tag seen."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.known: list[tuple[str, dict[str, str | None]]] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.known.append((tag, dict(attrs)))
-        if tag not in ("meta", "path", "rect", "circle", "link"):
-            self.open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        if self.open and self.open[-1] == tag:
-            self.open.pop()
+from .pages import Reader
 
 
 def test_the_page_is_whole_and_shows_what_happened(trend: Trend) -> None:
     page = render_trend_page(trend, title="press 4")
-    tags = Tags()
-    tags.feed(page)
-    assert tags.open == []
+    Reader(page)
     assert page.count("<script") == 0 and "http" not in page.split("</style>")[1]
     assert "<day>" not in page and "&lt;day&gt; 5.csv" in page
     for words in (
