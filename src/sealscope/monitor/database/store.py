@@ -22,8 +22,8 @@ from sqlalchemy.exc import TimeoutError as PoolTimeout
 
 from sealscope.errors import InputError
 from sealscope.monitor.alarms import Alarm
-from sealscope.monitor.memory import tables
-from sealscope.monitor.memory.postgresql import engine_options, limit_answers
+from sealscope.monitor.database import tables
+from sealscope.monitor.database.postgresql import engine_options, limit_answers
 from sealscope.monitor.stream.estimates import BlockEstimate
 from sealscope.recordings.recording import Recording
 
