@@ -14,7 +14,7 @@ from threading import Lock
 
 from sealscope.diagnosis.live.joining import CHANNELS
 from sealscope.errors import InputError
-from sealscope.monitor.memory.store import KEPT_IDENTITIES
+from sealscope.monitor.database.store import KEPT_IDENTITIES
 from sealscope.monitor.service import Source
 from sealscope.monitor.settings import ActuatorSettings, MonitorSettings, SimulateSettings
 from sealscope.monitor.sources.source_block import BlockReceiver, SourceBlock

@@ -17,7 +17,7 @@ from scipy.special import ndtr
 from sealscope.diagnosis.live.estimates import BlockEstimate, WatchedLeak
 from sealscope.errors import InputError
 from sealscope.monitor.alarms import MARKS, AlarmJudge
-from sealscope.monitor.memory.store import MonitorStore, StoredRows
+from sealscope.monitor.database.store import MonitorStore, StoredRows
 from sealscope.monitor.outputs.events import EventLines
 from sealscope.monitor.settings import WatchSettings
 from sealscope.storage.plain_state import restored

@@ -21,9 +21,9 @@ from sealscope.diagnosis.live.watch import STATE_VERSION, Watch, watch
 from sealscope.diagnosis.verdict.states import LEAKING, MachineState, state_of
 from sealscope.errors import InputError
 from sealscope.monitor.alarms import Alarm, AlarmJudge
-from sealscope.monitor.memory.machine_files import pass_on
-from sealscope.monitor.memory.sharing import Share
-from sealscope.monitor.memory.store import KEPT_IDENTITIES, MonitorStore, StoredRows, away
+from sealscope.monitor.database.machine_files import pass_on
+from sealscope.monitor.database.sharing import Share
+from sealscope.monitor.database.store import KEPT_IDENTITIES, MonitorStore, StoredRows, away
 from sealscope.monitor.settings import ActuatorSettings
 from sealscope.monitor.sources.source_block import SourceBlock, bytes_of, nothing
 from sealscope.monitor.supervisor import Supervisor

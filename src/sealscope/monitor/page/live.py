@@ -114,6 +114,11 @@ class LiveSamples:
             if window is not None:
                 window.add(samples)
 
+    @property
+    def watched(self) -> frozenset[str]:
+        """The actuators that somebody looks at."""
+        return frozenset(self._windows)
+
     def version(self, name: str) -> int:
         """Return a number that changes with the samples of an actuator that is looked at, 0 where there are none."""
         window = self._windows.get(name)
