@@ -114,7 +114,7 @@ class _Actuator:
             "t": None if self.last is None else last.t,
             "status": last.status,
             "state": self._machine_state().as_dict(),
-            "by": self.watch.by,
+            "by": self.watch.method,
             "total_lpm": last.total_lpm,
             "leak_lpm": last.leak_lpm,
             "leak_interval_lpm": last.leak_interval_lpm,

@@ -98,7 +98,7 @@ class LiveBalance:
     allow no balance.
     """
 
-    by, levels, inside, orifice = "volumes", True, 1.0, 1.0
+    method, levels, inside, orifice = "volumes", True, 1.0, 1.0
     block_seconds, begun = BLOCK_SECONDS, True
 
     def __init__(self, rig: Rig, names: Sequence[str], litres: bool | None = None) -> None:

@@ -41,7 +41,7 @@ class PressureEstimator:
     end of an interval is wider; `inside`: share of what shows that is surely inside.
     """
 
-    by, levels, cause = "pressures", False, "leak inside or outside"
+    method, levels, cause = "pressures", False, "leak inside or outside"
     size_error, orifice = flow_scale(), BELIEVED["conductance"]["orifice"]
     inside: float = beliefs("live")["watch"]["inside"]
     block_seconds: float = _BELIEVED["seconds"]

@@ -33,7 +33,7 @@ STATE_VERSION = 10
 GROUP, _RECENT = 16, 8
 _BELIEVED = beliefs("live")["watch"]
 #: Ways of watching, each a stream of conductances.
-_KINDS: dict[str, type[LiveBalance | PressureEstimator]] = {of.by: of for of in (LiveBalance, PressureEstimator)}
+_KINDS: dict[str, type[LiveBalance | PressureEstimator]] = {of.method: of for of in (LiveBalance, PressureEstimator)}
 
 
 class Watch:
@@ -97,7 +97,7 @@ class Watch:
         return probability_of(self.false_alarms_per_1000_h, hours, seconds, "false_alarms_per_1000_h")
 
     @property
-    def by(self) -> str:
+    def method(self) -> str:
         """Way of watching, "volumes" where the position is recorded, else "pressures"."""
         return "volumes" if "x" in self._samples.names or not self._samples.names else "pressures"
 
@@ -169,7 +169,9 @@ class Watch:
             if self._estimator is not None:
                 self._estimator.interrupt()
         for t, channels in self._samples.runs(samples):
-            if self._estimator is None or self._estimator.by != self.by:  # a position came with the second piece
+            if (
+                self._estimator is None or self._estimator.method != self.method
+            ):  # a position came with the second piece
                 self._estimator = self._estimator_by()
             with np.errstate(all="ignore"):  # a block whose sums overflow says nothing
                 every = self._estimator.take(t, channels, self._samples.rate)
@@ -181,7 +183,7 @@ class Watch:
                     yield self.judged(shown), self.leak
 
     def _estimator_by(self) -> LiveBalance | PressureEstimator:
-        return _KINDS[self.by](self._rig, self._samples.names, self._litres.get(self.by, False))
+        return _KINDS[self.method](self._rig, self._samples.names, self._litres.get(self.method, False))
 
     def continue_from(self, blocks: int, baseline_version: int) -> None:
         """Count blocks and baselines on from those of a watch before, whose settings or state were of another kind."""
@@ -346,7 +348,7 @@ class Watch:
 
     def state(self) -> dict[str, Any]:
         """Return all that the watch knows as plain values that JSON holds, its ``"version"`` that of the format."""
-        own = self._estimator if self._estimator is not None and self._estimator.by == self.by else None
+        own = self._estimator if self._estimator is not None and self._estimator.method == self.method else None
         return {
             "version": STATE_VERSION,
             "rig": json.dumps(self._rig.model_dump()),
