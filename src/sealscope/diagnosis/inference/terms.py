@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 ATMOSPHERE = 101325.0
 #: The least absolute pressure that the terms of air are computed for [Pa]; oil boils, and they say nothing, below it.
 LEAST_ABSOLUTE = 2e4
-#: Half the time over which the direction of motion is taken [s]: a few counts of an encoder at slow motion.
+#: Half the time over which speed and direction of motion are taken [s]: a few counts of an encoder at slow motion.
 HALF_DIFFERENCE = 0.025
 
 
@@ -100,12 +100,17 @@ class Signals:
         }
 
     @cached_property
-    def outward(self) -> Array:
-        """1 where the piston moves towards B or stands still, else 0, at each sample, by a central difference."""
+    def speed(self) -> Array:
+        """Speed of the piston [m/s] at each sample, by a central difference."""
         half = max(1, round(HALF_DIFFERENCE * self.rate))
         x = self._channels["x"]
         padded = np.concatenate([np.full(half, x[0]), x, np.full(half, x[-1])])
-        return (padded[2 * half :] >= padded[: -2 * half]).astype(float)
+        return np.asarray((padded[2 * half :] - padded[: -2 * half]) * (0.5 * self.rate / half))
+
+    @cached_property
+    def outward(self) -> Array:
+        """1 where the piston moves towards B or stands still, else 0, at each sample."""
+        return (self.speed >= 0.0).astype(float)
 
     @cached_property
     def carried_by_A(self) -> Array:
@@ -366,6 +371,16 @@ def _made_up(side: str) -> Term:
 #: A delay between position and flow.
 LAG = "lag"
 _LAG = Term(LAG, "dv", "m^2 s", lambda s: s.acceleration_step(), "sensor fault", "motion", needs=("x",))
+#: What a pump loses the more, the faster it turns: its filling, and slip that no recorded pressure drives.
+_SPEED_LOSS = Term(
+    "loss over speed",
+    "abs(v) dx",
+    "m s",
+    lambda s: _middle(np.abs(s.speed)) * s.step("x"),
+    "sensor fault",
+    "speed",
+    needs=("x",),
+)
 _BIAS = Term(BIAS, "dt", "m^3/s", lambda s: s.dt, "sensor fault", "bias")
 _PUMP = Term(
     PUMP,
@@ -405,6 +420,7 @@ _CYLINDER = (
     *_of_side("A"),
     *_of_side("B"),
     _LAG,
+    _SPEED_LOSS,
     _BIAS,
     _LINES,
     _PUMP,
