@@ -154,7 +154,7 @@ def test_decisions_are_numbered_in_turn():
     assert numbers == sorted(set(numbers))
 
 
-@pytest.mark.parametrize("path", sorted(SOURCE.glob("diagnosis/**/priors.toml")), ids=lambda path: path.parent.name)
+@pytest.mark.parametrize("path", sorted(SOURCE.rglob("priors.toml")), ids=lambda path: path.parent.name)
 def test_a_belief_states_value_unit_and_source(path):
     for table in tomllib.loads(path.read_text("utf-8")).values():
         for name, row in table.items():

@@ -159,8 +159,8 @@ def recall(confusion, fault):
 def test_what_it_adds_up_to(plan, done):
     result = simulated_result(plan, done)
     table = {(one.detector, one.leak_lpm): one for one in result.judgement.table}
-    assert table["watcher", 0.02].detection.value == table["watcher", 0.02].false_alarm.value == 1.0
-    assert table["watcher @ pressures", 0.02].detection.count == 0
+    assert table["watcher", 0.02].alarms.value == table["watcher", 0.02].false_alarm.value == 1.0
+    assert table["watcher @ pressures", 0.02].alarms.count == 0
     flows = {(one.detector, one.leak_lpm): one for one in result.judgement.flows}
     assert flows["watcher", 0.0].errors.bias.value == pytest.approx(plan.rig.pump.q_b)
     assert flows["watcher", 0.02].errors.bias.value == pytest.approx(-0.02, rel=0.1)
@@ -282,7 +282,8 @@ def test_channels_restrict_those_that_name_no_view(plan, tmp_path):
 def row(number, verdict, leak=0.0, fault="", cause=None, use="judge", **stated):
     said = Evidence(verdict, "", 4.0 if verdict == "leak" else 1.0, 3.0, cause=cause, **stated)
     scores = {"watcher": (rank_of(said), said.onset_s)}
-    return CaseRow(f"{number:04x}", use, leak, fault, {}, number, leak, scores=scores, statements={"watcher": said})
+    inputs = {"id": f"{number:04x}", "use": use, "leak_lpm": leak, "fault": fault, "levels": {}, "replicate": number}
+    return CaseRow(**inputs, flow_lpm=leak, scores=scores, statements={"watcher": said})
 
 
 def test_flows_onsets_and_causes_by_hand():
@@ -306,7 +307,7 @@ def test_flows_onsets_and_causes_by_hand():
     assert (free.leak_lpm, free.errors.bias.value, free.errors.without, free.errors.coverage.value) == (0.0, 0.1, 1, 1)
     assert leaky.errors.bias.value == pytest.approx((0.5 - 0.1 - 0.7) / 3)
     assert (leaky.errors.without, leaky.errors.coverage.count, leaky.errors.coverage.n) == (1, 1, 2)
-    assert (leaky.median.value, leaky.median_size.value) == pytest.approx((-0.1, 0.5))
+    assert (leaky.errors.median.value, leaky.errors.median_size.value) == pytest.approx((-0.1, 0.5))
     (named,) = outcome.causes
     said = {
         (true, name): int(named.confusion.counts[i][j])

@@ -36,7 +36,7 @@ def check(result: Diagnosis) -> None:
 
 
 @pytest.mark.usefixtures("rms_change_alone")
-def test_contract_of_a_leak(leaky: Recording) -> None:
+def test_contract_of_a_leak_by_the_change_of_rms(leaky: Recording) -> None:
     result = diagnose(leaky, file="rig.csv")
     assert (result.verdict, result.file) == ("leak", "rig.csv")
     check(result)

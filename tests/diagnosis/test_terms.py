@@ -187,12 +187,16 @@ def test_nothing_is_balanced_without_a_source_of_flow(rig: Rig) -> None:
     assert equations(load_rig("servo-valve"), frozenset({"x", "p_A", "p_B", "u"})) == ()
 
 
+@pytest.fixture(scope="module")
+def single_rod() -> Recording:
+    words = {"rig": "single-rod-eha", "command": "5 sin(2t)", "load": "-3000 N", "leak": LATE}
+    return simulate_with_truth(Experiment.of(duration=120, seed=3, **words)).recording
+
+
 @pytest.mark.parametrize("bar", [-6.0, -1.0, 6.0])
-def test_a_zero_that_is_far_off_leaves_a_single_rod_s_leak_as_it_is(bar: float) -> None:
+def test_a_zero_that_is_far_off_leaves_a_single_rod_s_leak_as_it_is(single_rod: Recording, bar: float) -> None:
     """Which side carries, and the root of an orifice's law, are taken about the zero."""
-    single = load_rig("single-rod-eha")
-    experiment = Experiment.of(rig=single, command="5 sin(2t)", duration=120, load="-3000 N", leak=LATE, seed=3)
-    own = simulate_with_truth(experiment).recording
+    single, own = load_rig("single-rod-eha"), single_rod
     shifted = replace(own, channels={**own.channels, "p_A": own["p_A"] + bar * 1e5})
     diagnosis = diagnose(shifted, rig=single)
     assert diagnosis.verdict == "leak"

@@ -12,16 +12,9 @@ from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings import read
 from sealscope.recordings.formats import table
 
+from .refusals import refused
+
 GOOD = "t [s],p_A [bar],note\n0,1,a\n0.002,2,b\n0.004,3,c\n"
-
-
-def refused(path: Path, **options: object) -> str:
-    with pytest.raises(UnreadableFile) as caught:
-        read(path, **options)  # type: ignore[arg-type]
-    text = str(caught.value)
-    assert "\n" not in text
-    assert str(path) in text
-    return text.replace(str(path), "FILE")
 
 
 @pytest.mark.parametrize(

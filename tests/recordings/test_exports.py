@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sealscope.errors import UnreadableFile
 from sealscope.recordings import read
 
 from .dialects import RATE, N, T, deviations
 from .exports import EXPORTS, POSITION, RECORDS, A, twincat
+from .refusals import refused
 
 
 @pytest.mark.parametrize("name", EXPORTS)
@@ -26,15 +26,6 @@ def test_exports_are_read_to_their_last_digit(name: str, tmp_path: Path) -> None
     for channel, off in deviations(recording).items():
         assert off <= 0.5 * dialect.digit + 1e-11, channel
         assert np.isfinite(recording[channel]).all()
-
-
-def refused(path: Path, **options: object) -> str:
-    start = time.process_time()
-    with pytest.raises(UnreadableFile) as caught:
-        read(path, **options)  # type: ignore[arg-type]
-    assert time.process_time() - start < 5.0
-    assert "\n" not in str(caught.value)
-    return str(caught.value).replace(str(path), "FILE")
 
 
 @pytest.mark.parametrize(

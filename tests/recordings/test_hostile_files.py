@@ -14,17 +14,10 @@ from sealscope.errors import UnreadableFile
 from sealscope.recordings import Recording, inspect, read, write
 from sealscope.units import to_si
 
+from .refusals import refused
+
 T = np.arange(900) / 500
 P = 3e5 + 1e4 * np.sin(4 * T)
-
-
-def refused(path: Path, **options: object) -> str:
-    with pytest.raises(UnreadableFile) as caught:
-        read(path, **options)  # type: ignore[arg-type]
-    text = str(caught.value)
-    assert "\n" not in text
-    assert str(path) in text
-    return text.replace(str(path), "FILE")
 
 
 def quoted(remarks: list[str]) -> str:

@@ -59,28 +59,26 @@ def test_a_hostile_name_is_text(history):
 
 
 def test_figures_stand_at_their_levels_and_days(history):
-    for size in ("wide", "narrow"):
-        chart = history_chart(history, size)
-        assert (len(chart["points"]), len(chart["bounds"]), len(chart["absent"])) == (2, 1, 1)
-        (bound,), (early, late), bottom = chart["bounds"], chart["points"], chart["bottom"]
-        per_lpm = (bottom - bound["y"]) / 0.002
-        assert bottom - chart["limit"] == pytest.approx(0.006 * per_lpm)
-        assert bottom - late["high"] == pytest.approx(0.009 * per_lpm)
-        assert late["x"] - early["x"] == pytest.approx((late["x"] - bound["x"]) / 3)
+    chart = history_chart(history)
+    (bound,), (early, late), (absent,) = chart["bounds"], chart["points"], chart["absent"]
+    assert (bound["level"], early["level"], late["level"], chart["limit"]) == pytest.approx((2e-3, 4.21e-3, 8e-3, 6e-3))
+    assert (late["low"], late["high"]) == pytest.approx((7e-3, 9e-3))
+    assert [day - bound["day"] for day in (absent, early["day"], late["day"])] == pytest.approx([1.0, 2.0, 3.0])
 
 
 def test_without_dates_recordings_stand_in_order(history):
     undated = [own._replace(start_s=None) for own in history]
-    chart = history_chart(undated, "wide")
-    assert [label for _, label in chart["x_ticks"]] == ["1", "2", "3", "4"]
+    ticks = history_chart(undated)["pictures"][0]["x_ticks"]
+    assert [label for _, label in ticks if label] == ["1", "2", "3", "4"]
     assert "4 of 4 recordings state no date" in render_history_page(undated, "press 4")
 
 
 def test_a_single_huge_bound_presses_no_other_flat(history, make_diagnosis):
     wide = make_diagnosis(verdict="cannot tell", bound_lpm=40.0, leak_lpm=None, leak_interval_lpm=None)
-    chart = history_chart([*history, Judged(wide, 1.7e9 + 9 * DAY, history[0].read)], "wide")
+    chart = history_chart([*history, Judged(wide, 1.7e9 + 9 * DAY, history[0].read)])
     assert len(chart["beyond"]) == 1
-    assert chart["points"][0]["low"] - chart["points"][0]["high"] > 20.0
+    point, scale = chart["points"][0], chart["pictures"][0]["scale"]
+    assert scale.y(point["low"]) - scale.y(point["high"]) > 20.0
 
 
 def test_wrong_calls_are_refused(history, tmp_path):

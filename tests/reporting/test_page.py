@@ -7,7 +7,6 @@ import re
 from base64 import b64decode, b64encode
 from dataclasses import replace
 from hashlib import sha256
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
@@ -21,56 +20,9 @@ from sealscope.reporting import Mark, render_page, write_page
 from sealscope.reporting.particulars import particulars_of
 from sealscope.reporting.schematic import circuit_of, schematic
 
-VOID = {"meta", "link", "br", "img", "hr", "input"}
+from .pages import Reader
+
 EVIL = '"><script>alert(1)</script><img src=x onerror=alert(2)>{{ 7*7 }}</script>'
-
-
-class Reader(HTMLParser):
-    """Reads a page, insists on balanced tags, and collects what the tests ask for."""
-
-    def __init__(self, page):
-        super().__init__(convert_charrefs=True)
-        self.open, self.targets, self.values, self.scripts, self.handlers, self.ids = [], [], {}, [], [], []
-        self.text, self.tables = "", []
-        self.feed(page)
-        self.close()
-        assert self.open == [], f"left open: {self.open}"
-
-    def handle_starttag(self, tag, attrs):
-        if tag not in VOID:
-            self.open.append(tag)
-        named = dict(attrs)
-        assert len(named) == len(attrs), f"an attribute of <{tag}> stands twice"
-        self.targets += [named[name] for name in ("src", "href", "action", "data", "xlink:href") if named.get(name)]
-        self.handlers += [name for name in named if name.startswith("on")]
-        if "id" in named:
-            self.ids.append(named["id"])
-        if tag == "data":
-            self.values.setdefault(named["value"], "")
-            self.current = named["value"]
-        if tag == "script":
-            self.scripts.append("")
-        if tag == "table":
-            self.tables.append(False)
-
-    def handle_startendtag(self, tag, attrs):
-        self.handle_starttag(tag, attrs)
-        if tag not in VOID:
-            self.handle_endtag(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open and self.open[-1] == tag, f"</{tag}> closes {self.open[-1:]}"
-        self.open.pop()
-
-    def handle_data(self, data):
-        if self.open[-1:] == ["script"]:
-            self.scripts[-1] += data
-        elif self.open[-1:] != ["style"]:
-            self.text += data
-        if "data" in self.open:
-            self.values[self.current] += data
-        if self.open[-1:] == ["caption"] and data.strip():
-            self.tables[-1] = True
 
 
 def chart_data(reader):

@@ -9,7 +9,6 @@ import sys
 import xml.etree.ElementTree as ET
 from base64 import b64encode
 from hashlib import sha256
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import get_args
 
@@ -24,6 +23,8 @@ from sealscope.reporting.thesis.plots import MOST_SVG_BYTES, UNRESOLVED, draw, g
 from sealscope.thesis.engine.build import ItemStatus
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Claim, Figure, FigureCurve, Image, Number, Panel, Role, ThesisTable
+
+from .pages import Reader
 
 pytest.importorskip("matplotlib", reason="figures need the extra 'report'")
 
@@ -212,30 +213,6 @@ def test_an_id_that_is_no_file_name_is_refused(tmp_path: Path) -> None:
 # the page
 
 
-class Checker(HTMLParser):
-    """Tags that do not nest, ids, and addresses."""
-
-    VOID = ("meta", "img", "br", "input", "link", "hr")
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.ids: list[str] = []
-        self.addresses: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        if tag not in self.VOID:
-            self.open.append(tag)
-        given = dict(attrs)
-        if "id" in given:
-            self.ids.append(str(given["id"]))
-        self.addresses += [str(given[name]) for name in ("src", "href") if name in given]
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open
-        assert self.open.pop() == tag
-
-
 @pytest.fixture
 def page(tmp_path: Path) -> str:
     claims = tuple(
@@ -257,12 +234,10 @@ def page(tmp_path: Path) -> str:
 
 
 def test_the_page_is_well_formed_and_self_contained(page: str, tmp_path: Path) -> None:
-    checker = Checker()
-    checker.feed(page)
-    assert checker.open == []
+    checker = Reader(page)
     assert len(checker.ids) == len(set(checker.ids))
     assert {"fig-4.22", "table-4.2-a", "claim-4.3", "claims", "absent", "chapter-4"} <= set(checker.ids)
-    for address in checker.addresses:
+    for address in checker.targets:
         if address.startswith("#"):
             assert address[1:] in checker.ids
         elif not address.startswith("data:image/"):

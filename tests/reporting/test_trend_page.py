@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -17,30 +15,12 @@ from sealscope.errors import InputError
 from sealscope.reporting.trend.page import chart_of, render_trend_page, write_trend_page
 from sealscope.reporting.trend.text import trend_text
 
-
-class Tags(HTMLParser):
-    """Open tags that are not closed, and every tag seen."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.known: list[tuple[str, dict[str, str | None]]] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.known.append((tag, dict(attrs)))
-        if tag not in ("meta", "path", "rect", "circle", "link"):
-            self.open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        if self.open and self.open[-1] == tag:
-            self.open.pop()
+from .pages import Reader
 
 
 def test_the_page_is_whole_and_shows_what_happened(trend: Trend) -> None:
     page = render_trend_page(trend, title="press 4")
-    tags = Tags()
-    tags.feed(page)
-    assert tags.open == []
+    Reader(page)
     assert page.count("<script") == 0 and "http" not in page.split("</style>")[1]
     assert "<day>" not in page and "&lt;day&gt; 5.csv" in page
     for words in (
@@ -60,14 +40,15 @@ def test_the_page_is_whole_and_shows_what_happened(trend: Trend) -> None:
 
 
 def test_the_chart_stands_within_its_frame(trend: Trend) -> None:
-    for size in ("wide", "narrow"):
-        chart = chart_of(trend, size)
-        assert chart is not None
+    chart = chart_of(trend)
+    assert chart is not None and [picture["size"] for picture in chart["pictures"]] == ["wide", "narrow"]
+    for scale in (picture["scale"] for picture in chart["pictures"]):
         for point in chart["points"]:
-            assert chart["left"] <= point["x"] <= chart["right"]
-            assert chart["top"] <= point["high"] <= point["y"] <= point["low"] <= chart["bottom"]
-        numbers = [float(x) for d in chart["course"] for x in re.findall(r"[\d.]+", d)]
-        assert min(numbers) >= 0.0 and max(numbers) <= max(chart["width"], chart["height"])
+            assert 0.0 <= scale.x(point["day"]) <= scale.width
+            assert 0.0 <= scale.y(point["high"]) <= scale.y(point["level"]) <= scale.y(point["low"]) <= scale.height
+        for days, levels in chart["course"]:
+            for at, end in ((scale.x(days), scale.width), (scale.y(levels), scale.height)):
+                assert np.all((at >= 0.0) & (at <= end))
 
 
 def test_without_a_level_there_is_a_page_without_a_chart(tmp_path: Path) -> None:
@@ -94,6 +75,7 @@ def test_another_kind_of_file_is_refused(trend: Trend, tmp_path: Path) -> None:
 
 def test_a_session_has_ticks_of_minutes(trend: Trend) -> None:
     points = tuple(replace(own, day=own.day / 1440.0) for own in trend.points)
-    chart = chart_of(replace(trend, points=points), "wide")
-    assert chart is not None and len(chart["x_ticks"]) >= 3
-    assert all(":" in label for _, label in chart["x_ticks"])
+    chart = chart_of(replace(trend, points=points))
+    assert chart is not None
+    ticks = chart["pictures"][0]["x_ticks"]
+    assert len(ticks) >= 3 and all(":" in label for _, label in ticks)

@@ -15,7 +15,6 @@ from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from operator import attrgetter
 from pathlib import Path
-from types import MappingProxyType
 from typing import Literal, NamedTuple
 
 from sealscope.calls import checked_call
@@ -28,6 +27,7 @@ from sealscope.fmu.variables import INPUTS, REFERENCES, RESULTS, SENSOR_RESULTS,
 from sealscope.parameters import Rig, load_rig
 from sealscope.physics.state import STATES
 from sealscope.storage.atomic import atomic_write
+from sealscope.storage.plain_values import as_type
 
 Version = Literal[2, 3]
 #: What a soft sensor reads: pressures of both chambers, the pump's angle and the piston's position.
@@ -51,17 +51,9 @@ class Platform(NamedTuple):
     suffix: str
 
 
-def _platforms() -> Mapping[str, Platform]:
-    tables = tomllib.loads((files("sealscope.fmu") / "platforms.toml").read_text("utf-8"))
-    return MappingProxyType(
-        {
-            name: Platform(own["triple"], own["target"], {int(k): v for k, v in own["folders"].items()}, own["suffix"])
-            for name, own in tables.items()
-        }
-    )
-
-
-PLATFORMS = _platforms()
+PLATFORMS: Mapping[str, Platform] = as_type(
+    dict[str, Platform], tomllib.loads((files("sealscope.fmu") / "platforms.toml").read_text("utf-8"))
+)
 
 
 def this_platform() -> str:

@@ -8,10 +8,9 @@ from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.channels import Array
 from sealscope.recordings.motion import moves
 from sealscope.recordings.recording import Recording, remembered
+from sealscope.storage.toml_file import beliefs_of
 
-_LONGEST_CYCLE = 20.0
-_CYCLE_CORRELATION = 0.6
-_ANALYSIS_RATE = 50.0
+_CYCLE = beliefs_of("sealscope.recordings")["cycle"]
 
 
 def find_cycle(recording: Recording) -> float | None:
@@ -35,7 +34,7 @@ def cycle_of(signal: Array, rate: float) -> float | None:
     The first maximum of the autocorrelation after its first zero, at least 0.6 high, between 0.2 s and 20 s and
     repeated five times or more; refined by a parabola.
     """
-    stride = max(1, int(rate / _ANALYSIS_RATE))
+    stride = max(1, int(rate / _CYCLE["rate"]))
     n = signal.size // stride
     if n < 32:
         return None
@@ -46,14 +45,14 @@ def cycle_of(signal: Array, rate: float) -> float | None:
     spectrum = np.abs(np.fft.rfft(slow, 2 * n)) ** 2
     correlation = np.fft.irfft(spectrum)[:n] / np.arange(n, 0, -1)
     correlation = correlation / correlation[0]
-    longest = min(n // 5, int(_LONGEST_CYCLE * rate / stride))
+    longest = min(n // 5, int(_CYCLE["longest"] * rate / stride))
     below = np.flatnonzero(correlation[:longest] < 0)
     if below.size == 0:
         return None
     first = int(below[0])
     inner = correlation[first + 1 : longest - 1]
     peaks = np.flatnonzero((inner >= correlation[first : longest - 2]) & (inner > correlation[first + 2 : longest]))
-    peaks = peaks[inner[peaks] >= _CYCLE_CORRELATION]
+    peaks = peaks[inner[peaks] >= _CYCLE["correlation"]]
     if peaks.size == 0:
         return None
     best = peaks[inner[peaks] >= inner[peaks].max() - 0.05][0]

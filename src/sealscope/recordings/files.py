@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib import import_module
@@ -28,54 +29,14 @@ from sealscope.storage.atomic import atomic_write
 from sealscope.storage.opening import open_regular, whole
 from sealscope.storage.unpacking import most_unpacked
 
-_HDF5 = b"\x89HDF\r\n\x1a\n"
-#: Format -> its name in words, the module that reads it, suffixes and first bytes of its files.
-_FORMATS: dict[str, tuple[str, str, str, tuple[bytes, ...]]] = {
-    "netcdf": ("a NetCDF or HDF5", "netcdf", ".nc .nc4 .h5 .hdf5", (_HDF5,)),
-    "text": ("a text", "text", ".csv .tsv .txt", ()),
-    "parquet": ("a Parquet", "parquet", ".parquet .pq", (b"PAR1", b"ARROW1")),
-    "matlab": ("a MATLAB", "matlab", ".mat", (b"MATLAB 5.0", b"MATLAB 7.")),
-    "tdms": ("a TDMS", "tdms", ".tdms", (b"TDSm",)),
-    "mdf": ("an MDF", "mdf", ".mdf .mf4", (b"MDF     ", b"UnFinMF ")),
-    "lvm": ("a LabVIEW measurement", "structured.lvm", ".lvm", ()),
-    "json": ("a JSON", "structured.json_log", ".json .jsonl .ndjson", ()),
-    "spreadsheet": ("a spreadsheet", "spreadsheet", ".xlsx .xlsm .xlsb .xls .ods", (b"PK\3\4", b"\xd0\xcf\x11\xe0")),
-}
+#: `formats.toml`: the formats that are read, and what is known by its first bytes or its suffix and not read.
+_TABLES: dict[str, dict[str, Any]] = tomllib.loads(Path(__file__).with_name("formats.toml").read_text("utf-8"))
+_FORMATS, _PROPRIETARY = _TABLES["read"], _TABLES["proprietary"]
+_BEGINS = {kind: re.compile(own["begins"].encode()) for kind, own in _FORMATS.items() if "begins" in own}
+_FOREIGN = {re.compile(begins.encode()): words for begins, words in _TABLES["foreign"].items()}
 #: Suffix -> format of any file, and of a file to write.
-_SUFFIXES = {suffix: kind for kind, (_, _, suffixes, _) in _FORMATS.items() for suffix in suffixes.split()}
+_SUFFIXES = {suffix: kind for kind, own in _FORMATS.items() for suffix in own["suffixes"]}
 SUFFIXES = {suffix: kind for suffix, kind in _SUFFIXES.items() if kind in ("netcdf", "text", "parquet")}
-#: First bytes of formats that are known and not read.
-_FOREIGN = {
-    rb"CDF[\x01\x02\x05]": "a NetCDF-3 file: convert it to NetCDF-4",
-    rb"%PDF": "a PDF document",
-    rb"7z\xbc\xaf": "a 7z archive: unpack it",
-    rb"Rar!": "a RAR archive: unpack it",
-    rb"SQLite format 3": "an SQLite data base: export it as CSV",
-    rb"\x93NUMPY": "a NumPy array: export it as CSV",
-    rb"\x80[\x04\x05]\x95": "a Python pickle: export it as CSV",
-    rb"DIAEXTENDED": "a DIAdem header (.DAT): export it from DIAdem as TDMS or CSV",
-    rb"\|CF,": "an imc FAMOS file: export it from FAMOS or imc STUDIO as MATLAB, TDMS or CSV",
-    rb"DEWESoft": "a Dewesoft file: export it from DewesoftX as MATLAB, TDMS or CSV",
-    rb"LOGG": "a BLF log of a bus: export its decoded signals as MDF or CSV",
-    rb"    -1\r?\n    58": "a universal file (UFF 58): export it as MATLAB or CSV",
-    rb"    -1\r?\n   151": "a universal file (UFF): export it as MATLAB or CSV",
-    rb"\x00\x01\x00\x00Standard": "an Access data base: export it as CSV",
-    rb"\x89PNG|\xff\xd8\xff": "a picture",
-    rb"RIFF": "a RIFF file, such as sound: export it as CSV",
-    rb"(?s:.*)<usi:tdm": "a DIAdem header (.tdm): export it as TDMS",
-}
-#: Suffixes of binary files that are known and not read -> what writes them, and the way out.
-_PROPRIETARY = {
-    ".bin": "a binary file such as catman's: export it from catman as MATLAB, TDMS or ASCII",
-    ".tst": "a catman test: export it from catman as MATLAB, TDMS or ASCII",
-    ".tdx": "the samples of a DIAdem .tdm: export them from DIAdem as TDMS or CSV",
-    ".dat": "a binary .dat: export it from the program that wrote it as TDMS, MATLAB or CSV",
-    ".raw": "an imc file: export it from FAMOS or imc STUDIO as MATLAB, TDMS or CSV",
-    ".dxd .d7d": "a Dewesoft file: export it from DewesoftX as MATLAB, TDMS or CSV",
-    ".unv .uff": "a universal file: export it as MATLAB or CSV",
-    ".wdf": "a file of a Yokogawa recorder: export it as CSV",
-    ".trc": "a file of an oscilloscope: export it as CSV",
-}
 #: Formats that are read in the program itself; the others' libraries end it, or fill its memory, on some files.
 _TEXTS = ("text", "lvm")
 #: Longest time that such a file may take [s], and what is added for its size [bytes/s]; most memory [bytes], and so
@@ -90,18 +51,17 @@ def _format_of(path: Path) -> str:
     """Return the format of a file by its content; raise UnreadableFile where it is none that is read."""
     with open_regular(path, "a recording") as file:
         head = file.read(SNIFF)
-        for kind, (_, _, _, magic) in _FORMATS.items():
-            if head.startswith(magic):
-                return kind
+        if known := next((kind for kind, begins in _BEGINS.items() if begins.match(head)), None):
+            return known
         for offset in (512, 1024, 2048, 4096):  # HDF5 may begin after a block of the user's
             file.seek(offset)
-            if file.read(8) == _HDF5:
+            if _BEGINS["netcdf"].match(file.read(8)):
                 return "netcdf"
-    foreign = next((name for pattern, name in _FOREIGN.items() if re.match(pattern, head)), None)
+    foreign: str | None = next((words for begins, words in _FOREIGN.items() if begins.match(head)), None)
     if foreign is None and is_matlab_4(head):
         return "matlab"
-    if foreign is None and path.suffix and encoding_of(head) is None:
-        foreign = next((name for own, name in _PROPRIETARY.items() if path.suffix.lower() in own.split()), None)
+    if foreign is None and encoding_of(head) is None:
+        foreign = _PROPRIETARY.get(path.suffix.lower())
     if foreign is not None:
         raise UnreadableFile(f"a recording must be in a format that is read, got {foreign} ({path})")
     return "lvm" if is_lvm(head) else "json" if is_json(head) else "text"
@@ -109,7 +69,7 @@ def _format_of(path: Path) -> str:
 
 def _member(kind: str, verb: str) -> Callable[..., Any]:
     """Return ``read_KIND`` or ``write_KIND`` of the format's module; its library is loaded now."""
-    module = import_module(f"sealscope.recordings.formats.{_FORMATS[kind][1]}")
+    module = import_module(f"sealscope.recordings.formats.{_FORMATS[kind]['module']}")
     return getattr(module, f"{verb}_{kind}")  # type: ignore[no-any-return]
 
 
@@ -268,7 +228,7 @@ def _inner(file: Path) -> Iterator[Path]:
 def _read(file: Path, wanted: Wanted) -> Recording:
     """Read a file that is no archive: by a process of its own where the format is none of text."""
     kind = _format_of(file)
-    with whole(f"{_FORMATS[kind][0]} file", file):
+    with whole(f"{_FORMATS[kind]['words']} file", file):
         if kind in _TEXTS:
             fields = _read_here(file, kind, wanted)
         else:

@@ -8,12 +8,11 @@ from sealscope.recordings.chambers import CHAMBERS, chambers_of
 from sealscope.recordings.channels import UNUSED, Array
 from sealscope.recordings.motion import constant
 from sealscope.recordings.recording import Recording
+from sealscope.storage.toml_file import beliefs_of
 
-#: Share of white noise in a pressure over which nothing else is in it; share of its swing by which a copy differs.
-_MOST_NOISE, _COPY = 0.5, 1e-6
-#: Rate [Hz] and fewest samples at which angle and speed are compared; correlation from which they show one motion, and
-#: factor between their rates that is an error of the unit.
-_SLOW, _FEWEST, _CORRELATED, _MISFIT = 20.0, 400, 0.5, 5.0
+_BELIEFS = beliefs_of("sealscope.recordings")["readings"]
+#: Share of its swing by which a copy differs, of rounding.
+_COPY = 1e-6
 
 
 def no_readings(recording: Recording) -> str | None:
@@ -29,17 +28,17 @@ def no_readings(recording: Recording) -> str | None:
         if np.std(difference) <= _COPY * max(np.std(signals[name]) for name in CHAMBERS):
             return "p_B is a copy of p_A, but chambers on either side of a piston move against each other"
     if {"theta", "omega"} <= {name for name, unit in recording.units.items() if unit != "count"}:
-        every = max(1, round(recording.rate / _SLOW))
+        every = max(1, round(recording.rate / _BELIEFS["rate"]))
         theta, omega = (_means(recording[name], every) for name in ("theta", "omega"))
-        if theta.size >= _FEWEST and np.isfinite(theta + omega).all():
+        if theta.size >= _BELIEFS["samples"] and np.isfinite(theta + omega).all():
             turned = np.gradient(theta, every / recording.rate)
             product, square = abs(float(turned @ omega)), float(turned @ turned)
             factor = product / max(square, np.finfo(float).tiny)
-            correlated = product >= _CORRELATED * np.sqrt(square * float(omega @ omega)) > 0.0
-            if correlated and not 1.0 / _MISFIT <= factor <= _MISFIT:
+            correlated = product >= _BELIEFS["correlation"] * np.sqrt(square * float(omega @ omega)) > 0.0
+            if correlated and not 1.0 / _BELIEFS["misfit"] <= factor <= _BELIEFS["misfit"]:
                 return f"the speed is {factor:.3g} times that at which the angle turns: is the unit of the time right?"
     for name, values in signals.items():
-        if not np.mean(np.diff(values, 3) ** 2) <= 20.0 * _MOST_NOISE * np.var(values):
+        if not np.mean(np.diff(values, 3) ** 2) <= 20.0 * _BELIEFS["noise"] * np.var(values):
             return f"{name} is noise: the machine's motion does not show in it"
     return None
 

@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.channels import Array
 from sealscope.recordings.recording import Recording
+from sealscope.storage.toml_file import beliefs_of
 
 #: A change of at most this share of a reading's largest value is rounding of the arithmetic: the reading does not move.
 ROUNDING = 1e-9
-#: Equal samples over this time [s], and at least this many, are no reading of a pressure.
-_LONGEST_HOLD_S, _LONGEST_HOLD = 1.5, 64
-
+_HOLD = beliefs_of("sealscope.recordings")["hold"]
 _SHORTEST_STUCK = 5
 _NEIGHBOURHOOD = 100
 _STUCK_CHANCE = 1e-6
@@ -42,7 +41,7 @@ def does_not_move(recording: Recording) -> str | None:
     is a straight line to within `ROUNDING` throughout. A recording too short to tell and a constant channel, which
     `inspect` reports, give None.
     """
-    longest = max(round(_LONGEST_HOLD_S * recording.rate), _LONGEST_HOLD)
+    longest = max(round(_HOLD["seconds"] * recording.rate), _HOLD["samples"])
     for name in chambers_of(recording):
         values = recording[name]
         if len(values) <= longest or constant(values):

@@ -19,6 +19,7 @@ from sealscope.recordings.channels import COUNTS, SLOW, Array
 from sealscope.recordings.formats.columns import counted
 from sealscope.recordings.motion import constant, runs_of, spacing, stuck
 from sealscope.recordings.recording import Recording
+from sealscope.storage.toml_file import beliefs_of
 
 Severity = Literal["note", "warning", "fatal"]
 
@@ -27,23 +28,10 @@ SHORTEST = 226
 #: An interval over this many sampling steps is a gap, one under the inverse share of a step is crowded.
 _GAP = 1.5
 _CROWDED = 0.5
-#: Scatter of the intervals, as a share of the step, from which sampling is called irregular, and unusable.
-_JITTER = 0.05
-_WORST_JITTER = 0.3
-_RATE_ERROR = 0.01
-#: Share of the power over 20 Hz, where leakage shows, from which hum disturbs, and from which there is little else.
-_LOUD_HUM = 0.1
-_UNCONNECTED = 0.5
 _FEWEST_AT_RAIL = 5
 _LONG_RUN = 20
-#: Mean pressure [Pa/s] of both chambers that creeps faster than oil warms in an actuator with an accumulator, and how
-#: long [s] a recording must be to tell it from a stroke.
-_CREEP_RATE = 2e3
-_CREEP_SECONDS = 60.0
-_HUM_BAND = 5.0
-_HUM_POWER_FROM = 20.0
-_HUM_OVER_REST = 4.0
-_HUM_OVER_FLOOR = 10.0
+_BELIEFS = beliefs_of("sealscope.recordings")
+_CLOCK, _HUM, _CREEP = (_BELIEFS[table] for table in ("clock", "hum", "creep"))
 
 
 @dataclass(frozen=True)
@@ -127,7 +115,7 @@ def _time_findings(recording: Recording) -> list[Finding]:
     add("duplicated_time", known[same + 1], f"{counted(same.size, 'time stamp')} equal to the one before")
     if forward.size:
         typical = float(np.median(forward))
-        if abs(typical / step - 1.0) > _RATE_ERROR and not (same.size and typical < 2.5 * step):
+        if abs(typical / step - 1.0) > _CLOCK["rate"] and not (same.size and typical < 2.5 * step):
             text = f"time stamps tell {1.0 / typical:.6g} Hz, the recording's rate is {recording.rate:g} Hz"
             add("rate_mismatch", known[:1], text)
             step = typical
@@ -138,10 +126,12 @@ def _time_findings(recording: Recording) -> list[Finding]:
         add("gap", known[gaps], f"{counted(gaps.size, 'gap')}, about {samples} lost, the longest {longest:g} s")
         usual = forward[forward <= _GAP * step] / step
         scatter = float(usual.std()) if usual.size else 0.0
-        if scatter > _JITTER:
-            odd = np.flatnonzero((steps > 0) & (steps <= _GAP * step) & (np.abs(steps / step - 1.0) > _JITTER))
+        if scatter > _CLOCK["scatter"]:
+            odd = np.flatnonzero(
+                (steps > 0) & (steps <= _GAP * step) & (np.abs(steps / step - 1.0) > _CLOCK["scatter"])
+            )
             text = f"intervals scatter by {100 * scatter:.0f} % of the sampling step"
-            add("irregular_sampling", known[odd], text, "fatal" if scatter > _WORST_JITTER else "warning")
+            add("irregular_sampling", known[odd], text, "fatal" if scatter > _CLOCK["unusable"] else "warning")
     if len(recording) < SHORTEST:
         text = f"{counted(len(recording), 'sample')}; the slowest detail needs {SHORTEST}"
         findings.append(Finding("too_short", "warning", None, len(recording), None, text))
@@ -155,14 +145,14 @@ def _times(count: int) -> str:
 def _creep_findings(recording: Recording) -> list[Finding]:
     """Return the finding on chambers whose mean pressure creeps evenly all the while, as no sealed circuit's does."""
     duration = len(recording) / recording.rate
-    if duration < _CREEP_SECONDS or any(recording.units.get(name) != "Pa" for name in ("p_A", "p_B")):
+    if duration < _CREEP["seconds"] or any(recording.units.get(name) != "Pa" for name in ("p_A", "p_B")):
         return []
     mean = 0.5 * (recording["p_A"] + recording["p_B"])
     levels = np.array([np.nanmean(part) if np.isfinite(part).any() else np.nan for part in np.array_split(mean, 8)])
     steps = np.diff(levels)
     rate = float(np.median(steps)) * 8.0 / duration
     even = np.all((steps / np.median(steps) > 0.5) & (steps / np.median(steps) < 2.0))
-    if not (even and abs(rate) >= _CREEP_RATE):
+    if not (even and abs(rate) >= _CREEP["rate"]):
         return []
     text = (
         f"p_A, p_B: their mean creeps evenly by {rate / 1e3:+.2g} kPa/s: oil is fed or lost, or a simulator balanced "
@@ -219,8 +209,8 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
     for frequency, amplitude, share in hum(kept, rate) if kept.size > 0.9 * values.size else ():
         text = f"mains hum of {frequency:g} Hz, amplitude {amplitude:.3g} {unit}"
         text += f", {100 * share:.2g} % of the power over 20 Hz"
-        text += ": is the sensor connected?" if share > _UNCONNECTED else ""
-        add("mains_hum", kept.size, int(present[0]), text, "warning" if share > _LOUD_HUM else "note")
+        text += ": is the sensor connected?" if share > _HUM["alone"] else ""
+        add("mains_hum", kept.size, int(present[0]), text, "warning" if share > _HUM["loud"] else "note")
     return findings
 
 
@@ -333,17 +323,17 @@ def hum(values: Array, rate: float) -> list[tuple[float, float, float]]:
     squares = (spectrum.real**2 + spectrum.imag**2) * (2.0 / window.sum()) ** 2
     step = rate / size
     # amplitude^2/2 summed over bins counts each line's power 1.5 size/count times, as wide as Hann's window makes it
-    power = float(squares[math.ceil(_HUM_POWER_FROM / step - 1e-9) :].sum()) / 2 / (1.5 * size / count)
+    power = float(squares[math.ceil(_HUM["from"] / step - 1e-9) :].sum()) / 2 / (1.5 * size / count)
     lines = []
     for mains in (50.0, 60.0):
-        if mains + _HUM_BAND >= rate / 2:
+        if mains + _HUM["around"] >= rate / 2:
             continue
-        bins = np.arange(int((mains - _HUM_BAND) / step), int((mains + _HUM_BAND) / step) + 2)
+        bins = np.arange(int((mains - _HUM["around"]) / step), int((mains + _HUM["around"]) / step) + 2)
         off, amplitudes = np.abs(bins * step - mains), np.sqrt(squares[bins])
         near = off <= max(0.1, 0.5 * rate / count)
-        beside = (off > max(0.5, 2.5 * rate / count)) & (off <= _HUM_BAND)
+        beside = (off > max(0.5, 2.5 * rate / count)) & (off <= _HUM["around"])
         peak, rest = float(amplitudes[near].max(initial=0.0)), amplitudes[beside]
-        if rest.size >= 10 and peak > _HUM_OVER_REST * rest.max() and peak > _HUM_OVER_FLOOR * np.median(rest):
+        if rest.size >= 10 and peak > _HUM["over_rest"] * rest.max() and peak > _HUM["over_median"] * np.median(rest):
             lines.append((mains, peak, min(1.0, peak**2 / 2 / power)))
     return lines
 

@@ -14,8 +14,8 @@ from sealscope.errors import InputError
 from sealscope.recordings.recording import COUNTS, Array, Recording
 from sealscope.reporting.features import NAMES, PRODUCT, ChamberDetails
 from sealscope.reporting.picture import Scale
-from sealscope.reporting.series import DrawnTimes, coded, coded_times, time_base
-from sealscope.units import LITRE_PER_MINUTE, PSI
+from sealscope.reporting.series import DrawnTimes, coded, coded_times, ordered_time, time_base
+from sealscope.units import to_si
 
 SAMPLES = "samples"
 #: points of a series drawn by the script, and in the still picture
@@ -25,19 +25,10 @@ NEAR_SAMPLES = 6_000
 
 #: largest value drawn; least extent of an axis, and over the size of its values: what is less is a constant
 _LARGEST, _LEAST, _LEAST_SHARE = 1e100, 1e-100, 1e-12
-#: unit of pressures -> Pa per unit, unit of their details, Pa per that unit
-PRESSURE_UNITS: dict[str, tuple[float, str, float]] = {
-    "bar": (1e5, "kPa", 1e3),
-    "MPa": (1e6, "kPa", 1e3),
-    "kPa": (1e3, "kPa", 1e3),
-    "psi": (PSI, "psi", PSI),
-}
-#: SI unit of other channels -> unit shown, SI per unit
-_SHOWN = {
-    "m": ("mm", 1e-3),
-    "rad/s": ("rpm", np.pi / 30),
-    "m^3/s": ("L/min", LITRE_PER_MINUTE),
-}
+#: unit of pressures -> unit of their details
+_DETAIL_UNITS = {"bar": "kPa", "MPa": "kPa", "kPa": "kPa", "psi": "psi"}
+#: SI unit of other channels -> unit shown
+_SHOWN = {"m": "mm", "rad/s": "rpm", "m^3/s": "L/min"}
 
 
 @dataclass(frozen=True)
@@ -102,14 +93,13 @@ def shown_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tuple[
 
     Raises InputError for an unknown pressure unit.
     """
-    if pressure_unit not in PRESSURE_UNITS:
-        raise InputError(f"pressure unit must be one of {', '.join(PRESSURE_UNITS)}, got {pressure_unit!r}")
-    if unit == "Pa":
-        size, detail_unit, detail_size = PRESSURE_UNITS[pressure_unit]
-        return (detail_unit, detail_size) if detail else (pressure_unit, size)
+    if pressure_unit not in _DETAIL_UNITS:
+        raise InputError(f"pressure unit must be one of {', '.join(_DETAIL_UNITS)}, got {pressure_unit!r}")
     if unit == COUNTS:
         return "counts", 1.0
-    return _SHOWN.get(unit, (unit, 1.0))
+    pressure = _DETAIL_UNITS[pressure_unit] if detail else pressure_unit
+    shown = pressure if unit == "Pa" else _SHOWN.get(unit, unit)
+    return shown, to_si(1.0, shown, unit)
 
 
 def detail_unit(unit: str, name: str, pressure_unit: str) -> tuple[str, float]:
@@ -214,11 +204,19 @@ def detail_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Ch
 
 
 class DrawnCharts(NamedTuple):
-    """All charts: `data` for the script (plain JSON values), `still` by chart key for the template, and their base."""
+    """All charts as a page shows them.
+
+    `data`: for the script (plain JSON values); `still`: by chart key, for the template; `events`: what is marked on
+    each; `base`: times at which the channels are drawn; `span`: their ends [s]; `fine`: ends of the stretch whose
+    samples are drawn one by one [s].
+    """
 
     data: dict[str, Any]
     still: dict[str, dict[str, Any]]
+    events: list[dict[str, Any]]
     base: DrawnTimes
+    span: tuple[float, float]
+    fine: tuple[float, float]
 
 
 def draw(
@@ -226,7 +224,7 @@ def draw(
     chambers: list[ChamberDetails],
     charts: list[Chart],
     diagnosis: Diagnosis,
-    marks: list[Mark],
+    marks: Sequence[Mark],
 ) -> DrawnCharts:
     """Decimate and code every chart's lines, and lay out the still picture of each.
 
@@ -240,7 +238,7 @@ def draw(
     axes: dict[str, Array] = {SAMPLES: base.t} | {f"windows-{c.channel}": c.window_t for c in chambers}
     if diagnosis.course is not None:
         axes[COURSE] = diagnosis.course.t
-    onset, interval = onset_within(diagnosis, span)
+    onset, interval = _onset_within(diagnosis, span)
     low, high = interval or (None, None)
     coded_charts, still = [], {}
     for chart in charts:
@@ -260,7 +258,11 @@ def draw(
         "marks": [{"t": mark.t, "label": mark.label, "known": mark.known} for mark in marks],
         "charts": coded_charts,
     }
-    return DrawnCharts(data, still, base)
+    events = [{"t": low, "width": high - low, "kind": ""}] if low is not None and high is not None else []
+    events += [] if onset is None else [{"t": onset, "width": None, "kind": ""}]
+    events += [{"t": mark.t, "width": None, "kind": "known" if mark.known else "other"} for mark in marks]
+    t = ordered_time(recording.t, recording.rate)[0]
+    return DrawnCharts(data, still, events, base, span, (float(t[base.fine.start]), float(t[base.fine.stop - 1])))
 
 
 def _drawable(values: Array) -> Array:
@@ -268,7 +270,7 @@ def _drawable(values: Array) -> Array:
     return np.where(np.isfinite(values), np.clip(values, -_LARGEST, _LARGEST), values)
 
 
-def onset_within(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[float | None, tuple[float, float] | None]:
+def _onset_within(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[float | None, tuple[float, float] | None]:
     """Return the onset and its interval [s] as drawn: an end outside the recording, or unbounded, is cut."""
     onset, interval = diagnosis.onset_s, diagnosis.onset_interval_s
     if onset is None or not isfinite(onset):
@@ -277,17 +279,6 @@ def onset_within(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[float
         return float(onset), None
     low, high = (float(np.clip(end, *span)) for end in interval)
     return float(onset), (low, high)
-
-
-def events(diagnosis: Diagnosis, span: tuple[float, float], marks: Sequence[Mark]) -> list[dict[str, Any]]:
-    """Return what is marked on a still picture: the onset with its interval, and the moments given."""
-    onset, interval = onset_within(diagnosis, span)
-    marked: list[dict[str, Any]] = []
-    if interval is not None:
-        marked.append({"t": interval[0], "width": interval[1] - interval[0], "kind": ""})
-    if onset is not None:
-        marked.append({"t": onset, "width": None, "kind": ""})
-    return marked + [{"t": mark.t, "width": None, "kind": "known" if mark.known else "other"} for mark in marks]
 
 
 def still_chart(chart: Chart, t: Array, lines: list[Array], span: tuple[float, float]) -> dict[str, Any]:

@@ -26,7 +26,7 @@ def _texts() -> dict[str, dict[str, str]]:
     return tomllib.loads((resources.files("sealscope.reporting") / "messages.toml").read_text(encoding="utf-8"))
 
 
-def _say(name: str, **values: Any) -> str:
+def say(name: str, /, **values: Any) -> str:
     """Return the text `section.key` with its values."""
     section, _, key = name.partition(".")
     return _texts()[section][key].format(**values)
@@ -85,11 +85,11 @@ def since(diagnosis: Diagnosis) -> str | None:
     if diagnosis.verdict != "leak":
         return None
     if diagnosis.onset_s is None:
-        return _say("since.whole")
+        return say("since.whole")
     if diagnosis.onset_interval_s is None:
         return clock(diagnosis.onset_s)
     low, high = map(clock, diagnosis.onset_interval_s)
-    return _say("since.interval", onset=clock(diagnosis.onset_s), low=low, high=high)
+    return say("since.interval", onset=clock(diagnosis.onset_s), low=low, high=high)
 
 
 def how_much(diagnosis: Diagnosis) -> str | None:
@@ -97,16 +97,16 @@ def how_much(diagnosis: Diagnosis) -> str | None:
     interval, leak = diagnosis.leak_interval_lpm, diagnosis.leak_lpm
     if diagnosis.verdict != "leak":
         if diagnosis.bound_lpm is not None:
-            return _say("how_much.bound", bound=number(diagnosis.bound_lpm, 2))
+            return say("how_much.bound", bound=number(diagnosis.bound_lpm, 2))
         if diagnosis.verdict == "no leak" and leak is not None and interval is not None and interval[1] > 0:
-            return _say("how_much.at_most", high=number(interval[1], 2))
+            return say("how_much.at_most", high=number(interval[1], 2))
         return None
     if leak is None:
         share = _pump_share(diagnosis)
         return _why_no_flow(diagnosis) if share is None else f"{share}; {_why_no_flow(diagnosis)}"
     if interval is None:
         return f"{number(leak)} L/min"
-    return _say("how_much.interval", leak=number(leak), low=number(interval[0]), high=number(interval[1]))
+    return say("how_much.interval", leak=number(leak), low=number(interval[0]), high=number(interval[1]))
 
 
 def _pump_share(diagnosis: Diagnosis) -> str | None:
@@ -120,12 +120,12 @@ def _why_no_flow(diagnosis: Diagnosis) -> str:
     ratio, machine = diagnosis.measured_ratio, diagnosis.machine
     if "leak_lpm" not in diagnosis.refuses:
         small = diagnosis.passage is not None and diagnosis.passage.lpm is not None
-        return _say(f"how_much.{'too_small' if small else 'channels'}")
+        return say(f"how_much.{'too_small' if small else 'channels'}")
     if machine is not None and not machine.stated:
-        return _say(f"how_much.{'machine' if ratio is None else 'machine_or_area'}")
+        return say(f"how_much.{'machine' if ratio is None else 'machine_or_area'}")
     if machine is None or ratio is None:
-        return _say("how_much.reason")
-    return _say("how_much.ratio", ratio=number(ratio[0]), rig=machine.rig)
+        return say("how_much.reason")
+    return say("how_much.ratio", ratio=number(ratio[0]), rig=machine.rig)
 
 
 def rests_on(diagnosis: Diagnosis) -> str | None:
@@ -142,7 +142,7 @@ def machine_text(machine: AssumedMachine) -> str:
     else:
         key = "area" if machine.area_stated else "displacement" if machine.displacement_stated else "assumed"
     area, displacement = f"{number(1e6 * machine.area)} mm²", f"{number(1e6 * machine.displacement)} cm³/rev"
-    return _say(f"machine.{key}", area=area, displacement=displacement, rig=machine.rig)
+    return say(f"machine.{key}", area=area, displacement=displacement, rig=machine.rig)
 
 
 def how_bad(diagnosis: Diagnosis) -> str | None:
@@ -153,9 +153,9 @@ def how_bad(diagnosis: Diagnosis) -> str | None:
     if own.level is not None and own.of_limit is not None:
         low, high = own.of_limit[1:]
         share = f"{_span(low, high)} times" if high >= 10.0 else f"{_span(100.0 * low, 100.0 * high)} % of"
-        return _say(f"how_bad.{own.level}", share=share, limit=f"{limit}{'' if limit.stated else ', the default'}")
+        return say(f"how_bad.{own.level}", share=share, limit=f"{limit}{'' if limit.stated else ', the default'}")
     if limit.stated:
-        return _say("how_bad.no_area", limit=limit)
+        return say("how_bad.no_area", limit=limit)
     return None if diagnosis.leak_lpm is None else _pump_share(diagnosis)
 
 
@@ -191,19 +191,19 @@ def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
     if own.lpm is None or own.interval_lpm is None:
         known = own.pump_share is not None
         key = "share" if known else "not_measured"
-        text = _say(f"leakage.{key}", share=_percent(own.pump_share), pressure=pressure)
+        text = say(f"leakage.{key}", share=_percent(own.pump_share), pressure=pressure)
         if own.findable_share is None:
             return text
         size = _percent(own.findable_share) + ("" if known else " of the pump's flow")
-        return text + _say("leakage.findable", size=size if own.findable_lpm is None else f"{size}, {findable}")
+        return text + say("leakage.findable", size=size if own.findable_lpm is None else f"{size}, {findable}")
     low, high = own.interval_lpm
     key = "none" if not high > 0.0 else "at_most" if not low > 0.0 else "interval"
     figures = {"lpm": number(own.lpm, 2), "low": number(low, 2), "high": number(high, 2)}
-    text = _say(f"leakage.{key}", pressure=pressure, **figures)
+    text = say(f"leakage.{key}", pressure=pressure, **figures)
     if basis and diagnosis.verdict != "leak" and (machine := rests_on(diagnosis)) is not None:
         text += f" ({machine})"
-    text += "" if own.healthy_lpm is None else _say("leakage.healthy", lpm=number(own.healthy_lpm, 2))
-    return text + ("" if own.findable_lpm is None else _say("leakage.findable", size=findable))
+    text += "" if own.healthy_lpm is None else say("leakage.healthy", lpm=number(own.healthy_lpm, 2))
+    return text + ("" if own.findable_lpm is None else say("leakage.findable", size=findable))
 
 
 def leakage_in_short(diagnosis: Diagnosis) -> str | None:
@@ -229,14 +229,14 @@ def _percent(share: float | None) -> str:
 def how_sure(diagnosis: Diagnosis) -> str:
     """Return how many healthy recordings look like this, the score against its threshold, and what that means."""
     if diagnosis.score is None or diagnosis.threshold is None:
-        return _say("how_sure.no_score")
+        return say("how_sure.no_score")
     odds, other = _odds(diagnosis), cause(diagnosis)
     odds = "" if odds is None else f"{odds}; "
     relation = "over" if diagnosis.score > diagnosis.threshold else "not over"
     if diagnosis.verdict != "leak" and other is not None and diagnosis.alarmed:
         odds, relation = f"that something changed: {odds}", f"for {other}, over"
     judge = diagnosis.methods[0].detector if diagnosis.methods else ""
-    return _say(
+    return say(
         "how_sure.score", odds=odds, score=number(diagnosis.score), relation=relation,
         threshold=number(diagnosis.threshold), judge=f" of {judge}" if judge else "",
         false_alarms=false_alarms(diagnosis),
@@ -260,32 +260,32 @@ def false_alarms(diagnosis: Diagnosis) -> str:
     """Return what the threshold was set for."""
     p = diagnosis.false_alarm_probability
     if not 0 < p < 1:
-        return _say("how_sure.probability", probability=number(p))
+        return say("how_sure.probability", probability=number(p))
     every = f"{round(1 / p)}" if 1 / p >= 10 else number(1 / p)
-    return _say("how_sure.share", share=f"{number(100 * p)} % (1 in {every})")
+    return say("how_sure.share", share=f"{number(100 * p)} % (1 in {every})")
 
 
 def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
     """Return what to check next, most useful first."""
     level = None if diagnosis.severity is None else diagnosis.severity.level
-    confirmed = _say(f"once_confirmed.{level or 'plan'}", limit=diagnosis.limit)
+    confirmed = say(f"once_confirmed.{level or 'plan'}", limit=diagnosis.limit)
     named = diagnosis.cause is not None and (diagnosis.verdict == "leak") == (diagnosis.cause in LEAKS)
     if named and diagnosis.verdict == "leak":
-        steps = [diagnosis.next_check, _say("next.repeat"), confirmed]
+        steps = [diagnosis.next_check, say("next.repeat"), confirmed]
     elif named:
-        steps = [diagnosis.next_check, _say("next.resolved")]
+        steps = [diagnosis.next_check, say("next.resolved")]
     elif diagnosis.verdict == "leak":
-        steps = [*map(_say, ("next.repeat", "next.bypass", "next.creep")), confirmed]
+        steps = [*map(say, ("next.repeat", "next.bypass", "next.creep")), confirmed]
     elif diagnosis.verdict == "no leak":
-        steps = [diagnosis.next_check, _say("next.longer")]
+        steps = [diagnosis.next_check, say("next.longer")]
     else:
-        steps = [_say("next.cause"), _say("next.record")]
+        steps = [say("next.cause"), say("next.record")]
     trouble = [finding for finding in diagnosis.quality if finding.severity != "note"]
     if trouble:
         names = [f"{own.code.replace('_', ' ')}{f' ({own.channel})' if own.channel else ''}" for own in trouble]
         key = "rule_out" if named or diagnosis.verdict == "leak" else "care"
         key, place = ("findings", 1) if not named and diagnosis.verdict == "cannot tell" else (key, 0)
-        steps.insert(place, _say(f"next.{key}", faults=", ".join(dict.fromkeys(names))))
+        steps.insert(place, say(f"next.{key}", faults=", ".join(dict.fromkeys(names))))
     return tuple(steps)
 
 
@@ -364,7 +364,8 @@ def _lines(diagnosis: Diagnosis, rows: list[tuple[str, str | None]], width: int)
         for label, text in rows
         if text
     ]
-    return "\n".join((f"{_printable(diagnosis.file)}: {diagnosis.summary}", *texts))
+    first = say("terminal.diagnosis", file=_printable(diagnosis.file), summary=diagnosis.summary)
+    return "\n".join((first, *texts))
 
 
 def _printable(text: str) -> str:

@@ -19,7 +19,7 @@ from sealscope.recordings.recording import Recording
 from sealscope.reporting import charts, features, messages, printing, template
 from sealscope.reporting.charts import Mark
 from sealscope.reporting.particulars import particulars_of
-from sealscope.reporting.schematic import Circuit, circuit_of, columns_of, schematic
+from sealscope.reporting.schematic import circuit_of, columns_of, schematic
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -121,13 +121,10 @@ def render_card(
     title: str | None = None,
 ) -> str:
     """Return the card as HTML of `WIDTH` x `HEIGHT` pixels; arguments as for `write_page`."""
+    shown = charts.course_charts(diagnosis, height=_CURVE_HEIGHT)
     all_marks = _all_marks(recording, marks, truth_onset_s)
     particulars = particulars_of(recording, _rig_of(diagnosis, rig))
     name = Path(diagnosis.file).name
-    chart = next(iter(charts.course_charts(diagnosis, height=_CURVE_HEIGHT)), None)
-    still, span = None, (float(recording.t[0]), float(recording.t[-1]))
-    if chart is not None and diagnosis.course is not None:
-        still = charts.still_chart(chart, diagnosis.course.t, [line.values for line in chart.lines], span)
     subtitle = (name, particulars.get("Operator"), particulars.get("Oil temperature"))
     return template.render(
         "card.html.j2",
@@ -136,9 +133,8 @@ def render_card(
         title=title or particulars.get("Machine", name),
         date=particulars.get("Date", ""),
         subtitle=" · ".join(text for text in subtitle if text),
-        chart=chart,
-        still=still,
-        events=charts.events(diagnosis, span, all_marks),
+        charts=shown,
+        drawn=charts.draw(recording, [], shown, diagnosis, all_marks),
         width=WIDTH,
         height=HEIGHT,
     )
@@ -178,78 +174,23 @@ def render_page(
         title=title or Path(diagnosis.file).name,
         subtitle=f"{diagnosis.file} · {facts}",
         particulars=particulars_of(recording, known_rig),
-        known=_known(diagnosis, truth_onset_s, truth_leak_lpm),
+        truth=(truth_onset_s, truth_leak_lpm),
         marks=all_marks,
-        charts=shown,
+        groups={group: [own for own in shown if own.group == group] for group in charts.GROUPS},
+        drawn=drawn,
+        window=features.WINDOW,
+        step=features.STEP,
         notes=[note for _, note in details if note],
         schematic=Markup(schematic(recording, diagnosis, circuit)),
-        machine=_machine(circuit, known_rig),
+        rig=known_rig,
+        circuit=circuit,
         columns=columns_of(recording),
         recording=recording,
         channels=[_summary(recording, name, pressure_unit) for name in recording.channels],
         provenance=list(_flat(recording.provenance)),
         chart_data=drawn.data if shown else None,
-        **_evidence(recording, diagnosis, drawn, shown, all_marks),
         **_changes(recording, diagnosis, chambers, pressure_unit),
     )
-
-
-def _machine(circuit: Circuit, rig: Rig | None) -> list[tuple[str, str]]:
-    """Return what the rig says of the machine, as the page shows it beside the drawing."""
-    if rig is None:
-        return []
-    values = circuit.values
-    areas = values["A_A"] if values["A_A"] == values["A_B"] else f"{values['A_A']} at A and {values['A_B']} at B"
-    throttles = f"closed {values['closed_A']} at A, {values['closed_B']} at B" if circuit.throttles else "none"
-    return [
-        ("Rig", rig.title or rig.name),
-        ("Cylinder", f"{circuit.cylinder}, area {areas}, stroke {values['L']}"),
-        ("Pump", f"displacement {values['q_b']}"),
-        ("Throttles", throttles),
-    ]
-
-
-def _known(diagnosis: Diagnosis, truth_onset_s: float | None, truth_leak_lpm: float | None) -> str:
-    known = []
-    if truth_onset_s is not None:
-        known.append(f"the leak begins at {messages.clock(truth_onset_s)}")
-    if truth_onset_s is not None and diagnosis.onset_s is not None:
-        late = diagnosis.onset_s - truth_onset_s
-        known.append(f"the onset found is {abs(late):.1f} s {'late' if late >= 0 else 'early'}")
-    if truth_leak_lpm is not None:
-        known.append(f"the leak is {messages.number(truth_leak_lpm)} L/min on average")
-    return "; ".join(known)
-
-
-def _evidence(
-    recording: Recording,
-    diagnosis: Diagnosis,
-    drawn: charts.DrawnCharts,
-    shown: list[charts.Chart],
-    marks: list[Mark],
-) -> dict[str, Any]:
-    """Return charts by group, what is marked on them, the spans that the buttons show, and how samples are drawn."""
-    base, span = drawn.base, drawn.data["span"]
-    onset, _ = charts.onset_within(diagnosis, span)
-    t = np.arange(len(recording)) / recording.rate if base.by_sample else recording.t
-    first, last = float(t[base.fine.start]), float(t[base.fine.stop - 1])
-
-    def around(seconds: float) -> tuple[float, float] | None:
-        return None if onset is None else (max(span[0], onset - seconds), min(span[1], onset + seconds))
-
-    return {
-        "groups": {group: [own for own in shown if own.group == group] for group in charts.GROUPS},
-        "still": drawn.still,
-        "events": charts.events(diagnosis, span, marks),
-        "span": span,
-        "around": around(20.0),
-        "close": (first, last) if base.width > 1 else around(2.0),
-        "base": base,
-        "bucket_ms": f"{1000 * base.width / recording.rate:.3g}",
-        "fine": (first, last),
-        "window": features.WINDOW,
-        "step": features.STEP,
-    }
 
 
 def _changes(

@@ -1,9 +1,12 @@
-"""Read a TOML file from outside: bounded, and with one line for whatever is wrong with it."""
+"""Read TOML: a file from outside, bounded and with one line for whatever is wrong with it, or a package's beliefs."""
 
 from __future__ import annotations
 
 import re
 import tomllib
+from collections.abc import Mapping
+from functools import cache
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +48,19 @@ def read_toml(path: Path, what: str, place: str, largest: int = LARGEST) -> dict
     except (ValueError, RecursionError) as error:  # tomllib lets errors of dates and of very long numbers through
         raise InputError(f"{what} must be TOML: {str(error).splitlines()[0]} ({place})") from None
     return tree
+
+
+@cache
+def beliefs_of(package: str) -> Mapping[str, Mapping[str, Any]]:
+    """Return the values of a package's `priors.toml` by table and name; each states its unit and source beside it.
+
+    Raises KeyError where a row lacks unit or source.
+    """
+    tables = tomllib.loads((files(package) / "priors.toml").read_text("utf-8"))
+    return {
+        table: {name: (row["value"], row["unit"], row["source"])[0] for name, row in rows.items()}
+        for table, rows in tables.items()
+    }
 
 
 def _check_whole_numbers(value: Any) -> None:

@@ -87,8 +87,8 @@ class Rise(NamedTuple):
         return self.value - half, self.value + half
 
 
-class Taught(NamedTuple):
-    """What a healthy recording teaches of its machine.
+class RecordingSums(NamedTuple):
+    """What a recording says of its machine, to be added to what others say.
 
     `sums` (E, m, m) of its rows, the zero of its flow set aside; `flow` of the pump and `pressure`, mean sizes
     [m^3/s], [Pa]; `start_s`: its date [s since 1970], and `oil_degC`, its oil's temperature, None where
@@ -108,14 +108,14 @@ class Taught(NamedTuple):
         columns: Sequence[Columns],
         start_s: float | None = None,
         oil_degC: float | None = None,
-    ) -> Taught:
+    ) -> RecordingSums:
         """Return that of a recording's blocks."""
         weights = np.maximum(blocks.rows, 1e-9)
         flow, pressure = (float(np.average(of, weights=weights)) for of in (blocks.flow, blocks.driving()))
         return cls(_about_own(total(blocks, columns), columns), flow, pressure, start_s, oil_degC)
 
 
-def rise(judged: Taught, baseline: Sequence[Taught], columns: Sequence[Columns]) -> Rise:
+def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[Columns]) -> Rise:
     """Return how far the leak's coefficient of a recording is beyond that of healthy recordings of the same machine."""
     everything, count = np.sum([own.sums for own in baseline], axis=0), len(baseline)
     believed, by_flow = beliefs("inference")["scatter"], judged.flow / judged.pressure if judged.pressure > 0.0 else 0.0
@@ -194,15 +194,15 @@ def sessions_of(starts: Sequence[float | None], pause: float) -> list[int]:
     return [-1 if own is None else int(np.searchsorted(begins, own, "right")) for own in starts]
 
 
-def _of_oil(taught: Sequence[Taught], level: float, error: float) -> list[float]:
+def _of_oil(recordings: Sequence[RecordingSums], level: float, error: float) -> list[float]:
     """Return by how much each recording's leakage is beyond its mean over all but the last, for its oil's temperature.
 
     Last the deviation of the last one's: what may still differ, as far as the `level` within its `error` goes.
     """
     believed = beliefs("inference")["oil"]
-    known = [own.oil_degC for own in taught if own.oil_degC is not None]
-    if len(known) < len(taught):  # the difference of two sessions has twice the variance of each
-        return [0.0] * len(taught) + [0.5**1.5 * (believed["warmest"] - 1.0) * (level + error)]
+    known = [own.oil_degC for own in recordings if own.oil_degC is not None]
+    if len(known) < len(recordings):  # the difference of two sessions has twice the variance of each
+        return [0.0] * len(recordings) + [0.5**1.5 * (believed["warmest"] - 1.0) * (level + error)]
     warmer = np.array(known) - np.mean(known[:-1])
     factor = np.exp(believed["per_kelvin"] * warmer)
     deviation = believed["per_kelvin_deviation"] * abs(warmer[-1]) * factor[-1] * (level + error)
@@ -241,16 +241,16 @@ def motion_change(judged: Array, baseline: Sequence[Array], columns: Columns) ->
     return student(logarithm(judged, everything), apart, beliefs("inference")["between"]["motion"])
 
 
-def student(value: float, apart: Sequence[float] | Array, believed: float) -> Rise:
-    """Return a rise against n healthy recordings, each of which is so far `apart` from the others.
+def student(value: float, deviations: Sequence[float] | Array, believed: float) -> Rise:
+    """Return a rise against n healthy recordings, each of which deviates so far from the others.
 
     `believed`: what is believed of the scatter beforehand.
     """
-    width, count = beliefs("inference")["scatter"], len(apart)
+    width, count = beliefs("inference")["scatter"], len(deviations)
     squares = width["freedom"] * believed * believed
     freedom = width["freedom"] + count - 1
     if count > 1:
-        squares += float(np.sum(np.square(apart))) * ((count - 1) / count) ** 2
+        squares += float(np.sum(np.square(deviations))) * ((count - 1) / count) ** 2
     deviation = np.sqrt(squares / freedom * (1.0 + 1.0 / count))
     return Rise(value, max(float(deviation), np.finfo(float).tiny), freedom)
 
@@ -259,10 +259,10 @@ def _about_own(sums: Array, columns: Sequence[Columns]) -> Array:
     """Return a recording's sums (E, m, m) with the coefficients set aside that nothing ties to another recording's."""
     reduced = sums.copy()
     for e, column in enumerate(columns):
-        apart = [k for k in column.nuisance if k != column.leak and not np.isfinite(column.between[k])]
-        cross = sums[e][:, apart]
-        reduced[e] -= cross @ solve(sums[e][np.ix_(apart, apart)], cross.T)
-        reduced[e][apart] = reduced[e][:, apart] = 0.0
+        untied = [k for k in column.nuisance if k != column.leak and not np.isfinite(column.between[k])]
+        cross = sums[e][:, untied]
+        reduced[e] -= cross @ solve(sums[e][np.ix_(untied, untied)], cross.T)
+        reduced[e][untied] = reduced[e][:, untied] = 0.0
     return reduced
 
 
@@ -275,7 +275,7 @@ def _rise(own: Array, reference: Array, columns: Sequence[Columns]) -> float:
     for e, column in enumerate(columns):
         chosen = [k for k in column.nuisance if k == column.leak or np.isfinite(column.between[k])]
         coefficients = solve(reference[e][np.ix_(chosen, chosen)], reference[e][chosen, column.left])
-        left = own[e][:, column.left] - own[e][:, chosen] @ coefficients
+        residual = own[e][:, column.left] - own[e][:, chosen] @ coefficients
         others = [k for k in chosen if k != column.leak]
         size = np.abs(coefficients[[chosen.index(k) for k in others]])
         with np.errstate(divide="ignore", over="ignore"):
@@ -283,7 +283,7 @@ def _rise(own: Array, reference: Array, columns: Sequence[Columns]) -> float:
         matrix = own[e][np.ix_(others, others)]
         matrix = matrix + np.diag(np.minimum(belief, 1e9 * np.diag(matrix)))
         along = own[e][others, column.leak]
-        solved = solve(matrix, np.column_stack([along, left[others]]))
+        solved = solve(matrix, np.column_stack([along, residual[others]]))
         precision += float(own[e][column.leak, column.leak] - along @ solved[:, 0])
-        vector += float(left[column.leak] - along @ solved[:, 1])
+        vector += float(residual[column.leak] - along @ solved[:, 1])
     return vector / precision if precision > 0.0 else 0.0

@@ -261,8 +261,10 @@ class _Log:
         for _ in range(max(0, layout.first_row + 1 - number)):
             start = block.find(b"\n", start) + 1
         self.width = width = block.count(layout.delimiter.encode(), start, block.find(b"\n", start)) + 1
-        if any(block.find(mark, start, end) >= 0 for mark in _MARKS) or not self.least <= width <= len(layout.labels):
+        if not self.least <= width <= len(layout.labels):
             return None
+        if len(self.kinds) < width and any(block.find(mark, start, end) >= 0 for mark in _MARKS):
+            return None  # where all columns are read, none of these signs is part of a number
         if block.find(b"\r", 0, end) >= 0 and block.count(b"\r", 0, end) != block.count(b"\r\n", 0, end):
             return None
         wanted = [str(column) for column in self.kinds]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,22 +14,30 @@ from sealscope.recordings.channels import Array
 from sealscope.recordings.formats.headings.words import WORDS
 from sealscope.units import to_si
 
-_CLOCK = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,:]\d{1,9})?|[.,]\d{1,9})?|\d{6}(?:[.,]\d{1,9})?"
-_STAMP = re.compile(
-    r"(?:(?P<date>\d{4}[-/.]\d{1,2}[-/.]\d{1,2})|(?P<basic>(?:19|20)\d{6})(?=[T\s]|\Z)"
-    r"|(?P<days>\d{1,5}) days?,?(?=\s)"
-    r"|(?P<year_cjk>\d{4})年(?P<month_cjk>\d{1,2})月(?P<day_cjk>\d{1,2})日"
-    r"|(?P<day>\d{1,2})\.(?P<month>\d{1,2})\.(?P<year>\d{4}|\d{2})"
-    r"|(?P<day_named>\d{1,2})[-. /]{1,2}(?P<name>[^\W\d_]{3,9})[-. /]{1,2}(?P<year_named>\d{4}|\d{2})"
-    r"|(?P<name_first>[^\W\d_]{3,9})[. ]{1,2}(?P<day_after>\d{1,2}),? (?P<year_after>\d{4})"
-    r"|(?P<first>\d{1,2})(?P<stroke>[/-])(?P<second>\d{1,2})(?P=stroke)(?P<year_last>\d{4}|\d{2}))?,?"
-    rf"(?:(?:^|[T\s_]|(?<=日))(?:\s*-)?\s*(?P<clock>{_CLOCK})\s?(?P<half>[AaPp]\.?[Mm]\.?)?)?\s*"
-    r"(?P<zone>Z|UTC|GMT|[+-]\d{2}:?\d{2})?"
+#: How dates are written; what `first` and `second` are follows from all stamps of a column.
+_DATES = (
+    r"(?P<year>\d{4})[-/.](?P<month>\d{1,2})[-/.](?P<day>\d{1,2})",
+    r"(?P<plain>(?P<year>(?:19|20)\d{2})(?P<month>\d{2})(?P<day>\d{2}))(?=[T\s]|\Z)",
+    r"(?P<days>\d{1,5}) days?,?(?=\s)",  # a length of time, as pandas writes it
+    r"(?P<year>\d{4})年(?P<month>\d{1,2})月(?P<day>\d{1,2})日",
+    r"(?P<day>\d{1,2})\.(?P<month>\d{1,2})\.(?P<year>\d{4}|\d{2})",
+    r"(?P<day>\d{1,2})[-. /]{1,2}(?P<month>[^\W\d_]{3,9})[-. /]{1,2}(?P<year>\d{4}|\d{2})",
+    r"(?P<month>[^\W\d_]{3,9})[. ]{1,2}(?P<day>\d{1,2}),? (?P<year>\d{4})",
+    r"(?P<first>\d{1,2})(?P<stroke>[/-])(?P<second>\d{1,2})(?P=stroke)(?P<year>\d{4}|\d{2})",
+    "",
 )
-#: Groups of which a stamp has at least one.
-_TELLING = ("date", "days", "basic", "year_cjk", "year", "name", "name_first", "first", "clock")
+#: A number, which is no stamp but a date of eight digits.
+_PLAIN = re.compile(r"[+-]?\d*(?:[.,]\d*)?")
+_CLOCK = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,:]\d{1,9})?|[.,]\d{1,9})?|\d{6}(?:[.,]\d{1,9})?"
+_STAMPS = [
+    re.compile(
+        rf"{date},?(?:(?:^|[T\s_]|(?<=日))(?:\s*-)?\s*(?P<clock>{_CLOCK})\s?(?P<half>[AaPp]\.?[Mm]\.?)?)?\s*"
+        r"(?:Z|UTC|GMT|[+-]\d{2}:?\d{2})?"
+    )
+    for date in _DATES
+]
 #: Beginning of a month's name -> its number.
-_MONTHS = {beginning: int(number) for number, names in WORDS["month"].items() for beginning in names}
+_MONTHS = {beginning: number for number, names in WORDS["month"].items() for beginning in names}
 _LONGEST_STAMP = 64
 _SINCE = re.compile(r"(?P<unit>[a-z]{1,20})\s{1,9}since\s{1,9}(?P<start>.{1,64})", re.IGNORECASE)
 _LONG_UNITS = {"milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns", "days": "day", "day": "day"}
@@ -52,18 +60,23 @@ _EARLIEST_EPOCH = 1e8  # [s]: March 1973, and no recording lasts three years
 _Seconds = tuple[Array, dict[str, Any], list[str]]
 
 
-def _parsed_stamp(text: str) -> re.Match[str] | None:
+def _parsed_stamp(text: str) -> dict[str, str | None] | None:
+    """Return the parts of a stamp by the names of their groups; None for any other text."""
     text = text.strip()
-    match = _STAMP.fullmatch(text) if len(text) <= _LONGEST_STAMP else None
-    if match is None or not any(match[group] for group in _TELLING):
+    if len(text) > _LONGEST_STAMP or (_PLAIN.fullmatch(text) and len(text) != len("20240531")):
         return None
-    if match["clock"] and ":" not in match["clock"] and not match["basic"]:
+    match = next(filter(None, (stamp.fullmatch(text) for stamp in _STAMPS)), None)
+    if match is None or not (match["clock"] or len(match.groupdict()) > len(("clock", "half"))):
+        return None
+    parts, month = match.groupdict(), match.groupdict().get("month")
+    if match["clock"] and ":" not in match["clock"] and "plain" not in parts:
         return None  # six digits are a clock behind a date of eight alone
-    name = match["name"] or match["name_first"]
-    return None if name and _month(name) is None else match
+    if month and not month.isdecimal():
+        parts["month"] = _month(month)
+    return None if month and parts["month"] is None else parts
 
 
-def _month(name: str) -> int | None:
+def _month(name: str) -> str | None:
     name = name.casefold()
     return _MONTHS.get(name[:4], _MONTHS.get(name[:3]))
 
@@ -80,19 +93,19 @@ def stamps(cells: Sequence[str]) -> NDArray[np.datetime64]:
     begin with the day, but where the second number is over 12. Raises ValueError with the index of the first cell that
     is no stamp.
     """
-    matches = [_parsed_stamp(cell) for cell in cells]
-    day_first = any(match is not None and match["first"] and int(match["first"]) > 12 for match in matches)
+    parsed = [_parsed_stamp(cell) for cell in cells]
+    day_first = any(int(parts.get("first") or 0) > 12 for parts in parsed if parts is not None)
     plain: list[str] = []
-    for index, (cell, match) in enumerate(zip(cells, matches, strict=True)):
-        if match is None:
+    for index, (cell, parts) in enumerate(zip(cells, parsed, strict=True)):
+        if parts is None:
             if cell.strip():
                 raise ValueError(index)
             plain.append("NaT")
             continue
-        hour, colon, rest = _clock(match["clock"] or "00:00").partition(":")
-        if match["half"]:  # 12 AM is midnight, 12 PM is noon
-            hour = str(int(hour) % 12 + (12 if match["half"].lower() == "pm" else 0)) if 1 <= int(hour) <= 12 else "99"
-        plain.append(f"{_date_of(match, day_first)}T{hour:0>2}{colon}{rest}")
+        hour, colon, rest = _clock(parts["clock"] or "00:00").partition(":")
+        if half := parts["half"]:  # 12 AM is midnight, 12 PM is noon
+            hour = str(int(hour) % 12 + (12 if half.lower() == "pm" else 0)) if 1 <= int(hour) <= 12 else "99"
+        plain.append(f"{_date_of(parts, day_first)}T{hour:0>2}{colon}{rest}")
     try:
         return np.array(plain, dtype="datetime64[ns]")
     except ValueError:  # the 30th of February
@@ -125,25 +138,16 @@ def _clock(text: str) -> str:
     return f"00:{text:0>2}" if text.count(":") == 1 and "." in text else text
 
 
-def _date_of(match: re.Match[str], day_first: bool) -> str:
+def _date_of(parts: Mapping[str, str | None], day_first: bool) -> str:
     """Return the date of a stamp as ISO writes it; 1970-01-01 for the time of a day alone."""
-    if match["days"]:  # a length of time, as pandas writes it
-        return str(np.datetime64(_NO_DATE) + int(match["days"]))
-    if match["first"]:
-        first, second = match["first"], match["second"]
-        day_first = day_first or (match["stroke"] == "-" and int(second) <= 12)
-        year, month, day = match["year_last"], second if day_first else first, first if day_first else second
-    elif match["basic"]:
-        year, month, day = match["basic"][:4], match["basic"][4:6], match["basic"][6:]
-    elif name := match["name"] or match["name_first"]:
-        year, month = match["year_named"] or match["year_after"], str(_month(name))
-        day = match["day_named"] or match["day_after"]
-    elif match["year"] or match["year_cjk"]:
-        year, month = match["year"] or match["year_cjk"], match["month"] or match["month_cjk"]
-        day = match["day"] or match["day_cjk"]
-    else:
-        year, month, day = re.split("[-/.]", match["date"] or _NO_DATE)
-    return f"{'20' if len(year) == 2 else ''}{year}-{month:0>2}-{day:0>2}"
+    if days := parts.get("days"):
+        return str(np.datetime64(_NO_DATE) + int(days))
+    year, month, day = (parts.get(name) for name in ("year", "month", "day"))
+    first, second = parts.get("first"), parts.get("second")
+    if first and second:
+        day_first = day_first or (parts["stroke"] == "-" and int(second) <= 12)
+        month, day = (second, first) if day_first else (first, second)
+    return f"{'20' if len(year) == 2 else ''}{year}-{month:0>2}-{day:0>2}" if year else _NO_DATE
 
 
 def nominal_rate(t: Array) -> float:

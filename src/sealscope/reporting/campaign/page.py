@@ -11,17 +11,18 @@ from typing import Any
 import numpy as np
 
 from sealscope.campaigns.execution.store import RUN_BY_RUN
-from sealscope.campaigns.judging.judge import DetectorPod, Judgement, SizeRoc
+from sealscope.campaigns.judging.judge import AlarmShares, DetectorPod, Judgement, SizeRoc
 from sealscope.campaigns.judging.tables import PriorKnowledge
 from sealscope.campaigns.plans.detectors import DIAGNOSE, plan_detector
 from sealscope.campaigns.plans.model import HeldOutPlan, RecordedPlan, SimulatedPlan
 from sealscope.campaigns.results import CampaignResult
 from sealscope.diagnosis.registry import detectors
+from sealscope.evaluation.binomial import Proportion
 from sealscope.evaluation.roc import Area
-from sealscope.evaluation.table import SummaryRow
 from sealscope.recordings.channels import Array
 from sealscope.reporting import template
 from sealscope.reporting.campaign.tables import cause_tables, page_tables, percent
+from sealscope.reporting.messages import say
 from sealscope.reporting.picture import Scale
 
 PAGE = "report.html"
@@ -49,14 +50,14 @@ def main_table(result: CampaignResult) -> tuple[list[str], list[list[str]]]:
     judgement = result.judgement
     sizes = sizes_of(judgement)
     rows = judgement.overall if math.isnan(sizes[0]) else judgement.table
-    by_detector: dict[str, dict[str, SummaryRow]] = defaultdict(dict)
+    by_detector: dict[str, dict[str, AlarmShares]] = defaultdict(dict)
     for row in rows:
         by_detector[row.detector][f"{row.leak_lpm}"] = row
     pods = {pod.detector: pod for pod in judgement.pods}
     areas = {roc.detector: _area(roc.area) for roc in judgement.rocs if math.isnan(roc.leak_lpm)}
     table = []
     for name, own in by_detector.items():
-        cells = [percent(own[f"{size}"].detection) if f"{size}" in own else "–" for size in sizes]
+        cells = [percent(own[f"{size}"].alarms) if f"{size}" in own else "–" for size in sizes]
         given = [_given(result.known.get(name))] if result.known else []
         alarms = percent(next(iter(own.values())).false_alarm)
         table.append([name, *given, alarms, *cells, areas.get(name, "–"), *_smallest(pods.get(name))])
@@ -93,13 +94,13 @@ def result_text(result: CampaignResult) -> str:
         if not rows:
             continue
         largest = max(rows, key=lambda row: row.leak_lpm)
-        finding = f"finds {percent(largest.detection)} of leaks of {largest.leak_lpm:g} {unit}"
+        finding = f"finds {percent(largest.alarms)} of leaks of {largest.leak_lpm:g} {unit}"
         a90 = math.inf
         if pod.curve is not None and pod.curve.a90 <= largest.leak_lpm:
             a90 = pod.curve.a90
             finding = f"finds 9 in 10 leaks of {a90:.2g} {unit}"
         text = f"{pod.detector} {finding} at {percent(largest.false_alarm)} false alarms."
-        said.append((a90, -largest.detection.value, text))
+        said.append((a90, -largest.alarms.value, text))
     said.sort(key=lambda item: item[:2])
     shown = [text for _, _, text in said[:_MOST_SAID]]
     more = len(said) - len(shown)
@@ -122,65 +123,42 @@ def campaign_text(result: CampaignResult) -> str:
 def _notes(result: CampaignResult) -> list[str]:
     """Return what stands under the table, in whole sentences."""
     judgement, plan = result.judgement, result.plan
-    notes = [
-        f"Fractions with their {100 * plan.confidence:g} % intervals; a90, a90/95 in {plan.unit} from the curve "
-        "through hits and misses."
-    ]
+    simulated = isinstance(plan, SimulatedPlan)
+    notes = [_say("intervals", share=100 * plan.confidence, unit=plan.unit)]
     if isinstance(plan, HeldOutPlan):
-        notes.append(f"Each {plan.leave_out} was held out whole in turn; an alarm is a probability over 50 %.")
+        notes.append(_say("held_out", group=plan.leave_out))
     else:
+        share = 100 * plan.false_alarm
         if judgement.thresholds:
-            records, others = "recordings", "others"
-            if isinstance(plan, SimulatedPlan):
-                records, others = "records", "others, each with seeds of its own"
-            notes.append(
-                f"Thresholds for {100 * plan.false_alarm:g} % false alarms from {judgement.leak_free} leak-free "
-                f"{records}; judged on {judgement.judged} {others}."
-            )
+            key = "thresholds_of_records" if simulated else "thresholds_of_recordings"
+            notes.append(_say(key, share=share, leak_free=judgement.leak_free, judged=judgement.judged))
         own = [name for name in plan.detectors if plan_detector(name).scorer is None]
-        if own:
-            notes.append(
-                f"By their own verdict at {100 * plan.false_alarm:g} % false alarms: {', '.join(own)}. "
-                "What they state of flow, onset and cause is in estimates.csv, onsets.csv and causes.csv."
-            )
+        notes += [_say("own_verdict", share=share, detectors=", ".join(own))] if own else []
+    with_onset = [name for name, known in result.known.items() if known.onset]
+    notes += [_say("true_onset", detectors=", ".join(with_onset))] if with_onset else []
     notes += _known_notes(result)
-    if _batched(result):
-        notes.append(
-            f"Simulated {result.mode}: of each record only the RMS of the details on both sides of the onset was "
-            "stored. Seeds draw the same machines as run by run, and other noise of the same law."
-        )
+    notes += [_say("batched", mode=result.mode)] if _batched(result) else []
     notes += [check.sentence() for check in result.checks]
-    if plan.note:
-        notes.append(plan.note)
-    if result.missing:
-        notes.append(f"Not complete: {result.missing} records of the plan have no row yet.")
-    if judgement.failed:
-        notes.append(f"{len(judgement.failed)} records failed; those to judge count as cannot tell for every detector.")
+    notes += [plan.note] if plan.note else []
+    notes += [_say("missing", count=result.missing)] if result.missing else []
+    notes += [_say("failed", count=len(judgement.failed))] if judgement.failed else []
     return notes
+
+
+def _say(name: str, **values: Any) -> str:
+    return say(f"campaign.{name}", **values)
 
 
 def _known_notes(result: CampaignResult) -> list[str]:
-    """Return which detectors knew the true onset, which channels they saw and which rig they assume."""
-    notes = []
-    with_onset = [name for name, known in result.known.items() if known.onset]
-    if with_onset:
-        notes.append(
-            "Given the true onset, which no machine in service gives, a scorer splits the record where the leak opens: "
-            f"{', '.join(with_onset)}."
-        )
-    by_channels: dict[tuple[str, ...], list[str]] = {}
-    by_rig: dict[str, list[str]] = {}
+    """Return which channels the detectors were given and which rig they assume."""
+    by_channels: dict[str, list[str]] = defaultdict(list)
+    by_rig: dict[str, list[str]] = defaultdict(list)
     for name, known in result.known.items():
-        by_channels.setdefault(known.channels, []).append(name)
-        by_rig.setdefault(known.rig, []).append(name)
-    if len(by_channels) == 1:
-        notes.append(f"Channels given: {', '.join(next(iter(by_channels)))}.")
-    else:
-        notes += [
-            f"Channels given: {', '.join(channels)} to {', '.join(names)}." for channels, names in by_channels.items()
-        ]
-    notes += [f"Rig {rig} assumed by {', '.join(names)}." for rig, names in by_rig.items() if rig]
-    return notes
+        by_channels[", ".join(known.channels)].append(name)
+        by_rig[known.rig].append(name)
+    key = "channels" if len(by_channels) == 1 else "channels_of"
+    notes = [_say(key, channels=channels, detectors=", ".join(names)) for channels, names in by_channels.items()]
+    return notes + [_say("rig", rig=rig, detectors=", ".join(names)) for rig, names in by_rig.items() if rig]
 
 
 def _batched(result: CampaignResult) -> bool:
@@ -318,13 +296,8 @@ def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:
         known = ((pod.curve.a90, "a90"), (pod.curve.a90_95, "a90/95"))
         marks = [(size, label) for size, label in known if math.isfinite(size) and size <= grid[-1]]
     scale = Scale(WIDTH, HEIGHT, (math.log10(ends[0]) - 0.02, math.log10(ends[1]) + 0.02), (0.0, 1.0), log=True)
-    points = []
-    for at in pod.sizes if len(pod.sizes) <= _MOST_POINTS else ():
-        own = at.proportion
-        points.append((float(scale.x(at.size)), *map(float, scale.y(np.array([own.value, own.high, own.low])))))
-    labels = {"title": f"Detection over leak size, {pod.detector}", "x_label": f"leak [{unit}]"}
-    marked = [(float(scale.x(size)), label) for size, label in marks]
-    return {**_drawn(scale, curves), **labels, "points": points, "marks": marked}
+    points = [(at.size, at.proportion) for at in pod.sizes] if len(pod.sizes) <= _MOST_POINTS else []
+    return _plot(scale, f"Detection over leak size, {pod.detector}", f"leak [{unit}]", curves, points, marks)
 
 
 def _roc_plot(rocs: Sequence[SizeRoc], unit: str) -> dict[str, Any] | None:
@@ -336,16 +309,23 @@ def _roc_plot(rocs: Sequence[SizeRoc], unit: str) -> dict[str, Any] | None:
         for roc in rocs
         for own in [roc.curve]
     ]
-    labels = {"title": f"Detection over false alarms, {rocs[0].detector}", "x_label": "false alarms"}
     scale = Scale(WIDTH, HEIGHT, (0.0, 1.0), (0.0, 1.0))
-    return {**_drawn(scale, curves), **labels, "points": [], "marks": []}
+    return _plot(scale, f"Detection over false alarms, {rocs[0].detector}", "false alarms", curves)
 
 
-def _drawn(scale: Scale, curves: Sequence[tuple[str, Array, Array, tuple[Array, Array] | None]]) -> dict[str, Any]:
-    """Return the curves (label, x, y, ends of the band) as a template draws them, of long ones some points."""
+def _plot(
+    scale: Scale,
+    title: str,
+    x_label: str,
+    curves: Sequence[tuple[str, Array, Array, tuple[Array, Array] | None]],
+    points: Sequence[tuple[float, Proportion]] = (),
+    marks: Sequence[tuple[float, str]] = (),
+) -> dict[str, Any]:
+    """Return what the template draws; of long curves (label, x, y, ends of the band) some points."""
     paths, bands = [], []
     for label, x, y, ends in curves:
         kept = np.unique(np.linspace(0, x.size - 1, min(x.size, _MOST_DRAWN)).round().astype(np.int64))
         paths.append((label, scale.path(x[kept], y[kept], 2)))
         bands += [] if ends is None else [scale.band(x[kept], ends[0][kept], ends[1][kept])]
-    return {"scale": scale, "paths": paths, "bands": bands, **scale.ticks(5, 5)}
+    drawn = {"title": title, "x_label": x_label, "scale": scale, "paths": paths, "bands": bands}
+    return {**drawn, "points": points, "marks": marks, **scale.ticks(5, 5)}

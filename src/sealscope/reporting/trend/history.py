@@ -15,7 +15,7 @@ from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
 from sealscope.reporting import charts, messages, template
-from sealscope.reporting.trend.page import SIZES, Scale, with_margin
+from sealscope.reporting.trend.page import level_chart
 from sealscope.reporting.trend.text import stamp
 
 
@@ -61,17 +61,16 @@ def render_history_page(judged: Sequence[Judged], title: str, left_out: int = 0)
         rows=rows[::-1],
         undated=sum(own.start_s is None for own in ordered),
         left_out=left_out,
-        pictures=[(size, picture) for size in SIZES if (picture := history_chart(ordered, size)) is not None],
+        levels=history_chart(ordered),
         charts=shown,
-        still={} if drawn is None else drawn.still,
-        events=[] if drawn is None else charts.events(newest, drawn.data["span"], []),
+        drawn=drawn,
         files=files,
         chart_data=None if drawn is None else drawn.data,
     )
 
 
-def history_chart(ordered: Sequence[Judged], size: str) -> dict[str, Any] | None:
-    """Return what the template draws of recordings in their order, in a box of one of `SIZES`.
+def history_chart(ordered: Sequence[Judged]) -> dict[str, Any] | None:
+    """Return what the template draws of recordings in their order.
 
     Days of their dates, numbers from 1 where a date is not known. None where no recording states a figure or a bound.
     """
@@ -85,24 +84,23 @@ def history_chart(ordered: Sequence[Judged], size: str) -> dict[str, Any] | None
     far = 8.0 * float(np.median([lpm for lpm, *_ in known])) or math.inf  # beyond it others would be pressed flat
     near = [value for lpm, _, high in known for value in (lpm, high) if value <= far and value < math.inf]
     near += [] if limit is None or limit > far else [limit]
-    scale = Scale(size, with_margin(days[0], days[-1]), (0.0, 1.08 * max(near, default=0.0) or 1.0))
-    drawn: dict[str, list[Any]] = {"points": [], "bounds": [], "beyond": [], "absent": []}
+    top = 1.08 * max(near, default=0.0) or 1.0
+    drawn: dict[str, list[Any]] = {"points": [], "bounds": [], "beyond": []}
     for own, day, level in zip(ordered, days, levels, strict=True):
         if level is None:
-            drawn["absent"].append(scale.x(day))
             continue
         lpm, low, high = level
         title = f"{Path(own.diagnosis.file).name}: {messages.flow(own.diagnosis)}"
-        mark = {"x": scale.x(day), "y": scale.y(lpm), "kind": "first", "title": title}
-        if lpm > scale.levels[1]:
-            drawn["beyond"].append(mark)
-        elif low is None:
-            drawn["bounds"].append(mark)
-        else:
-            drawn["points"].append(mark | {"low": scale.y(low), "high": scale.y(high)})
-    ticks = [day for day in scale.day_ticks(days[0]) if dated or day.is_integer()]
-    labels = [stamp(day * DAY, days[-1] - days[0]) if dated else f"{day:g}" for day in ticks]
-    return scale.picture(list(zip(map(scale.x, ticks), labels, strict=True)), limit=scale.limit(limit), **drawn)
+        kind = "beyond" if lpm > top else "bounds" if low is None else "points"
+        drawn[kind].append(
+            {"day": day, "level": lpm, "low": low, "high": min(high, top), "kind": "first", "title": title}
+        )
+
+    def moment(day: float) -> str:
+        return stamp(day * DAY, days[-1] - days[0]) if dated else f"{day:g}" if day.is_integer() else ""
+
+    absent = [day for day, level in zip(days, levels, strict=True) if level is None]
+    return level_chart((days[0], days[-1]), (0.0, top), limit, moment, absent=absent, **drawn)
 
 
 def _level(diagnosis: Diagnosis) -> _Level | None:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import dataclass
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from sealscope.diagnosis.trend.trend import Trend
 from sealscope.diagnosis.trend.wear import MONTH, Episode
 from sealscope.reporting import messages, template
-from sealscope.reporting.picture import ticks
+from sealscope.reporting.picture import Scale
 from sealscope.reporting.trend import text
 
 #: Sizes of the picture: for a screen, and for a telephone; the margins round its frame.
@@ -35,100 +38,78 @@ def render_trend_page(trend: Trend, *, title: str = "") -> str:
         figures=text.figures(trend),
         title=title or "Trend of a machine",
         n=messages.number,
-        charts=[(size, chart) for size in SIZES if (chart := chart_of(trend, size)) is not None],
+        chart=chart_of(trend),
     )
 
 
-@dataclass(frozen=True)
-class Scale:
-    """Where days and levels stand in a picture of one of `SIZES`, inside its frame."""
+def level_chart(
+    days: tuple[float, float],
+    levels: tuple[float, float],
+    limit: float | None,
+    moment: Callable[[float], str],
+    **shown: list[Any],
+) -> dict[str, Any]:
+    """Return levels over days as the template draws them: what is shown, and the picture of each of `SIZES`.
 
-    size: str
-    days: tuple[float, float]
-    levels: tuple[float, float]
-
-    def x(self, day: float) -> float:
-        """Return where a day stands."""
-        (first, last), width = self.days, SIZES[self.size][0]
-        return _LEFT + (day - first) / (last - first) * (width - _LEFT - _RIGHT)
-
-    def y(self, level: float) -> float:
-        """Return where a level stands; at the frame where it is beyond."""
-        (low, high), height = self.levels, SIZES[self.size][1]
-        return _TOP + (high - min(max(level, low), high)) / (high - low) * (height - _TOP - _BOTTOM)
-
-    def limit(self, level: float | None) -> float | None:
-        """Return where a limit stands, None for one above the frame."""
-        return None if level is None or level > self.levels[1] else self.y(level)
-
-    def day_ticks(self, origin: float) -> list[float]:
-        """Return days for ticks, round distances from `origin` apart, as many as have room."""
-        first, last = self.days
-        most = SIZES[self.size][0] / 110.0
-        step = next((step for step in _STEPS if (last - first) / step <= most), _STEPS[-1])
-        begin = math.ceil((first - origin) / step - 1e-9)
-        return [origin + step * k for k in range(begin, math.floor((last - origin) / step) + 1)]
-
-    def picture(self, x_ticks: list[tuple[float, str]], **shown: Any) -> dict[str, Any]:
-        """Return what the template draws: the frame, its ticks, and what is shown in it."""
-        width, height = SIZES[self.size]
-        nothing = {name: () for name in ("points", "course", "bands", "marks", "bounds", "beyond", "absent")}
-        return {
-            "width": width,
-            "height": height,
-            "left": _LEFT,
-            "right": width - _RIGHT,
-            "top": _TOP,
-            "bottom": height - _BOTTOM,
-            "x_ticks": x_ticks,
-            "y_ticks": [(self.y(level), f"{level:.6g}") for level in ticks(*self.levels, 4)],
-            **nothing,
-            **shown,
-        }
+    `days`: of the first and the last recording, with a tick at the first; `levels`: ends of the axis; `limit`: drawn
+    where it is on the axis; `moment`: a day in words; `shown`: points, bands and the like, in days and levels.
+    """
+    margin = 0.02 * (days[1] - days[0]) or 0.5
+    first, last = days[0] - margin, days[1] + margin
+    pictures = []
+    for size, (width, height) in SIZES.items():
+        scale = Scale(width - _LEFT - _RIGHT, height - _TOP - _BOTTOM, (first, last), levels)
+        step = next((step for step in _STEPS if (last - first) / step <= width / 110.0), _STEPS[-1])
+        ticks_of_days = np.arange(days[0], last, step).tolist()
+        pictures.append(
+            {
+                "size": size,
+                "width": width,
+                "height": height,
+                "left": _LEFT,
+                "top": _TOP,
+                "scale": scale,
+                "x_ticks": [(float(scale.x(day)), moment(day)) for day in ticks_of_days],
+                "y_ticks": scale.ticks(1, 4)["y_ticks"],
+            }
+        )
+    nothing = {name: () for name in ("points", "course", "bands", "marks", "bounds", "beyond", "absent")}
+    return {"pictures": pictures, "limit": None if limit is None or limit > levels[1] else limit, **nothing, **shown}
 
 
-def chart_of(trend: Trend, size: str) -> dict[str, Any] | None:
-    """Return what the template draws, in a box of one of `SIZES`; None where no recording states a level."""
+def chart_of(trend: Trend) -> dict[str, Any] | None:
+    """Return what the template draws of a trend; None where no recording states a level."""
     known = [point for point in trend.points if point.value is not None]
     if not known or trend.wear is None:
         return None
-    scale = Scale(size, with_margin(trend.points[0].day, trend.points[-1].day), _levels(trend))
     points = [
         {
-            "x": scale.x(point.day),
-            "y": scale.y(point.value or 0.0),
-            "low": scale.y(point.low or 0.0),
-            "high": scale.y(point.high or 0.0),
+            "day": point.day,
+            "level": point.value,
+            "low": point.low or 0.0,
+            "high": point.high or 0.0,
             "kind": "apart" if point.note else "first" if point.group == 0 else "other",
             "title": f"{point.file}: {point.value:.3g} {trend.unit}",
         }
         for point in known
     ]
     days = [trend.points[row].day for row in trend.rows]
-    course, bands, marks = [], [], []
-    for own in trend.episodes:
-        line, healthy = _course(days, own), own.wear.healthy
-        course.append("M" + "L".join(f"{scale.x(day):.1f} {scale.y(level):.1f}" for day, level in line))
-        left, right = scale.x(days[own.begin]), scale.x(days[min(own.end, len(days) - 1)])
-        top, bottom = scale.y(healthy.high), scale.y(healthy.low)
-        bands.append({"x": left, "width": max(right - left, 2.0), "y": top, "height": max(bottom - top, 1.0)})
-        marks += [] if own.alarm is None else [{"x": scale.x(days[own.alarm]), "kind": ""}]
-    marks += [{"x": scale.x(point.day), "kind": "other"} for point in trend.repairs]
-    return scale.picture(
-        [(scale.x(day), text.moment(trend, day)) for day in scale.day_ticks(trend.points[0].day)],
+    bands = [
+        (days[own.begin], days[min(own.end, len(days) - 1)], own.wear.healthy.low, own.wear.healthy.high)
+        for own in trend.episodes
+    ]
+    marks = [(days[own.alarm], "") for own in trend.episodes if own.alarm is not None]
+    return level_chart(
+        (trend.points[0].day, trend.points[-1].day),
+        _levels(trend),
+        trend.limit,
+        partial(text.moment, trend),
         points=points,
-        course=course,
+        course=[np.transpose(_course(days, own)) for own in trend.episodes],
         bands=bands,
-        marks=marks,
-        limit=scale.limit(trend.limit),
-        absent=[scale.x(point.day) for point in trend.points if point.value is None],
+        marks=[*marks, *((point.day, "other") for point in trend.repairs)],
+        absent=[point.day for point in trend.points if point.value is None],
     )
-
-
-def with_margin(first: float, last: float) -> tuple[float, float]:
-    """Return the ends of the axis of days from the first to the last."""
-    margin = 0.02 * (last - first) or 0.5
-    return first - margin, last + margin
 
 
 def _levels(trend: Trend) -> tuple[float, float]:

@@ -14,14 +14,7 @@ from sealscope.diagnosis.inference.onset import Interval
 from sealscope.diagnosis.trend.reading import DAY
 from sealscope.diagnosis.trend.trend import Trend
 from sealscope.recordings.formats.columns import counted
-from sealscope.reporting.messages import machine_text, number
-
-_BASES = {
-    None: "",
-    "volume balance": "Levels by the volume balance. ",
-    "pressure response": "Levels by the pressures' response. ",
-    "ringing": "Levels: the damping of the pressures' ringing, relative: no L/min. ",
-}
+from sealscope.reporting.messages import machine_text, number, say
 
 
 def moment(trend: Trend, day: float) -> str:
@@ -46,23 +39,24 @@ def recordings(trend: Trend) -> str:
 
 def headline(trend: Trend) -> str:
     """Return verdict and what it rests on, in one line."""
-    wear = trend.wear
-    since = "" if wear is None or wear.onset is None else f" since {moment(trend, wear.onset.value)}"
+    wear, line, since = trend.wear, "trend", ""
     if trend.verdict == "no leak" and trend.repairs:  # what was before is over
-        since = f" since {moment(trend, trend.repairs[-1].day)}, when the level fell"
-    return f"{trend.verdict}{since}: {recordings(trend)}"
+        line, since = "trend_fell", moment(trend, trend.repairs[-1].day)
+    elif wear is not None and wear.onset is not None:
+        line, since = "trend_since", moment(trend, wear.onset.value)
+    return say(f"terminal.{line}", verdict=trend.verdict, since=since, recordings=recordings(trend))
 
 
 def sentence(trend: Trend) -> str:
     """Return the verdict as a sentence."""
+    key = "ringing"
     if trend.verdict == "no leak":
-        fell = f", since {moment(trend, trend.repairs[-1].day)}" if trend.repairs else ""
-        return f"The leakage does not grow{fell}"
-    if trend.alarm is None or trend.wear is None:
-        return "Cannot tell"
-    if trend.verdict == "leak":
-        return "The leakage grows" if trend.wear.step is None else "The leakage stepped up"
-    return "The ringing of the pressures changed; a leak cannot be separated from other causes"
+        key = "fell" if trend.repairs else "no leak"
+    elif trend.alarm is None or trend.wear is None:
+        key = "cannot tell"
+    elif trend.verdict == "leak":
+        key = "grows" if trend.wear.step is None else "stepped"
+    return say(f"trend_headline.{key}", since=moment(trend, trend.repairs[-1].day) if trend.repairs else "")
 
 
 def figures(trend: Trend) -> dict[str, str]:
@@ -124,9 +118,10 @@ def assumed(trend: Trend) -> str:
         machine = "No L/min: area and displacement of this machine are not stated (--rig, --area, --displacement). "
         if trend.unit == "L/min":
             machine = f"L/min rest on {machine_text(trend.machine)}. "
+    basis = "" if trend.basis is None else say(f"trend_basis.{trend.basis}")
     known = "taken out" if any(point.temperature is not None for point in trend.points) else "not known"
     first = "The first recording is" if trend.healthy == 1 else f"The first {trend.healthy} recordings are"
-    return f"{_BASES[trend.basis]}{machine}The oil's temperature is {known}. {first} taken to be of a healthy machine."
+    return f"{basis}{machine}The oil's temperature is {known}. {first} taken to be of a healthy machine."
 
 
 def limit_note(trend: Trend) -> str:
