@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import zip_longest
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from sealscope.recordings.recording import Array
 if TYPE_CHECKING:
     from sealscope.physics.rig import RigNumbers
 
+T = TypeVar("T", float, Array)
 #: Longest time [s] over which a changing number is held, and the shortest (unless something jumps within it).
 LONGEST_BLOCK, SHORTEST_BLOCK = 0.5, 0.05
 #: Most that a drifting parameter changes from one block of the solver to the next, relative.
@@ -64,16 +65,19 @@ class Effect:
         return self.field.startswith("sensors.")
 
 
+def changed(own: T, effects: Sequence[Effect], field: str, t: Array) -> T | Array:
+    """Return a number at times t [s]: (own value + sum of what is added to it) x product of its factors."""
+    value: T | Array = own
+    for effect in sorted(effects, key=lambda effect: not effect.added):  # sums before products
+        if effect.field == field:
+            value = value + effect.change(t) if effect.added else value * effect.change(t)
+    return value
+
+
 def values_of(effects: Sequence[Effect], base: RigNumbers, t: Array) -> dict[str, Array]:
     """Return the numbers of `base` that change, by name, at times t [s]."""
-    values: dict[str, Array] = {}
-    for effect in sorted(effects, key=lambda effect: not effect.added):  # sums before products
-        own = values.get(effect.field)
-        if own is None:
-            own = np.full(t.size, float(getattr(base, effect.field)))
-        change = effect.change(t)
-        values[effect.field] = own + change if effect.added else own * change
-    return values
+    names = dict.fromkeys(effect.field for effect in effects)
+    return {name: changed(np.full(t.size, float(getattr(base, name))), effects, name, t) for name in names}
 
 
 def moved_per_block(effect: Effect, bounds: np.ndarray, rate: float) -> Array:
@@ -176,11 +180,7 @@ class Readings:
 
     def value(self, parameter: str, own: float, t: Array) -> Array | float:
         """Return the parameter at times t [s], its own value where nothing changes it."""
-        value: Array | float = own
-        for effect in sorted(self.effects, key=lambda effect: not effect.added):
-            if effect.field == parameter:
-                value = value + effect.change(t) if effect.added else value * effect.change(t)
-        return value
+        return changed(own, self.effects, parameter, t)
 
     def held(self, channel: str, read: Array, t: Array) -> Array:
         """Return the readings (n,) with every hold of this channel in them."""

@@ -16,6 +16,7 @@ import numpy as np
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.chambers import CHAMBERS, PRESSURES
 from sealscope.recordings.recording import Array
+from sealscope.signals.windows import rms
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.instruments import decimate, lagging
 from sealscope.simulation.integrate import oversampling, trajectory
@@ -66,10 +67,6 @@ def clean_channels(
     return np.stack([decimate(values, factor, n) for values in behind])
 
 
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
 def _settled(name: str, channels: tuple[str, ...], first: float, quotient: Callable[[float], Array]) -> Sensitivity:
     """Return the derivative at a step over which the answer is a straight line.
 
@@ -78,8 +75,8 @@ def _settled(name: str, channels: tuple[str, ...], first: float, quotient: Calla
     step, coarse = first, quotient(first)
     for _ in range(_MOST_HALVINGS):
         fine = quotient(step / 2.0)
-        size = _rms(fine)
-        nonlinearity = _rms(coarse - fine) / size if size > 0.0 else 0.0
+        size = rms(fine.ravel())
+        nonlinearity = rms((coarse - fine).ravel()) / size if size > 0.0 else 0.0
         if nonlinearity <= LINEARITY:
             return Sensitivity(name, channels, fine, step, nonlinearity)
         step, coarse = step / 2.0, fine
