@@ -67,17 +67,12 @@ class Reproduction:
         """Return the products of an item that the folder holds; None where it has none of these sources."""
         return self.folder.products(name, self._key(self.items[name]))
 
-    def look(self) -> dict[str, ItemStatus]:
-        """Return the status of every item as the folder has it: kept, left out or not made."""
-        statuses = {}
-        for name, item in self.items.items():
-            if self._left_out(item):
-                statuses[name] = ItemStatus(item, "left out", MISSING)
-            elif (files := self.folder.files(name, self._key(item))) is None:
-                statuses[name] = ItemStatus(item, "not made")
-            else:
-                statuses[name] = ItemStatus(item, "kept", files=files)
-        return statuses
+    def status(self, item: Item) -> ItemStatus:
+        """Return the status of an item as the folder has it: kept, left out or not made."""
+        if self._left_out(item):
+            return ItemStatus(item, "left out", MISSING)
+        files = self.folder.files(item.id, self._key(item))
+        return ItemStatus(item, "not made" if files is None else "kept", files=files or ())
 
     def make(self, name: str) -> ItemStatus:
         """Make and draw an item; the status holds the reason of a failure."""
@@ -142,7 +137,7 @@ def reproduce(
     chosen = with_needed(every, select_items(every, patterns))
     result = Reproduction(Path(folder), every, quick, find_sheet(sheet), publish)
     with result.folder.locked():
-        result.statuses = result.look()
+        result.statuses = {item.id: result.status(item) for item in every}
         waiting = [item for item in chosen if result.statuses[item.id].state == "not made"]
         total, ended, in_work = len(waiting), 0, list[str]()
 
