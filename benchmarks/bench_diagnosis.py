@@ -25,7 +25,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.inference.live.stream import SequentialBalance
+from sealscope.diagnosis.live.watch import Watch
+from sealscope.parameters import load_rig
 from sealscope.recordings import Recording, write
 from sealscope.simulation.simulate import simulate
 
@@ -90,10 +91,10 @@ def of_many(count: int, duration: float, cores: int) -> float:
 
 
 def streamed(recording: Recording) -> None:
-    """The volume balance's stream of a recording, in blocks of its own length."""
-    balance = SequentialBalance("thesis-closed-loop", alarms_per_hour=1.0)
+    """The watch of a recording, in blocks of its own length."""
+    watch = Watch(load_rig("thesis-closed-loop"), 1000.0, 1000.0)
     for start in range(0, int(recording.duration), 3):
-        balance.update(recording.between(start, start + 3))
+        watch.update(recording.between(start, start + 3))
 
 
 def main() -> None:
@@ -118,11 +119,11 @@ def main() -> None:
     }
     pressures = [recording.only(["u", "p_A", "p_B"]) for recording in (healthy[0], leaky)]
     cases |= {
-        "the judge alone, no leak": lambda: diagnose(healthy[0], quick=True),
-        "the judge alone, leak": lambda: diagnose(leaky, quick=True),
+        "the judge alone, no leak": lambda: diagnose(healthy[0]),
+        "the judge alone, leak": lambda: diagnose(leaky),
         "pressures and command, no leak": lambda: diagnose(pressures[0]),
         "pressures and command, leak": lambda: diagnose(pressures[1]),
-        "the judge alone, from pressures": lambda: diagnose(pressures[0], quick=True),
+        "the judge alone, from pressures": lambda: diagnose(pressures[0]),
     }
     for command in COMMANDS:
         record = simulate(command=command, seed=1, leak="0.0042 L/min from 90 s")

@@ -28,7 +28,7 @@ from sqlalchemy import select
 
 import sealscope as ss
 from sealscope.monitor.actuators import WatchedActuators
-from sealscope.monitor.memory.store import MonitorStore
+from sealscope.monitor.database.store import MonitorStore
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import ActuatorSettings, MonitorSettings
 from sealscope.monitor.sources.source_block import decoded

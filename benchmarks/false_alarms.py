@@ -26,8 +26,7 @@ from sealscope.diagnosis.registry import DETECTORS
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.instruments import record
-from sealscope.simulation.integrate import oversampling, trajectory
-from sealscope.simulation.sizing import sized_leaks
+from sealscope.simulation.integrate import oversampling, sized_leaks, trajectory
 
 COMMANDS = ("3 sin(4t)", "5 sin(2t)", "7 sin(4t)", "8 sin(t)")
 LEAKS = (0.0042, 0.015)

@@ -35,7 +35,7 @@ from paho.mqtt.enums import MQTTProtocolVersion
 from sqlalchemy import create_engine, inspect, text
 
 import sealscope as ss
-from sealscope.monitor.memory.tables import metadata
+from sealscope.monitor.database.tables import metadata
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import MonitorSettings
 from sealscope.monitor.sources import broker as _loaded  # noqa: F401 (here, not by each monitor anew)

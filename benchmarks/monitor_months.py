@@ -41,7 +41,7 @@ from threadpoolctl import threadpool_limits
 
 import sealscope as ss
 from sealscope.diagnosis.beliefs import beliefs
-from sealscope.diagnosis.inference.live.balance import BlockConductance, LiveBalance, NotJudged, size_error
+from sealscope.diagnosis.live.balance import BlockConductance, LiveBalance, NotJudged, size_error
 
 RESULTS = Path(__file__).parent / "results" / "monitor_months.csv"
 SHIFT_S, DAY_S = 16 * 3600.0, 24 * 3600.0

@@ -28,10 +28,10 @@ from bench_monitor import CHANNELS, resident
 from cbor2 import CBORTag
 
 import sealscope as ss
+from sealscope.diagnosis.live.watch import Watch
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import MonitorSettings
 from sealscope.monitor.sources.source_block import BlockReceiver, decoded
-from sealscope.monitor.stream.watch import Watch
 
 DAY = 86_400
 #: The duty has a cycle of 1 s, so that its end joins its beginning; so long it settles, and so long it is repeated [s].

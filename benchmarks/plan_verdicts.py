@@ -44,7 +44,7 @@ def judged(plan_name: str, records: int, false_alarm: float, channels: str) -> d
         simulated = simulate_with_truth(experiment_of(plan, case))
         kind, started = kinds[case.leak_lpm, case.fault], time.process_time()
         viewed = simulated.recording.only(channels.split(",")) if channels else simulated.recording
-        verdict = diagnose(viewed, rig=plan.rig, false_alarm_probability=false_alarm, quick=True)
+        verdict = diagnose(viewed, rig=plan.rig, false_alarm_probability=false_alarm)
         kind.seconds.append(time.process_time() - started)
         kind.verdicts.append(verdict.verdict)
         if verdict.bound_lpm is not None:

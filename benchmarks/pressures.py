@@ -1,32 +1,25 @@
-"""Verdicts from pressures and command, and evidence by provider, on machines that they were developed on.
+"""Verdicts from pressures and command on machines that they were developed on.
 
-    python benchmarks/pressures.py detector --machines 24 --seed 91 --leaks 0 0.0042 0.05 0.5
-    python benchmarks/pressures.py detector --machines 28 --seed 94 --families --leaks 0 0.0042
-    python benchmarks/pressures.py detector --machines 8 --seed 91 --leaks 0 --fault "friction +20 %"
-    python benchmarks/pressures.py ring_down --machines 24 --seed 91 --leaks 0 0.0042 0.015
-    python benchmarks/pressures.py response --machines 24 --seed 91 --leaks 0 0.0042 0.1 0.5
+    python benchmarks/pressures.py --machines 24 --seed 91 --leaks 0 0.0042 0.05 0.5
+    python benchmarks/pressures.py --machines 28 --seed 94 --families --leaks 0 0.0042
+    python benchmarks/pressures.py --machines 8 --seed 91 --leaks 0 --fault "friction +20 %"
 
 Machines of the profile `bench`, 180 s at 500 Hz, the leak by either law in turn from 90 s on, or a fault; `--families`:
-of the development families of `unmodelled` in turn. By a provider a machine counts as found where the step of the
-conductance has a chance below `--false-alarm` (`sealscope.diagnosis.inference.onset`), by the detector where the
-verdict is `leak`; its other verdicts and causes are counted. The time is that of a core.
+of the development families of `unmodelled` in turn. A machine counts as found where the verdict is `leak`; other
+verdicts and causes are counted. The time is that of a core.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib
 import time
 from collections import Counter
 from dataclasses import replace
-from functools import partial
-from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
 
 from sealscope.campaigns.cases.machines import sized_once
-from sealscope.diagnosis.inference.onset import step_test
 from sealscope.diagnosis.inference.pressures.detector import PressureResponse
 from sealscope.diagnosis.inference.pressures.evidence import BELIEVED
 from sealscope.parameters import Rig, load_rig
@@ -51,24 +44,15 @@ class Answer(NamedTuple):
     words: str = ""
 
 
-def by_detector(recording: Recording, rig: Rig, false_alarm: float) -> Answer:
+def answer(recording: Recording, rig: Rig, false_alarm: float) -> Answer:
     evidence = PressureResponse(rig).examine(recording, [], false_alarm)
     if evidence.verdict != "leak":
         return Answer(False, words=evidence.summary)
     return Answer(True, evidence.leak_lpm, evidence.leak_interval_lpm, evidence.onset_s, evidence.summary)
 
 
-def by_provider(provider: ModuleType, recording: Recording, rig: Rig, false_alarm: float) -> Answer:
-    evidence = provider.evidence(recording, rig)
-    test = None if evidence is None else step_test(evidence.information)
-    if test is None or test.chance >= false_alarm:
-        return Answer(False, words="silent" if test is None else "none")
-    return Answer(True, *evidence.flow(*test.fitted), test.onset().value, "found")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("by", choices=("detector", "ring_down", "response"))
     parser.add_argument("--machines", type=int, default=24)
     parser.add_argument("--seed", type=int, default=91)
     parser.add_argument("--leaks", type=float, nargs="+", default=[0.0, 0.0042])
@@ -76,9 +60,7 @@ def main() -> None:
     parser.add_argument("--families", action="store_true")
     parser.add_argument("--false-alarm", type=float, default=0.01)
     given = parser.parse_args()
-    rig, ask = load_rig("thesis"), by_detector
-    if given.by != "detector":
-        ask = partial(by_provider, importlib.import_module(f"sealscope.diagnosis.inference.pressures.{given.by}"))
+    rig = load_rig("thesis")
     for lpm in given.leaks:
         answers, holds, spent = [], 0, []
         for number in range(given.machines):
@@ -90,7 +72,7 @@ def main() -> None:
             run = machine.experiment(seed=seed + 5, leak=leak, **fault)
             simulated = simulate_with_truth(replace(run, leaks=sized_once(run)))
             recording, begun = simulated.recording.only(("u", "p_A", "p_B")), time.process_time()
-            answers.append(ask(recording, rig, given.false_alarm))
+            answers.append(answer(recording, rig, given.false_alarm))
             spent.append(time.process_time() - begun)
             low, high = answers[-1].interval
             holds += bool(lpm) and low <= simulated.truth.mean_leak_lpm <= high

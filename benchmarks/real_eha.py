@@ -67,7 +67,7 @@ def main() -> None:
             others = [own for j, own in enumerate(runs) if j != k]
             judged = leaking(run, lpm) if lpm else run
             by = partial(ss.diagnose, baseline=others, rig=rig) if machine is None else machine.diagnose
-            verdicts.append(by(judged, quick=True))
+            verdicts.append(by(judged))
             plain += regression(judged, others, 1.6e-6) if options.plain else 0
         detected = [own for own in verdicts if own.verdict == "leak"]
         sizes = [own.leak_lpm for own in detected if own.leak_lpm is not None]

@@ -38,7 +38,7 @@ def shown(machine: ss.CommissionedMachine, run: ss.Recording, largest: float) ->
     """Return the smallest leak [L/min] that a run shows, 0 where it needs none, inf where the largest does not do."""
 
     def detected(lpm: float) -> bool:
-        return machine.diagnose(leaking(run, lpm) if lpm else run, quick=True).verdict == "leak"
+        return machine.diagnose(leaking(run, lpm) if lpm else run).verdict == "leak"
 
     low, high = 0.0, largest
     if detected(low) or not detected(high):

@@ -66,7 +66,7 @@ def main() -> None:
     for name, (keywords, changes) in CASES.items():
         stated = {"command": DUTY, **keywords, "set": {**HEALTHY, **keywords.get("set", {})}}
         runs = [ss.simulate(**stated, duration=SECONDS, seed=seed) for seed in seeds]
-        verdicts = [machine.diagnose(logged(run, changes), quick=True) for run in runs]
+        verdicts = [machine.diagnose(logged(run, changes)) for run in runs]
         counts = Counter(own.verdict for own in verdicts)
         named = sum("another machine" in own.reason for own in verdicts)
         print(f"| {name} | {counts['leak']} | {counts['cannot tell']} | {counts['no leak']} | {named} |", flush=True)

@@ -18,15 +18,14 @@ if TYPE_CHECKING:
     from sealscope.diagnosis.commissioned.machine_file import load_machine as load_machine
     from sealscope.diagnosis.commissioned.machine_file import write_machine as write_machine
     from sealscope.diagnosis.diagnose import diagnose as diagnose
-    from sealscope.diagnosis.inference.live.stream import SequentialBalance as SequentialBalance
+    from sealscope.diagnosis.live.watch import Watch as Watch
+    from sealscope.diagnosis.live.watch import watch as watch
     from sealscope.diagnosis.trend.trend import Trend as Trend
     from sealscope.diagnosis.trend.trend import trend as trend
     from sealscope.diagnosis.verdict.diagnosis import Diagnosis as Diagnosis
     from sealscope.fmu.build import write_fmu as write_fmu
     from sealscope.fmu.build import write_sensor_fmu as write_sensor_fmu
     from sealscope.fmu.recording import record_fmu as record_fmu
-    from sealscope.monitor.stream.watch import Watch as Watch
-    from sealscope.monitor.stream.watch import watch as watch
     from sealscope.parameters import Rig as Rig
     from sealscope.parameters import load_rig as load_rig
     from sealscope.recordings import Recording as Recording
@@ -49,12 +48,11 @@ _NAMES = {
     "diagnosis.commissioned.machine": "CommissionedMachine commission",
     "diagnosis.commissioned.machine_file": "load_machine write_machine",
     "diagnosis.diagnose": "diagnose",
-    "diagnosis.inference.live.stream": "SequentialBalance",
     "diagnosis.trend.trend": "Trend trend",
     "diagnosis.verdict.diagnosis": "Diagnosis",
     "fmu.build": "write_fmu write_sensor_fmu",
     "fmu.recording": "record_fmu",
-    "monitor.stream.watch": "Watch watch",
+    "diagnosis.live.watch": "Watch watch",
     "parameters": "Rig load_rig",
     "recordings": "inspect read read_parts write",
     "recordings.recording": "Recording",

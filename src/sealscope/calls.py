@@ -6,7 +6,9 @@ import difflib
 import functools
 import inspect
 from collections.abc import Callable, Iterable
-from typing import ParamSpec, TypeVar
+from dataclasses import field, fields
+from textwrap import fill, indent
+from typing import Any, ParamSpec, TypeVar
 
 from sealscope.errors import InputError
 
@@ -61,16 +63,29 @@ def checked_call(function: Callable[P, R]) -> Callable[P, R]:
     return call
 
 
-def with_arguments_of(make: Callable[P, V]) -> Callable[[Callable[[V], R]], Callable[P, R]]:
-    """Give a function of one value the arguments of the function that makes the value, so that they are listed once."""
+def argument(default: Any, kind: str, text: str, *, unit: str = "") -> Any:
+    """Declare an argument as a field of a dataclass: its type in words, what it is, and the SI unit of a number."""
+    return field(
+        default=default, metadata={"kind": kind, "text": f"{text} [{unit}]." if unit else f"{text}.", "unit": unit}
+    )
+
+
+def with_arguments_of(declared: Callable[P, V]) -> Callable[[Callable[[V], R]], Callable[P, R]]:
+    """Give a function of a dataclass the `argument` fields of that class as arguments, in signature and docstring."""
+    rows: list[str] = []
+    for own in fields(declared):  # type: ignore[arg-type]
+        wrapped = fill(own.metadata["text"], 110, break_long_words=False, break_on_hyphens=False)
+        rows += [f"{own.name} : {own.metadata['kind']}, optional", indent(wrapped, "    ")]
+    section = "\n".join(["Parameters", "----------", *rows, "", ""])
 
     def decorated(function: Callable[[V], R]) -> Callable[P, R]:
         @functools.wraps(function)
         def call(*args: P.args, **kwargs: P.kwargs) -> R:
-            return function(make(*args, **kwargs))
+            return function(declared(*args, **kwargs))
 
         returns = inspect.signature(function).return_annotation
-        call.__signature__ = inspect.signature(make).replace(return_annotation=returns)  # type: ignore[attr-defined]
+        call.__signature__ = inspect.signature(declared).replace(return_annotation=returns)  # type: ignore[attr-defined]
+        call.__doc__ = (inspect.getdoc(function) or "").replace("Returns\n---", f"{section}Returns\n---", 1)
         return checked_call(call)
 
     return decorated

@@ -12,12 +12,12 @@ from bisect import bisect_left
 from collections.abc import Callable
 from threading import Lock
 
+from sealscope.diagnosis.live.joining import CHANNELS
 from sealscope.errors import InputError
-from sealscope.monitor.memory.store import KEPT_IDENTITIES
+from sealscope.monitor.database.store import KEPT_IDENTITIES
 from sealscope.monitor.service import Source
 from sealscope.monitor.settings import ActuatorSettings, MonitorSettings, SimulateSettings
 from sealscope.monitor.sources.source_block import BlockReceiver, SourceBlock
-from sealscope.monitor.stream.joining import CHANNELS
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_with_truth
 

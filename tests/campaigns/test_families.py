@@ -99,7 +99,7 @@ def test_a_change_is_bounded_by_both_sides_of_its_onset():
     """With as much before as after, s of the difference of two runs, each as long as a side."""
     seconds = 3.2
     experiment = Experiment.of(command="7 sin(4t)", duration=seconds)
-    one = leak_bound(experiment, unknown=UNKNOWN).unknown
+    one = leak_bound(experiment, UNKNOWN)
     result = change_bound(experiment, seconds, seconds, 1e5)
     assert result == pytest.approx(2**0.5 * in_lpm(one, 1e5), rel=1e-9)
     assert change_bound(experiment, 4 * seconds, 4 * seconds, 1e5) == pytest.approx(result / 2, rel=1e-9)

@@ -52,12 +52,13 @@ def test_the_table_counts_by_hand():
     table = {(one.detector, one.leak_lpm): one for one in result.table}
     first = table[CHANGED, 1.0]
     assert first.false_alarm.count == sum(free)
-    assert first.detection.count == sum(small)
-    assert (first.detection.low, first.detection.high) == pytest.approx(clopper_pearson(sum(small), 200))
+    assert first.alarms.count == sum(small)
+    assert (first.alarms.low, first.alarms.high) == pytest.approx(clopper_pearson(sum(small), 200))
     assert first.per_hour.value == pytest.approx(sum(free) / 20.0)
-    assert table[CHANGED, 2.0].detection.value == 1.0
-    assert table["always fire", 1.0].detection.value == table["always fire", 1.0].false_alarm.value == 1.0
-    assert table["never fire", 1.0].detection.value == table["never fire", 1.0].false_alarm.value == 0.0
+    assert first.informedness == pytest.approx(sum(small) / 200 - sum(free) / 400)
+    assert table[CHANGED, 2.0].alarms.value == 1.0
+    assert table["always fire", 1.0].alarms.value == table["always fire", 1.0].false_alarm.value == 1.0
+    assert table["never fire", 1.0].alarms.value == table["never fire", 1.0].false_alarm.value == 0.0
     assert table[SIGN, 1.0].false_alarm.value == pytest.approx(0.5, abs=0.1)  # a threshold of its own
 
 
@@ -83,7 +84,7 @@ def test_a_duty_without_leak_free_records_cannot_be_told():
     rows = [*rows_of(4), row(50000, 9.0, leak=3.0, command="5 sin(2t)"), row(50001, 9.0, leak=3.0)]
     result = judged(rows)
     last = next(one for one in result.table if (one.detector, one.leak_lpm) == (CHANGED, 3.0))
-    assert (last.detection.count, last.cannot_tell.count, last.n) == (1, 1, 2)
+    assert (last.alarms.count, last.cannot_tell.count, last.alarms.n) == (1, 1, 2)
     with pytest.raises(InputError, match="must be at least 999 of a duty, got at most 199"):
         judged(rows, false_alarm=0.001)
 
@@ -98,7 +99,7 @@ def test_duties_have_thresholds_of_their_own():
     result = judged(rows)
     assert {duty for _, duty in result.thresholds} == {"3 sin(4t)", "5 sin(2t)"}
     table = next(one for one in result.table if one.detector == CHANGED)
-    assert table.detection.count == 1  # the same score is high at the one point and low at the other
+    assert table.alarms.count == 1  # the same score is high at the one point and low at the other
     assert table.false_alarm.value == pytest.approx(0.05, abs=0.05)
 
 

@@ -72,7 +72,7 @@ def test_recordings_are_calibrated_and_judged(folder):
     result = recorded_result(plan_of(folder), folder)
     assert (result.judgement.leak_free, result.judgement.judged, len(result.rows)) == (10, 4, 14)
     table = {row.detector: row for row in result.judgement.table}
-    assert table["d3 of p_A changed"].detection.count == 2
+    assert table["d3 of p_A changed"].alarms.count == 2
     assert table["d3 of p_A changed"].false_alarm.n == 2
     files = write_result(result, folder / "out")
     assert {path.name for path in files} >= {"table.csv", "records.csv", "thresholds.csv"}
@@ -139,7 +139,7 @@ def test_rotary_strokes(real_folder):
     assert (result.judgement.leak_free, result.judgement.judged, len(result.judgement.failed)) == (20, 40, 0)
     assert {duty for _, duty in result.judgement.thresholds} == {"in", "out"}  # the two directions
     table = {row.detector: row for row in result.judgement.table}
-    assert table["d3 of p_B high"].detection.value > 0.5
+    assert table["d3 of p_B high"].alarms.value > 0.5
     assert table["d3 of p_B high"].false_alarm.count <= 4
     assert {"always fire", "never fire"} <= set(table)
 

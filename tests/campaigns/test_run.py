@@ -173,7 +173,7 @@ def test_a_failed_case_is_a_row_with_its_error(tiny, tmp_path):
     result = simulated_result(plan, tmp_path / "bad")
     assert {row.error for row in result.judgement.failed} == {"the run diverged"}
     outcome = [row for row in result.judgement.table if row.detector == "d3 of p_A changed"]
-    assert [row.n for row in outcome] == [5, 5]  # a failed record stays in the count, as one that cannot be told
+    assert [row.alarms.n for row in outcome] == [5, 5]  # a failed record stays in the count, as one that cannot be told
     leaky_bad = sum(row.leak_lpm > 0 for row in result.judgement.failed)
     assert sum(row.cannot_tell.count for row in outcome) == leaky_bad
     assert campaign.run(plan, tmp_path / "bad", jobs=1, retry=True).failed == 0

@@ -131,13 +131,13 @@ THROTTLED = {"line.orifices": "present", "line.closed_A": "50 %", "line.closed_B
 
 @pytest.fixture(scope="session")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with simulated recordings: `leak.nc` (a leak from second 40 of 80), `healthy_1.nc` to `healthy_3.nc`
-    (40 s, no leak)."""
+    """A folder with simulated recordings: `leak.nc` (a leak from second 20 of 40), `healthy_1.nc` to `healthy_3.nc`
+    (20 s, no leak)."""
     folder = tmp_path_factory.mktemp("recordings")
-    leaky = sealscope.simulate(duration=80.0, leak="0.0135 L/min from 40 s", set=THROTTLED, seed=8)
+    leaky = sealscope.simulate(duration=40.0, leak="0.0135 L/min from 20 s", set=THROTTLED, seed=8)
     sealscope.write(leaky, folder / "leak.nc")
     for seed in (1, 2, 3):
-        healthy = sealscope.simulate(duration=40.0, set=THROTTLED, seed=seed)
+        healthy = sealscope.simulate(duration=20.0, set=THROTTLED, seed=seed)
         sealscope.write(healthy, folder / f"healthy_{seed}.nc")
     return folder
 

@@ -76,7 +76,7 @@ def test_jsonl_is_one_object_a_line_and_nothing_else(call, recordings):
         assert result["false_alarm_probability"] == 0.01
     assert leak["verdict"] == "leak"
     assert leak["score"] > leak["threshold"]
-    assert abs(leak["onset_s"] - 40.0) <= 10.0
+    assert abs(leak["onset_s"] - 20.0) <= 10.0
     assert leak["onset_interval_s"][0] <= leak["onset_s"] <= leak["onset_interval_s"][1]
     assert leak["leak_lpm"] is None or leak["leak_lpm"] == pytest.approx(0.0135, rel=0.5)
     assert leak["cause"] in ("piston leak", "piston or pump leak")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Iterator
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import pytest
 import typer
 
+import sealscope as ss
 from sealscope.cli.app import app
 
 
@@ -45,3 +47,12 @@ def test_every_option_s_text_is_shown_whole_in_80_columns(path, command, call, m
 def test_units_are_among_what_is_shown(call):
     out = call("simulate", "--help").out
     assert all(unit in out for unit in ("[s]", "[Hz]", "[m]", "'20[Pa]'"))
+
+
+def test_each_argument_of_an_experiment_is_an_option_with_the_same_text_and_default():
+    options = {option.name: option for option in dict(COMMANDS)["simulate",].params}
+    for name, argument in inspect.signature(ss.simulate).parameters.items():
+        if name == "drifts":
+            continue
+        assert plain(options[name].help).removesuffix(plain("Repeat for several.")) in plain(ss.simulate.__doc__)
+        assert str(argument.default).removesuffix(".0") == str(options[name].default)

@@ -12,8 +12,7 @@ from sealscope.diagnosis import registry
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.instruments import record
-from sealscope.simulation.integrate import oversampling
-from sealscope.simulation.sizing import sized_run
+from sealscope.simulation.integrate import oversampling, sized_run
 
 THROTTLED = {"orifices": "present", "closed_A": 0.5, "closed_B": 0.5}
 Records = Callable[..., Recording]

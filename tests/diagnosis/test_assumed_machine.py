@@ -43,14 +43,14 @@ def flow(recording: Recording, share: float = 1.0) -> float:
 
 def test_a_machine_five_times_as_large_gives_the_same_recording_and_no_flow(foreign: Recording) -> None:
     """Displacement, area and leak five times as large: 0.021 L/min was stated as 0.0043."""
-    result = diagnose(foreign, quick=True)
+    result = diagnose(foreign)
     assert result.verdict == "leak"
     assert result.leak_lpm is result.leak_interval_lpm is None
     assert result.refuses == {"leak_lpm"}
     assert "state --rig, or the piston's --area" in str(how_much(result))
     assert result.measured_ratio == (pytest.approx(1.0, abs=0.01), pytest.approx((1.0, 1.0), abs=0.02))
-    small = diagnose(foreign, rig=stated(area=f"{AREA} m^2"), quick=True)
-    large = diagnose(foreign, rig=stated(area=f"{5 * AREA} m^2"), quick=True)
+    small = diagnose(foreign, rig=stated(area=f"{AREA} m^2"))
+    large = diagnose(foreign, rig=stated(area=f"{5 * AREA} m^2"))
     assert small.leak_lpm == pytest.approx(flow(foreign), rel=0.05)
     assert large.leak_lpm == pytest.approx(5.0 * small.leak_lpm, rel=1e-6)
     for other in (small, large):
@@ -62,7 +62,7 @@ def test_a_machine_five_times_as_large_gives_the_same_recording_and_no_flow(fore
 
 
 def test_pump_share_and_creep_are_those_of_the_machine(foreign: Recording) -> None:
-    result = diagnose(foreign, quick=True).severity
+    result = diagnose(foreign).severity
     assert result is not None and result.pump_share is not None and result.creep_mm_per_min is not None
     assert result.mL_per_min is None
     pump = 4.9e-6 / (2.0 * np.pi) * 12.0 * 2.0 / np.pi * LPM  # mean of the size of 12 sin(4 t) rad/s
@@ -73,15 +73,15 @@ def test_pump_share_and_creep_are_those_of_the_machine(foreign: Recording) -> No
 @pytest.mark.parametrize("ratio", [0.5, pytest.param(1.4, marks=pytest.mark.slow)])
 def test_area_or_displacement_alone_gives_the_flow_whatever_the_other_is(ratio: float) -> None:
     recording = machine(1, G=step(0.0, LEAK), ratio=ratio)
-    by_area = diagnose(recording, rig=stated(area=f"{AREA} m^2"), quick=True)
-    by_pump = diagnose(recording, rig=stated(displacement=f"{ratio * 4.9} cm^3/rev"), quick=True)
-    both = diagnose(recording, rig="thesis", quick=True)
+    by_area = diagnose(recording, rig=stated(area=f"{AREA} m^2"))
+    by_pump = diagnose(recording, rig=stated(displacement=f"{ratio * 4.9} cm^3/rev"))
+    both = diagnose(recording, rig="thesis")
     assert by_area.leak_lpm == pytest.approx(flow(recording), rel=0.06)
     assert by_pump.leak_lpm == pytest.approx(by_area.leak_lpm, rel=0.01)
     assert f"displacement over area is {ratio:.2g}" in both.reason
     for by in (by_area, by_pump):  # either may be wrong: the interval holds what both say
         assert both.leak_interval_lpm[0] <= by.leak_lpm <= both.leak_interval_lpm[1]
-    assert diagnose(recording, quick=True).leak_lpm is None
+    assert diagnose(recording).leak_lpm is None
 
 
 def test_pressures_alone_state_no_flow_without_a_rig() -> None:
@@ -116,7 +116,7 @@ def test_who_states_the_machine() -> None:
 
 
 def test_no_leak_passes_a_share_of_the_pumps_flow() -> None:
-    result = diagnose(machine(1), quick=True)
+    result = diagnose(machine(1))
     assert result.verdict == "no leak"
     assert result.passage is not None and result.passage.lpm is None
     pump = 4.9e-6 / (2.0 * np.pi) * 12.0 * 2.0 / np.pi

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-
 import numpy as np
 import pytest
 
@@ -93,47 +91,25 @@ def test_it_is_made_for_the_rig_given_or_the_thesis_s(recording: Recording) -> N
         assert rigs.pop() is expected
 
 
-def test_two_at_a_time_and_as_each_by_itself(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two detectors that wait for one another both come to an end; evidence stands in the registry's order."""
-    both = threading.Barrier(2, timeout=20.0)
+def test_what_stands_in_for_a_judge_is_not_asked(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The most specific judges; where it abstains the next does; a user's own detectors are asked in any case."""
 
-    class Waiting(Looker):
-        def examine(self, recording: Recording, baseline: object, probability: float) -> Evidence:
-            both.wait()
-            return super().examine(recording, baseline, probability)
-
-    class First(Waiting):
-        name = "first"
-
-    class Second(Waiting):
-        name = "second"
-
-    monkeypatch.setattr(registry, "DETECTORS", {"second": Second, "first": First})
-    whole = Examination(recording, false_alarm_probability=0.05)
-    fused = whole.fused()
-    assert [one.detector for one in fused.parts] == ["second", "first"]
-    assert len(observed) == 2
-    assert whole.evidence("first").score == 0.05
-
-
-def test_quick_stops_at_the_detector_that_judges(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The most specific first; one that abstains does not judge; verdict and figures are those of all together."""
-
-    class Abstains(Looker):
+    class Volumes(Looker):
         name = "volume balance"
 
+    class Abstains(Volumes):
         def examine(self, recording: Recording, baseline: object, probability: float) -> Evidence:
             return Evidence("cannot tell", "too little")
 
-    class Judges(Looker):
+    class Pressures(Looker):
         name = "pressure response"
 
-    monkeypatch.setattr(
-        registry, "DETECTORS", {"looker": Looker, "pressure response": Judges, "volume balance": Abstains}
-    )
-    whole = Examination(recording, false_alarm_probability=0.05).fused()
-    observed.clear()
-    quick = Examination(recording, false_alarm_probability=0.05).fused(quick=True)
-    assert [part.detector for part in quick.parts] == ["pressure response", "volume balance"]
-    assert len(observed) == 1
-    assert (quick.verdict, quick.score, quick.detector) == (whole.verdict, whole.score, whole.detector)
+    for volumes, asked in (
+        (Volumes, ["volume balance", "looker"]),
+        (Abstains, ["pressure response", "volume balance", "looker"]),
+    ):
+        known = {"looker": Looker, "pressure response": Pressures, "volume balance": volumes}
+        monkeypatch.setattr(registry, "DETECTORS", known)
+        fused = Examination(recording, false_alarm_probability=0.05).fused()
+        assert [part.detector for part in fused.parts] == asked
+        assert fused.detector == asked[0]

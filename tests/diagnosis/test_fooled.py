@@ -58,7 +58,7 @@ def test_what_changed_in_the_readings_is_no_leak(kind: str, healthy: Recording) 
 )
 def test_swapped_chambers_are_no_leak_and_nothing_is_written(names: tuple[str, ...], healthy: Recording, capfd) -> None:  # type: ignore[no-untyped-def]
     """Models of the machine diverge on such a recording: that is no message for the terminal."""
-    diagnosis = diagnose(swapped(healthy.only(names)), quick="theta" in names)
+    diagnosis = diagnose(swapped(healthy.only(names)))
     if "theta" in names:  # the balance names what compresses: the sign of the pressures' rates
         assert diagnosis.verdict != "leak"
         assert diagnosis.cause is not None

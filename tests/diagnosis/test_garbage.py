@@ -35,9 +35,9 @@ GARBAGE: dict[str, tuple[Change, str]] = {
 def test_garbage_gets_cannot_tell_with_the_true_reason(kind: str, healthy: Recording, leaky: Recording, capfd) -> None:  # type: ignore[no-untyped-def]
     make, reason = GARBAGE[kind]
     for recording in (healthy, leaky):
-        diagnosis = diagnose(make(recording), quick=True)
+        diagnosis = diagnose(make(recording))
         if kind == "bar":  # flows do not depend on the unit of the pressures, and both show in the balance
-            assert diagnosis.verdict == diagnose(recording, quick=True).verdict
+            assert diagnosis.verdict == diagnose(recording).verdict
             continue
         assert diagnosis.verdict == "cannot tell"
         assert diagnosis.reason.startswith("this is no recording of a hydraulic machine: ")

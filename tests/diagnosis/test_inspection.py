@@ -72,14 +72,14 @@ def test_of_copies_the_one_with_the_most_channels_is_kept(healthy: list[Recordin
 @pytest.mark.parametrize("fault", ["stuck", "clipped", "constant", "too short"])
 def test_a_baseline_with_a_fault_is_left_out_for_every_detector(fault: str, healthy: list[Recording]) -> None:
     recording, leak_free, other = healthy
-    p_A = np.array(other["p_A"])
+    p_A, p_B = np.array(other["p_A"]), np.array(other["p_B"])
     if fault == "stuck":
         p_A[20000:20400] = p_A[20000]
     elif fault == "clipped":
-        p_A = np.minimum(p_A, np.quantile(p_A, 0.4))
+        p_A, p_B = (np.minimum(p, np.quantile(p, 0.4)) for p in (p_A, p_B))
     elif fault == "constant":
         p_A[:] = 3e5
-    faulty = replace(other, channels={**other.channels, "p_A": p_A})
+    faulty = replace(other, channels={**other.channels, "p_A": p_A, "p_B": p_B})
     if fault == "too short":
         faulty = faulty.samples(slice(0, 200))
     result = diagnose(recording, [faulty, leak_free])

@@ -10,7 +10,7 @@ from sealscope.parameters import load_rig
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_with_truth
 
-ONSET = 61.3
+ONSET = 36.3
 
 
 @pytest.mark.parametrize("command", ["3 sin(4t)", "5 sin(2t)"])
@@ -24,7 +24,7 @@ def test_mean_flow_and_onset(law: str, lpm: float, command: str) -> None:
     that slips.
     """
     leak = f"{lpm} L/min {'orifice ' if law == 'orifice' else ''}from {ONSET} s"
-    result = simulate_with_truth(Experiment.of(command=command, duration=125.0, leak=leak, seed=7))
+    result = simulate_with_truth(Experiment.of(command=command, duration=75.0, leak=leak, seed=7))
     evidence = VolumeBalance(load_rig("thesis")).examine(result.recording, [], 0.01)
     true = result.truth.mean_leak_lpm
     assert evidence.verdict == "leak"
@@ -53,7 +53,7 @@ def test_half_of_the_blocks_leak_much(command: str, lpm: float, law: str) -> Non
     """
     throttles = {"line.orifices": "present", "line.closed_A": "50[%]", "line.closed_B": "50[%]"}
     experiment = Experiment.of(
-        command=command, duration=120.0, leak=f"{lpm} L/min {law}from 60 s", set=throttles, seed=3
+        command=command, duration=60.0, leak=f"{lpm} L/min {law}from 30 s", set=throttles, seed=3
     )
     result = simulate_with_truth(experiment)
     evidence = VolumeBalance(load_rig("thesis")).examine(result.recording, [], 0.01)
@@ -62,7 +62,7 @@ def test_half_of_the_blocks_leak_much(command: str, lpm: float, law: str) -> Non
     assert evidence.leak_lpm == pytest.approx(true, rel=0.06)
     assert evidence.leak_interval_lpm is not None
     assert evidence.leak_interval_lpm[0] <= true <= evidence.leak_interval_lpm[1]
-    assert evidence.onset_s == pytest.approx(60.0, abs=1.5)
+    assert evidence.onset_s == pytest.approx(30.0, abs=1.5)
 
 
 @pytest.mark.parametrize(("laws", "lpm"), [(("laminar",), 0.5), (("orifice",), 0.5), (("laminar", "orifice"), 0.4)])
@@ -71,7 +71,7 @@ def test_zero_errors_of_the_transducers_do_not_bend_the_law(laws: tuple[str, ...
     offsets = {"sensors.p_A.offset": "12[kPa]", "sensors.p_1.offset": "12[kPa]"}
     offsets |= {"sensors.p_B.offset": "-12[kPa]", "sensors.p_2.offset": "-12[kPa]"}
     leak = [f"{lpm / len(laws)} L/min {'orifice ' if law == 'orifice' else ''}from {ONSET} s" for law in laws]
-    result = simulate_with_truth(Experiment.of(command="5 sin(2t)", duration=125.0, leak=leak, set=offsets, seed=7))
+    result = simulate_with_truth(Experiment.of(command="5 sin(2t)", duration=75.0, leak=leak, set=offsets, seed=7))
     evidence = VolumeBalance(load_rig("thesis")).examine(result.recording, [], 0.01)
     true = result.truth.mean_leak_lpm
     assert evidence.leak_lpm == pytest.approx(true, rel=0.06)
@@ -83,7 +83,7 @@ def test_zero_errors_of_the_transducers_do_not_bend_the_law(laws: tuple[str, ...
 def test_mean_flow_from_pressures_and_command(law: str) -> None:
     """The flow of an orifice damps the ringing half as much as a laminar one: the interval holds both."""
     leak = f"0.015 L/min {'orifice ' if law == 'orifice' else ''}from {ONSET} s"
-    result = simulate_with_truth(Experiment.of(command="3 sin(4t)", duration=125.0, leak=leak, seed=7))
+    result = simulate_with_truth(Experiment.of(command="3 sin(4t)", duration=75.0, leak=leak, seed=7))
     recording = result.recording.only(("u", "p_A", "p_B"))
     evidence = PressureResponse(load_rig("thesis")).examine(recording, [], 0.01)
     assert evidence.verdict == "leak"
@@ -94,9 +94,9 @@ def test_mean_flow_from_pressures_and_command(law: str) -> None:
 
 def test_pressures_that_hardly_vary_leave_the_size_as_it_is() -> None:
     """A laminar leak passes for an orifice whose zero is off: its flow is counted about that zero."""
-    leak = "0.1 L/min from 60 s"
+    leak = "0.1 L/min from 30 s"
     result = simulate_with_truth(
-        Experiment.of(rig="single-rod-eha", command="2 sin(6t)", duration=120.0, leak=leak, seed=1)
+        Experiment.of(rig="single-rod-eha", command="2 sin(6t)", duration=60.0, leak=leak, seed=1)
     )
     evidence = VolumeBalance(load_rig("single-rod-eha")).examine(result.recording, [], 0.01)
     assert evidence.verdict == "leak"

@@ -51,14 +51,14 @@ GAPS: dict[str, Callable[[Recording], Recording]] = {
     ],
 )
 def test_a_leak_after_a_gap_is_found(gap: str, view: str, late_leak: Recording) -> None:
-    diagnosis = diagnose(observed(GAPS[gap](late_leak), view), quick=True)
+    diagnosis = diagnose(observed(GAPS[gap](late_leak), view))
     assert diagnosis.verdict == "leak", diagnosis.reason
     assert diagnosis.onset_s == pytest.approx(61.0, abs=5.0)  # within the blocks that the gap takes
 
 
 @pytest.mark.parametrize("view", VIEWS)
 def test_a_few_missing_samples_change_no_verdict_of_a_sound_machine(view: str, healthy: Recording) -> None:
-    diagnosis = diagnose(observed(GAPS["2 s of all channels"](healthy), view), quick=True)
+    diagnosis = diagnose(observed(GAPS["2 s of all channels"](healthy), view))
     assert diagnosis.verdict == "no leak"
     assert f"this rests on {100 * diagnosis.share:.3g} % of the recording" in diagnosis.reason
     assert 0.95 <= diagnosis.share < 1.0
@@ -67,6 +67,6 @@ def test_a_few_missing_samples_change_no_verdict_of_a_sound_machine(view: str, h
 @pytest.mark.parametrize("view", ["all", "pressures"])
 def test_no_leak_needs_nearly_all_of_the_recording(view: str, healthy: Recording) -> None:
     """A tenth of a second in every four after half: hardly a sample is missing, and few blocks are left."""
-    diagnosis = diagnose(observed(holed(healthy, (healthy.t % 4.0 < 0.1) & (healthy.t > 60.0)), view), quick=True)
+    diagnosis = diagnose(observed(holed(healthy, (healthy.t % 4.0 < 0.1) & (healthy.t > 60.0)), view))
     assert diagnosis.verdict == "cannot tell"
     assert "the rest may hide a leak" in diagnosis.reason

@@ -124,4 +124,4 @@ def test_a_leak_moves_none_of_them(leak: str) -> None:
 def test_a_large_leak_slows_the_piston_and_is_a_leak(leak: str) -> None:
     recording = simulate(command="3 sin(4t)", leak=leak, duration="120 s", seed=1)
     assert other_step(recording, CHANCE) is not None
-    assert diagnose(recording, quick=True).verdict == "leak"
+    assert diagnose(recording).verdict == "leak"

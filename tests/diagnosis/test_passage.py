@@ -115,7 +115,7 @@ def test_a_single_rod_s_total_is_stated_from_the_first_sample(command: str, load
     simulated = simulate_with_truth(experiment)
     difference = simulated.truth.outputs["p_A"] - simulated.truth.outputs["p_B"]
     true = own.pump.G_pump * float(np.abs(difference).mean()) * LPM + simulated.truth.mean_leak_lpm
-    diagnosis = diagnose(simulated.recording, rig=own, quick=True)
+    diagnosis = diagnose(simulated.recording, rig=own)
     assert diagnosis.passage is not None
     assert diagnosis.passage.lpm == pytest.approx(true, rel=0.05)
     low, high = diagnosis.passage.interval_lpm or pytest.fail("no interval")

@@ -82,7 +82,7 @@ def test_later_strokes_of_a_session_are_no_leak(name: str, sessions: dict[str, l
     """The first 20 strokes as baseline; at most 3 % of all later ones."""
     verdicts = Counter(within(stroke, sessions[name][:20]) for stroke in sessions[name][20::3])
     assert verdicts["leak"] <= 1  # of 28
-    assert verdicts["no leak"] > 10
+    assert verdicts["no leak"] >= 26
 
 
 @pytest.mark.slow

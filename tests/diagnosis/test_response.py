@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import sealscope as ss
-from sealscope.diagnosis.inference.onset import step_test
+from sealscope.diagnosis.inference.onset import Information, step_test
 from sealscope.diagnosis.inference.pressures.response import (
     C_C,
     F_C,
@@ -28,7 +28,13 @@ from sealscope.diagnosis.inference.pressures.response import (
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
 
-from .ringing import step_of
+
+def step_of(information: Information, onset: float) -> tuple[float, float]:
+    """Return the step of g at a known onset [s] beside its level, by least squares, and its standard deviation."""
+    basis = np.column_stack([np.ones(len(information.time)), information.time > onset])
+    covariance = np.linalg.inv(basis.T @ information.precision @ basis)
+    return float((covariance @ basis.T @ information.vector)[1]), float(np.sqrt(covariance[1, 1]))
+
 
 THESIS = load_rig("thesis")
 BELIEFS = beliefs_of(THESIS)
@@ -68,7 +74,7 @@ def test_a_path_that_made_the_record_is_followed() -> None:
     own = response(recording, THESIS)
     assert own is not None
     assert np.sqrt(own.variance) == pytest.approx(4e3, rel=0.03)
-    followed = own.parameters.reshape(blocks, -1)
+    followed = own.theta + own.mean.reshape(blocks, -1) * own.beliefs.unit
     assert np.diff(followed[:, G].reshape(2, -1).mean(axis=1))[0] == pytest.approx(step, rel=0.4)
     np.testing.assert_allclose(followed[:, K_OIL], BELIEFS.centre[K_OIL], rtol=0.02)
 

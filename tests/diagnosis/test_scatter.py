@@ -10,7 +10,7 @@ from scipy.stats import binom, kstest
 
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.blocks import Blocks, Columns
-from sealscope.diagnosis.inference.scatter import Rise, Taught, rise
+from sealscope.diagnosis.inference.scatter import RecordingSums, Rise, rise
 from sealscope.diagnosis.inference.terms import LEAK, Equation, Term
 
 PRESSURE, FLOW = 1e5, 1e-5
@@ -63,18 +63,20 @@ def risen(random: np.random.Generator, count: int, scatter: float, leak: float =
 
 def beyond(judged: Blocks, healthy: Sequence[Blocks]) -> Rise:
     """The rise of a recording beyond healthy ones."""
-    return rise(Taught.of(judged, (COLUMNS,)), [Taught.of(own, (COLUMNS,)) for own in healthy], (COLUMNS,))
+    return rise(
+        RecordingSums.of(judged, (COLUMNS,)), [RecordingSums.of(own, (COLUMNS,)) for own in healthy], (COLUMNS,)
+    )
 
 
 DAY = 86400.0
 
 
-def fleet(random: np.random.Generator, days: Sequence[int], viscosity: float, within: float) -> list[Taught]:
+def fleet(random: np.random.Generator, days: Sequence[int], viscosity: float, within: float) -> list[RecordingSums]:
     """Recordings of these days: leakage goes with the inverse of each day's viscosity (deviation of its logarithm)."""
     thin = dict(zip(dict.fromkeys(days), np.exp(viscosity * random.standard_normal(len(days))), strict=False))
     level = 20.0 * BELIEVED
     return [
-        Taught.of(recording(random, level * thin[day] + within * random.normal()), (COLUMNS,), DAY * day)
+        RecordingSums.of(recording(random, level * thin[day] + within * random.normal()), (COLUMNS,), DAY * day)
         for day in days
     ]
 
@@ -106,10 +108,12 @@ def test_a_known_temperature_of_the_oil_takes_off_what_it_makes_of_the_level() -
     """Twice the leakage in oil that is 17 K warmer is no leak, and as much at the same temperature is."""
     random, level = np.random.default_rng(5), 20.0 * BELIEVED
     twice = np.exp(beliefs("inference")["oil"]["per_kelvin"] * 17.3)
-    healthy = [Taught.of(recording(random, level), (COLUMNS,), DAY * 1, 40.0) for _ in range(4)]
+    healthy = [RecordingSums.of(recording(random, level), (COLUMNS,), DAY * 1, 40.0) for _ in range(4)]
 
     def risen(day: int, warm: float) -> Rise:
-        return rise(Taught.of(recording(random, twice * level), (COLUMNS,), DAY * day, warm), healthy, (COLUMNS,))
+        return rise(
+            RecordingSums.of(recording(random, twice * level), (COLUMNS,), DAY * day, warm), healthy, (COLUMNS,)
+        )
 
     assert abs(risen(1, 57.3).value) < 0.1 * level < risen(1, 40.0).value
     assert risen(2, 57.3).chance > 0.1

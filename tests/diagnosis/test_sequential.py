@@ -1,4 +1,4 @@
-"""A balance that is watched: its rate of false alarms, the delay of a leak, and the same for pieces of any size."""
+"""The e-detector of a watch: its rate of false alarms, the delay and size of a step, and states that are restored."""
 
 from __future__ import annotations
 
@@ -6,15 +6,11 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, Phase, given, settings
-from hypothesis import strategies as st
 
-from sealscope.diagnosis.inference.live.balance import BLOCK_SECONDS, BlockConductance, LiveBalance
-from sealscope.diagnosis.inference.live.sequential import StepDetector
-from sealscope.diagnosis.inference.live.stream import BalanceState, SequentialBalance
-from sealscope.errors import InputError
+from sealscope.diagnosis.live.balance import BLOCK_SECONDS, BlockConductance, LiveBalance
+from sealscope.diagnosis.live.sequential import StepDetector
+from sealscope.diagnosis.live.watch import Watch
 from sealscope.parameters import load_rig
-from sealscope.recordings.recording import Recording
 
 from .balance_machine import machine, step
 
@@ -24,77 +20,12 @@ LEAK, OPENS = 3.0e-13, 80.0
 WORN = machine(1, G=step(0.0, LEAK, at=OPENS), duration=130.0, rate=50.0)
 
 
-def stream(recording: Recording, sizes: list[int], hourly: float = 0.1) -> list[BalanceState]:
-    """Every state that the stream goes through, for pieces of these sizes over and over."""
-    detector, states, start, turn = SequentialBalance(RIG, alarms_per_hour=hourly), [], 0, 0
-    while start < len(recording):
-        size = sizes[turn % len(sizes)]
-        states.append(detector.update(recording.samples(slice(start, start + size))))
-        start, turn = start + size, turn + 1
-    return states
-
-
-WHOLE = stream(WORN, [len(WORN)])[-1]
-
-
-def test_a_leak_raises_an_alarm_with_onset_and_size():
-    states = stream(WORN, [50])
-    first = next(state for state in states if state.alarm is not None)
-    assert OPENS < first.t < OPENS + 3.0 * BLOCK_SECONDS
-    low, high = WHOLE.alarm.onset_interval_s
-    assert low <= OPENS <= high
-    assert high - low < 2.0 * BLOCK_SECONDS
-    truth = LEAK * float(np.mean(np.abs((WORN["p_A"] - WORN["p_B"])[WORN.t > OPENS]))) * 6e4
-    low, high = WHOLE.alarm.leak_interval_lpm
-    assert low <= truth <= high
-    assert high - low < 0.3 * truth
-
-
-@settings(
-    max_examples=4,
-    deadline=None,
-    phases=(Phase.explicit, Phase.reuse, Phase.generate),
-    suppress_health_check=[HealthCheck.too_slow],
-)
-@given(sizes=st.lists(st.integers(1, 3000), min_size=1, max_size=4).filter(lambda sizes: sum(sizes) > 200))
-def test_pieces_of_any_size_give_what_one_gives(sizes: list[int]):
-    last = stream(WORN, sizes)[-1]
-    assert (last.t, last.blocks, last.alarm) == (WHOLE.t, WHOLE.blocks, WHOLE.alarm)
-    assert last.evidence == WHOLE.evidence
-
-
-def test_missing_samples_and_a_gap_cost_the_blocks_that_they_meet():
-    missing = (WORN.t > 31.0) & (WORN.t < 38.0)
-    with_gaps = Recording(
-        WORN.t, {**WORN.channels, "p_A": np.where(missing, np.nan, WORN["p_A"])}, WORN.units, WORN.rate
-    )
-    detector = SequentialBalance(RIG, alarms_per_hour=0.1)
-    detector.update(with_gaps.between(0.0, 60.0))
-    state = detector.update(with_gaps.between(65.0, 130.0))
-    assert 1 <= state.refused <= 2
-    assert state.blocks <= WHOLE.blocks - 1
-    assert state.alarm.leak_lpm == pytest.approx(WHOLE.alarm.leak_lpm, rel=0.1)
-    low, high = state.alarm.onset_interval_s
-    assert low <= OPENS <= high
-
-
-def test_an_alarm_stays_until_it_is_acknowledged():
-    detector = SequentialBalance(RIG, alarms_per_hour=0.1)
-    detector.update(WORN)
-    detector.acknowledge()
-    assert detector.state.alarm is None
-    more = machine(1, G=LEAK, duration=60.0, rate=50.0)
-    moved = Recording(more.t + WORN.t[-1] + 1.0 / 50.0, more.channels, more.units, more.rate)
-    assert detector.update(moved).alarm is None
-
-
 def test_without_a_leak_there_is_a_bound():
-    state = stream(machine(2, duration=130.0, rate=50.0), [700], hourly=1.0)[-1]
-    assert state.alarm is None
-    assert state.evidence.verdict == "no leak"
-    truth = 2.4e-13 * 1.1e5 * 6e4  # what the pump passes
-    assert 0.0 < state.evidence.bound_lpm < truth
-    assert state.total_lpm == pytest.approx(truth, rel=0.15)
+    watch = Watch(RIG, 1000.0, 1000.0)
+    watch.update(machine(2, duration=130.0, rate=50.0))
+    assert watch.leak is None
+    assert watch.evidence.verdict == "no leak"
+    assert 0.0 < watch.evidence.bound_lpm < 2.4e-13 * 1.1e5 * 6e4  # what the pump passes
 
 
 @pytest.mark.slow  # compiles a solver of its own
@@ -104,24 +35,10 @@ def test_behind_a_servo_valve_each_chamber_has_a_balance():
     recording = ss.simulate(
         rig="servo-valve", command="position 30 mm sin(3t)", duration=120.0, leak="0.05 L/min from 90 s", seed=3
     )
-    state = SequentialBalance("servo-valve", alarms_per_hour=0.3).update(recording)
-    assert state.alarm.cause == "piston leak"
-    assert state.alarm.onset_s == pytest.approx(90.0, abs=2.0 * BLOCK_SECONDS)
-
-
-@pytest.mark.parametrize("hourly", [0.0, -1.0, float("nan"), 1e9])
-def test_a_rate_that_cannot_be_set_is_refused(hourly: float):
-    with pytest.raises(InputError, match="alarms_per_hour must be"):
-        SequentialBalance(RIG, alarms_per_hour=hourly)
-
-
-def test_channels_units_and_rate_are_those_of_the_beginning():
-    with pytest.raises(InputError, match="x, p_A, p_B and theta"):
-        SequentialBalance(RIG).update(WORN.only(["p_A", "p_B", "u"]))
-    detector = SequentialBalance(RIG)
-    detector.update(WORN.between(0.0, 10.0))
-    with pytest.raises(InputError, match="rate"):
-        detector.update(Recording(WORN.t * 2.0, WORN.channels, WORN.units, 25.0))
+    watch = ss.watch("servo-valve", false_alarms_per_1000_h=400.0)
+    watch.update(recording)
+    assert watch.evidence.cause == "piston leak"
+    assert watch.evidence.onset_s == pytest.approx(90.0, abs=2.0 * BLOCK_SECONDS)
 
 
 def walk(random: np.random.Generator, count: int, q: float) -> np.ndarray:

@@ -62,7 +62,7 @@ def test_every_cause_says_what_to_do():
 
 def test_a_recording_has_the_state_of_its_leak_against_the_limit():
     worn = machine(1, G=step(0.0, 3.0e-13, at=100.0), duration=200.0, rate=100.0)
-    over = diagnose(worn, rig="thesis", limit="1e-6 L/min", quick=True)
+    over = diagnose(worn, rig="thesis", limit="1e-6 L/min")
     under = replace(over, limit=RepairLimit.of("10 L/min"))
     assert [each.verdict for each in (over, under)] == ["leak", "leak"]
     assert [each.state.name for each in (over, under)] == ["failure", "maintenance required"]
@@ -70,6 +70,6 @@ def test_a_recording_has_the_state_of_its_leak_against_the_limit():
         assert each.state.cause in LEAKS
         assert each.state.since_s == each.onset_s
         assert each.state.action == each.next_check
-    assert diagnose(machine(1), quick=True).state.name == "good"
-    noisy = diagnose(machine(4, p_noise=2.0e6, x_step=2.0e-3), quick=True)
+    assert diagnose(machine(1)).state.name == "good"
+    noisy = diagnose(machine(4, p_noise=2.0e6, x_step=2.0e-3))
     assert (noisy.verdict, noisy.state.name) == ("cannot tell", "out of specification")

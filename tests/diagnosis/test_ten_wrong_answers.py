@@ -119,7 +119,7 @@ def test_a_log_of_a_test_bench(case: str, own: Recording, tmp_path: Path) -> Non
     recording = read(DIALECTS[case](own, tmp_path))
     assert recording.rate == pytest.approx(own.rate, rel=1e-3)
     assert len(recording) == pytest.approx(len(own), abs=0.02 * len(own))
-    result = diagnose(recording, quick=True)
+    result = diagnose(recording)
     assert (result.verdict, result.detector) == ("leak", "volume balance"), result.reason
     assert result.onset_s is not None
     assert result.onset_s - float(recording.t[0]) == pytest.approx(ONSET, abs=1.5)
@@ -128,19 +128,19 @@ def test_a_log_of_a_test_bench(case: str, own: Recording, tmp_path: Path) -> Non
 
 def test_7_a_cylinder_five_times_as_large_got_the_flow_of_a_small_one(own: Recording) -> None:
     """Its recording is this one: 0.0043 L/min was stated where 0.021 L/min leaked."""
-    result = diagnose(own, quick=True)
+    result = diagnose(own)
     assert result.leak_lpm is None
     assert result.severity is not None and result.severity.pump_share is not None
     assert "--area" in short_text(result)
 
 
 def test_8_a_leak_from_the_start_was_kept_as_the_baseline() -> None:
-    result = diagnose(machine(1, G=1.0e-12).only(CHANNELS), quick=True)
+    result = diagnose(machine(1, G=1.0e-12).only(CHANNELS))
     assert result.verdict == "no leak"
     text = " ".join(diagnosis_text(result).split())
     assert "pump and piston together" in text
     assert "keep this recording as a baseline" not in text.lower()
-    stated = diagnose(machine(1, G=1.0e-12).only(CHANNELS), rig="thesis", quick=True)
+    stated = diagnose(machine(1, G=1.0e-12).only(CHANNELS), rig="thesis")
     assert (stated.verdict, stated.onset_s) == ("leak", None)
     assert "pump and piston together" in stated.reason
 

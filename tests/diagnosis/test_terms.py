@@ -187,14 +187,18 @@ def test_nothing_is_balanced_without_a_source_of_flow(rig: Rig) -> None:
     assert equations(load_rig("servo-valve"), frozenset({"x", "p_A", "p_B", "u"})) == ()
 
 
+@pytest.fixture(scope="module")
+def single_rod() -> Recording:
+    words = {"rig": "single-rod-eha", "command": "5 sin(2t)", "load": "-3000 N", "leak": LATE}
+    return simulate_with_truth(Experiment.of(duration=120, seed=3, **words)).recording
+
+
 @pytest.mark.parametrize("bar", [-6.0, -1.0, 6.0])
-def test_a_zero_that_is_far_off_leaves_a_single_rod_s_leak_as_it_is(bar: float) -> None:
+def test_a_zero_that_is_far_off_leaves_a_single_rod_s_leak_as_it_is(single_rod: Recording, bar: float) -> None:
     """Which side carries, and the root of an orifice's law, are taken about the zero."""
-    single = load_rig("single-rod-eha")
-    experiment = Experiment.of(rig=single, command="5 sin(2t)", duration=120, load="-3000 N", leak=LATE, seed=3)
-    own = simulate_with_truth(experiment).recording
+    single, own = load_rig("single-rod-eha"), single_rod
     shifted = replace(own, channels={**own.channels, "p_A": own["p_A"] + bar * 1e5})
-    diagnosis = diagnose(shifted, rig=single, quick=True)
+    diagnosis = diagnose(shifted, rig=single)
     assert diagnosis.verdict == "leak"
     low, high = diagnosis.leak_interval_lpm or pytest.fail("no interval")
     assert low <= 0.05 <= high
@@ -206,7 +210,7 @@ def test_a_position_recorded_late_is_named_and_changes_no_size(samples: int) -> 
     experiment = Experiment.of(command="3 sin(4t)", duration=40, leak="0.05 L/min from 20 s", seed=3)
     own = simulate_with_truth(experiment).recording
     shifted = replace(own, channels={**own.channels, "x": np.roll(own["x"], samples)}).between(0.1, 39.9)
-    diagnosis = diagnose(shifted, rig=load_rig("thesis"), quick=True)
+    diagnosis = diagnose(shifted, rig=load_rig("thesis"))
     assert diagnosis.verdict == "leak" and diagnosis.leak_lpm == pytest.approx(0.05, rel=0.03)
     named = re.search(r"x is recorded (\S+) ms (later|earlier)", diagnosis.reason)
     assert (named is None) == (samples == 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -97,6 +98,7 @@ def test_the_accumulator_tells_oil_that_leaves_from_oil_that_passes() -> None:
     assert examined(replace(recording, channels=channels)).verdict != "leak"
 
 
+@cache
 def simulated(rig: str, command: str, load: str = "0 N", leak: str = "") -> Run:
     words = {"rig": rig, "command": command, "load": load, "duration": SECONDS, "seed": 2}
     return simulate_with_truth(Experiment.of(**words, leak=leak or ()))

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sealscope.evaluation.estimates import estimate_error, mean_of, onset_errors, order_ranks, quantile_of
+from sealscope.evaluation.estimates import estimate_errors, mean_of, order_ranks, quantile_of
 from sealscope.evaluation.table import events_per_hour, poisson_interval
 
 # Garwood, Biometrika 28 (1936) 437-442, as in Pearson and Hartley, Biometrika Tables for Statisticians, table 40: 95 %
@@ -101,7 +101,7 @@ def test_student_s_sleep():
 
 
 def test_errors_of_an_estimate_by_hand():
-    result = estimate_error(
+    result = estimate_errors(
         [1.0, 2.0, math.nan, 5.0], [1.0, 1.0, 1.0, 4.0], [0.5, 1.5, math.nan, 3.0], [1.5, 2.5, math.nan, 6.0]
     )
     assert result.without == 1
@@ -109,22 +109,22 @@ def test_errors_of_an_estimate_by_hand():
     assert result.rmse.value == pytest.approx(math.sqrt(2 / 3))
     assert result.rmse.low == 0.0
     assert (result.coverage.count, result.coverage.n) == (2, 3)
-    assert estimate_error([1.0, 2.0], [1.0, 2.5]).coverage.n == 0
+    assert estimate_errors([1.0, 2.0], [1.0, 2.5]).coverage.n == 0
 
 
 @settings(deadline=None)
 @given(st.lists(st.floats(-50, 50), min_size=2, max_size=30), st.floats(-5, 5))
 def test_a_constant_error_is_bias(errors, shift):
     truth = np.arange(len(errors), dtype=float)
-    result = estimate_error(truth + errors, truth)
-    moved = estimate_error(truth + errors + shift, truth)
+    result = estimate_errors(truth + errors, truth)
+    moved = estimate_errors(truth + errors + shift, truth)
     assert moved.bias.value == pytest.approx(result.bias.value + shift, abs=1e-9)
     assert result.rmse.value >= abs(result.bias.value) - 1e-9
     assert result.rmse.low <= result.rmse.value <= result.rmse.high
 
 
 def test_errors_of_an_onset():
-    result = onset_errors([92.0, math.nan, 85.0, 90.0], [90.0] * 4, [88, math.nan, 80, 91], [95, math.nan, 89, 93])
+    result = estimate_errors([92.0, math.nan, 85.0, 90.0], [90.0] * 4, [88, math.nan, 80, 91], [95, math.nan, 89, 93])
     assert (result.n, result.without) == (3, 1)
     assert result.median.value == 0.0
     assert (result.median_size.value, result.ninety_size.value) == (2.0, 5.0)

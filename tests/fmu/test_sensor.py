@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import t as student
 
 import sealscope as ss
-from sealscope.diagnosis.inference.live.balance import LiveBalance, NotJudged, size_error
+from sealscope.diagnosis.live.balance import LiveBalance, NotJudged, size_error
 from sealscope.errors import InputError
 from sealscope.fmu.sensor import COLUMNS, INPUTS, WALK, WINDOW, SensorChoice, memory_of
 from sealscope.fmu.variables import SENSOR_RESULTS as RESULTS

@@ -200,7 +200,7 @@ def machines(folder: Path) -> Use:
 
     def read() -> None:
         machine = sealscope.load_machine(path)
-        machine.diagnose(judged, quick=True)
+        machine.diagnose(judged)
         str(machine)
         again = sealscope.load_machine(sealscope.write_machine(machine, folder / "again.toml"))
         assert [own.digest for own in again.healthy] == [own.digest for own in machine.healthy]

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import create_engine, inspect, text
 
-from sealscope.monitor.memory.tables import metadata
+from sealscope.monitor.database.tables import metadata
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import MonitorSettings, read_settings
 from sealscope.recordings import write

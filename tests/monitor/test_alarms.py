@@ -14,12 +14,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import ndtr
 
+from sealscope.diagnosis.live.estimates import BlockEstimate, WatchedLeak
 from sealscope.errors import InputError
 from sealscope.monitor.alarms import MARKS, AlarmJudge
-from sealscope.monitor.memory.store import MonitorStore, StoredRows
+from sealscope.monitor.database.store import MonitorStore, StoredRows
 from sealscope.monitor.outputs.events import EventLines
 from sealscope.monitor.settings import WatchSettings
-from sealscope.monitor.stream.estimates import BlockEstimate, WatchedLeak
 from sealscope.storage.plain_state import restored
 
 SETTINGS = WatchSettings(warning_lpm=0.002, error_lpm=0.01, debounce_blocks=2, return_share=0.5)

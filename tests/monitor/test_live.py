@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sealscope.monitor.actuators import WatchedActuators
-from sealscope.monitor.memory.store import MonitorStore
+from sealscope.monitor.database.store import MonitorStore
 from sealscope.monitor.page.live import MOST_ACTUATORS, MOST_SAMPLES, LiveSamples, machine_of
 from sealscope.monitor.page.site import PageServer
 from sealscope.monitor.settings import ActuatorSettings, PageSettings
@@ -62,16 +62,15 @@ def test_nothing_is_kept_of_what_nobody_looks_at_and_little_of_what_somebody_doe
             100.0 + np.arange(10 * MOST_SAMPLES) / 1e5, {"p_A": np.ones(10 * MOST_SAMPLES)}, {"p_A": "Pa"}, 1e5
         )
         live.take("press", fast)
-        window = live._windows["press"]
-        assert window.t.size == window.channels["p_A"].size == MOST_SAMPLES
-        assert window.t[-1] == fast.t[-1]
-        assert len(live.picture("press")["pressures"]["t"]) <= 800
-    assert not live._windows and not live._lookers
+        picture = live.picture("press")
+        assert picture["t"] == fast.t[-1] and len(picture["pressures"]["t"]) <= 800
+        assert picture["pressures"]["t"][0] == pytest.approx(-MOST_SAMPLES / 1e5, abs=1e-4)
+    assert not live.watched
     watched = [live.looked_at(f"press {k}") for k in range(MOST_ACTUATORS + 1)]
     assert [each.__enter__() for each in watched] == [True] * MOST_ACTUATORS + [False]
     for each in watched:
         each.__exit__(None, None, None)
-    assert not live._windows
+    assert not live.watched
 
 
 def test_what_is_stored_never_takes_the_place_of_what_comes_meanwhile():
@@ -157,7 +156,7 @@ def test_samples_go_to_who_looks_and_to_nobody_else(page: tuple[PageServer, Live
         assert (answer.status, "error" in json.loads(answer.read())) == (status, True)
     browser.request("GET", "/api/changes?actuator=press%20%3C1%3E&pressure=p_B")
     lines = browser.getresponse()
-    until(lambda: live._windows)
+    until(lambda: live.watched)
     live.take("press <1>", SENT)
     pictures = []
     while not pictures or pictures[-1]["t"] is None:
@@ -167,4 +166,4 @@ def test_samples_go_to_who_looks_and_to_nobody_else(page: tuple[PageServer, Live
     assert pictures[-1]["t"] == SENT.t[-1] and pictures[-1]["details"]["of"] == "p_B"
     browser.close()
     lines.close()
-    until(lambda: not live._windows)
+    until(lambda: not live.watched)

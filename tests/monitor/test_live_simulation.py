@@ -15,7 +15,7 @@ import pytest
 
 from sealscope.errors import InputError
 from sealscope.live_simulation import DEMO, simulated_sources
-from sealscope.monitor.memory.store import MonitorStore
+from sealscope.monitor.database.store import MonitorStore
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import MonitorSettings, read_settings
 from sealscope.simulation.simulate import simulate

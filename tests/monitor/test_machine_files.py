@@ -106,8 +106,8 @@ def test_nothing_is_taught_from_the_onset_of_a_valid_alarm_on_until_the_repair(t
 
 def test_without_samples_or_a_file_it_says_so(tmp_path, commissioned):
     service = alarmed(tmp_path, commissioned[0.0])
+    service.actuators.mark(NAME, "comment", text="its checkpoint takes the place of the samples")
     again = WatchedActuators([*service.actuators.settings.values()], service.store)
-    again._actuators[NAME].kept.clear()
     again.mark(NAME, "invalid", text="no oil seen")
     assert said_by(again) == "press.toml: not taught: no samples of the alarm are kept"
     (tmp_path / "gone").mkdir()

@@ -16,7 +16,7 @@ from sqlalchemy.exc import OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.testclient import TestClient
 
-from sealscope.monitor.memory.store import MonitorStore
+from sealscope.monitor.database.store import MonitorStore
 from sealscope.monitor.page.site import site
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import PageSettings
@@ -188,5 +188,5 @@ def test_a_source_is_no_longer_than_the_service(tmp_path):
     service.stop()
     thread.join(60.0)
     assert not thread.is_alive()
-    service._hold.close()
+    service.close()
     assert json.loads(json.dumps(service.supervisor.outages())) == []

@@ -11,7 +11,7 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import pytest
 
-from sealscope.monitor.memory.export import ESTIMATE_COLUMNS, export_labels
+from sealscope.monitor.database.export import ESTIMATE_COLUMNS, export_labels
 from sealscope.monitor.outputs.events import Webhook
 from sealscope.monitor.outputs.grafana import dashboard
 from sealscope.monitor.outputs.prometheus import metrics_text

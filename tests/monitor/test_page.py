@@ -203,9 +203,9 @@ def look_at_the_live_part(view: Any, live: LiveSamples) -> None:
     # the drawing changes with what is said of it, not a frame later
     assert view.get_attribute("#twin-moving", "transform") == "translate(200.00 0)"
     view.locator("#pause").click()
-    until(lambda: not live._windows)  # nothing is sent any more
+    until(lambda: not live.watched)  # nothing is sent any more
     view.locator("#pause").click()
-    until(lambda: live._windows)
+    until(lambda: live.watched)
 
 
 @pytest.mark.slow

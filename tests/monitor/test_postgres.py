@@ -21,8 +21,8 @@ from sqlalchemy.exc import OperationalError
 from starlette.testclient import TestClient
 
 from sealscope.errors import InputError
-from sealscope.monitor.memory.store import MonitorStore, away
-from sealscope.monitor.memory.tables import metadata
+from sealscope.monitor.database.store import MonitorStore, away
+from sealscope.monitor.database.tables import metadata
 from sealscope.monitor.page.site import site
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import PageSettings
@@ -202,8 +202,8 @@ def test_a_postgresql_that_hangs_is_said_and_costs_nothing(
     undisturbed, server: PostgreSQL, tmp_path: Path, monkeypatch, caplog
 ):
     """Its processes are stopped: connections are accepted, packets confirmed, and nothing is answered."""
-    monkeypatch.setattr("sealscope.monitor.memory.postgresql.ANSWER_S", 1.0)
-    monkeypatch.setattr("sealscope.monitor.memory.postgresql.CONNECT_S", 2)
+    monkeypatch.setattr("sealscope.monitor.database.postgresql.ANSWER_S", 1.0)
+    monkeypatch.setattr("sealscope.monitor.database.postgresql.CONNECT_S", 2)
     engine = create_engine(server.url)
     metadata.drop_all(engine)
     engine.dispose()
@@ -249,7 +249,7 @@ def test_a_postgresql_that_hangs_is_said_and_costs_nothing(
 
 def test_a_statement_that_waits_for_a_lock_is_ended_by_the_server(server: PostgreSQL, monkeypatch):
     """Else each new try would leave a process that waits in the server."""
-    monkeypatch.setattr("sealscope.monitor.memory.postgresql.STATEMENT_S", 0.3)
+    monkeypatch.setattr("sealscope.monitor.database.postgresql.STATEMENT_S", 0.3)
     store = MonitorStore(server.url)
     other = create_engine(server.url)
     try:

@@ -56,7 +56,7 @@ def proxy(tmp_path: Path) -> Iterator[http.client.HTTPSConnection]:
         process.terminate()
         process.wait()
         page.close()
-        service._hold.close()
+        service.close()
         service.store.engine.dispose()
 
 

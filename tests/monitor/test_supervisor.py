@@ -13,7 +13,7 @@ import pytest
 from sqlalchemy.exc import OperationalError
 
 from sealscope.errors import InputError
-from sealscope.monitor.memory.store import away
+from sealscope.monitor.database.store import away
 from sealscope.monitor.service import Service
 from sealscope.monitor.sources.source_block import BlockReceiver, decoded
 from sealscope.monitor.supervisor import DATABASE, LimitedLines, PartAway, Supervisor
@@ -164,7 +164,7 @@ def test_the_log_gets_so_many_lines_a_minute_from_one_place(monkeypatch):
 
 
 def test_refused_messages_are_kept_up_to_a_limit(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr("sealscope.monitor.memory.store.KEPT_REFUSED", 20)
+    monkeypatch.setattr("sealscope.monitor.database.store.KEPT_REFUSED", 20)
     odd = b'{"t": "now \\u0000 \\ud800", "x": "' + b"x" * 9000 + b'"}'
     bad = [b"{", odd, *(b"[%d]" % k for k in range(40)), odd]
     service, _ = served(settings_in(tmp_path), b"\n".join(bad) + b"\n" + FEW)

@@ -11,9 +11,9 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 import sealscope as ss
+from sealscope.diagnosis.live.estimates import BlockEstimate, WatchBaseline
+from sealscope.diagnosis.live.watch import Watch
 from sealscope.errors import InputError
-from sealscope.monitor.stream.estimates import BlockEstimate, WatchBaseline
-from sealscope.monitor.stream.watch import Watch
 from sealscope.recordings.recording import Recording
 
 from ..diagnosis.balance_machine import machine, step

@@ -12,9 +12,9 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 import sealscope as ss
+from sealscope.diagnosis.live.estimates import BlockEstimate
+from sealscope.diagnosis.live.watch import Watch
 from sealscope.errors import InputError
-from sealscope.monitor.stream.estimates import BlockEstimate
-from sealscope.monitor.stream.watch import Watch
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.changes import Linear, ParameterDrift
 
@@ -55,7 +55,7 @@ def part(first: float, last: float) -> Recording:
 @pytest.mark.slow
 def test_a_leak_is_stated_in_litres_per_minute_with_its_onset():
     watch, estimates = whole(LENGTH)
-    assert watch.by == "pressures"
+    assert watch.method == "pressures"
     assert watch.leak is not None and watch.baseline is not None
     assert OPENS < watch.leak.raised_s < OPENS + 120.0
     low, high = watch.leak.onset_interval_s
@@ -141,9 +141,9 @@ def test_a_position_that_comes_with_the_second_block_is_used():
     watch = ss.watch("thesis", learn_hours=LEARN)
     whole = ss.simulate(command="5 sin(2t)", duration=70.0, seed=2)
     watch.update(whole.between(0, 1).only(CHANNELS))
-    assert watch.by == "pressures"
+    assert watch.method == "pressures"
     watch.update(whole.between(1, 70))
-    assert watch.by == "volumes"
+    assert watch.method == "volumes"
     assert watch.counters == {"began anew: a position is recorded, too": 1}
 
 

@@ -235,7 +235,7 @@ def test_a_proof_integrates_half_the_step_and_nothing_else_twice(monkeypatch):
         counted.append(step)
         return trajectory(*args, step=step, **more)
 
-    for module in ("simulate", "sizing"):
+    for module in ("simulate", "integrate"):
         monkeypatch.setattr(f"sealscope.simulation.{module}.trajectory", count)
     experiment = Experiment.of(duration=6.0, leak="0.01 L/min from 3 s")
     simulate_with_truth(experiment)

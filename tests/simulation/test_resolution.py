@@ -77,27 +77,3 @@ def test_an_error_must_be_a_pressure(check_rig, drive):
     for error in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(InputError, match="error must be > 0 Pa"):
             drive(check_rig(), 1.0, error=error)
-
-
-def test_the_inputs_at_the_nodes_are_those_at_the_times(check_rig):
-    offsets = np.array([1e-12, 5e-4, 1e-3])
-    start = np.arange(5000) * 1e-3
-    for command in ("3 sin(4t + 0.3) + 0.2", "9.9 sin(4t) + 3", "chirp 3 from 0.1 Hz to 5 Hz over 60 s"):
-        experiment = Experiment.of(rig=check_rig(), leak="C = 1e-10 from 2 s", duration=1.0, command="1 sin(t)")
-        object.__setattr__(experiment, "command", Experiment.of(rig=check_rig(u_max=20.0), command=command).command)
-        inputs = RunInputs(experiment, experiment.leaks)
-        if "9.9" in command:
-            inputs._duration = 0.01  # beyond the limit only where the filter looks: clipped
-
-        def expected(t, volts=experiment.command.volts):
-            volts = np.clip(volts(t), -10.0, 10.0)
-            return volts, np.zeros_like(t), 1e-10 * (t >= 2.0)
-
-        t = start[:, None] + offsets
-        for one, other in zip(inputs.at_nodes(start, offsets), expected(t), strict=True):
-            np.testing.assert_allclose(one, other, rtol=0, atol=2e-14)
-            assert one.shape == t.shape
-        later = start[:2000] + 173.0  # the sines of the first block, turned
-        for one, other in zip(inputs.at_nodes(later, offsets), expected(later[:, None] + offsets), strict=True):
-            np.testing.assert_allclose(one, other, rtol=0, atol=3e-12)
-    assert inputs.largest(start) == (0.0, 1e-10)

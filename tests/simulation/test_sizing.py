@@ -10,10 +10,9 @@ import pytest
 from sealscope.errors import InputError
 from sealscope.simulation.bench.machines import draw
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.integrate import trajectory
+from sealscope.simulation.integrate import sized_leaks, trajectory
 from sealscope.simulation.leaks import From, Growing, Leak, Tabulated, parse_leak
 from sealscope.simulation.simulate import simulate_with_truth
-from sealscope.simulation.sizing import sized_leaks
 from sealscope.units import LITRE_PER_MINUTE
 
 THROTTLED = {"orifices": "present", "closed_A": "50 %", "closed_B": "50 %"}

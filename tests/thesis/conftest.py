@@ -14,6 +14,7 @@ import pytest
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.thesis.chapters.appendix_c_runs import SimulatedTest, table_of
 from sealscope.thesis.engine.context import RunSpec, SimulatedRun, simulated_run
+from sealscope.thesis.engine.items import Item, collect
 from sealscope.thesis.engine.products import Claim, Figure, Product, ThesisTable
 from sealscope.thesis.sheet import APPENDIX_C, FILES, QUANTITIES, Condition, DataSheet, read_sheet
 
@@ -22,6 +23,9 @@ FOLDER = Path(__file__).resolve().parents[3] / "shared" / "data"
 needs_sheet = pytest.mark.skipif(
     not (FOLDER / FILES["p_A"]).is_file(), reason="../shared/data/appendix_c_pa.csv is absent"
 )
+
+
+ITEMS: dict[str, Item] = {item.id: item for item in collect()}
 
 
 class Kept:
@@ -72,7 +76,7 @@ def table_with(sheet: DataSheet, item: str, range_MPa: Callable[[Condition], flo
     for k, condition in enumerate(APPENDIX_C):
         rms = {c: {q: tuple(sheet.rms[c][q][k].tolist()) for q in QUANTITIES} for c in CHAMBERS}
         rows.append(SimulatedTest(condition, rms, condition.mean_leak_lpm, (range_MPa(condition),) * 2, True))
-    return table_of(rows, item, "made")
+    return table_of(rows, ITEMS[item])
 
 
 @pytest.fixture(scope="session")

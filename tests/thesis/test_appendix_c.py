@@ -15,8 +15,9 @@ from sealscope.thesis.chapters.appendix_c_runs import RigDrift, draw_rig_drift, 
 from sealscope.thesis.engine.products import Claim, Product, ThesisTable
 from sealscope.thesis.sheet import APPENDIX_C, QUANTITIES, DataSheet
 
-from .conftest import Kept, made_sheet, table_with
+from .conftest import ITEMS, Kept, made_sheet, table_with
 
+RUNS = ("appendix-c-leak", "appendix-c-no-leak", "appendix-c-drift")
 TWO = (APPENDIX_C[10], APPENDIX_C[11], APPENDIX_C[39])
 
 
@@ -27,7 +28,7 @@ def tables() -> dict[str, tuple[ThesisTable, ...]]:
         patch.setattr(simulation, "QUICK_HALF", 15.0)
         patch.setattr(simulation, "_SIZING", 10.0)
         context = Kept()
-        return {item.id: simulation.runs_table(context, item) for item in simulation.ITEMS}  # type: ignore[arg-type]
+        return {name: simulation.runs_table(context, ITEMS[name]) for name in RUNS}  # type: ignore[arg-type]
 
 
 def test_a_table_reads_back_as_the_sheet_it_holds(tables: dict[str, tuple[ThesisTable, ...]]) -> None:
@@ -104,8 +105,7 @@ def test_the_appendix_stands_beside_the_sheet_where_there_is_one(given: bool) ->
     still = full_table(made_sheet(2, scatter=0.01), "appendix-c-no-leak")
     products: dict[str, tuple[Product | Claim, ...]] = {"appendix-c-leak": (leak,), "appendix-c-no-leak": (still,)}
     context = Kept(products, measured if given else None)
-    items = {item.id: item for item in appendix_c.ITEMS}
-    summary, of_a, of_b = appendix_c.appendix(context, items["appendix-c"])  # type: ignore[arg-type]
+    summary, of_a, of_b = appendix_c.appendix(context, ITEMS["appendix-c"])  # type: ignore[arg-type]
     assert (summary.id, of_a.id, of_b.id) == ("appendix-c", "appendix-c-pa", "appendix-c-pb")
     assert (len(summary.rows), len(of_a.rows), len(of_b.rows)) == (10, 41, 41)
     first = dict(zip(summary.columns, summary.rows[0], strict=True))
@@ -116,7 +116,7 @@ def test_the_appendix_stands_beside_the_sheet_where_there_is_one(given: bool) ->
     assert row["d3 diff, simulated [%]"] == pytest.approx(100 * (pair[1] / pair[0] - 1))
     assert row["d3 no leak, measured [psi]"] == (pytest.approx(pair[0] / 2) if given else None)
 
-    (figure,) = appendix_c.difference_figure(context, items["fig-5.90"])  # type: ignore[arg-type]
+    (figure,) = appendix_c.difference_figure(context, ITEMS["fig-5.90"])  # type: ignore[arg-type]
     roles = [curve.role for curve in figure.panels[0].curves]
     assert roles == [*(["measured"] if given else []), "simulated", "no leak", "reference"]
     counts = {number.name: number.value for number in figure.numbers}
@@ -128,10 +128,9 @@ def test_the_appendix_stands_beside_the_sheet_where_there_is_one(given: bool) ->
 @pytest.mark.long
 def test_the_thesis_s_rule_fires_like_a_coin_where_nothing_leaks() -> None:
     context = Kept()
-    items = {item.id: item for item in simulation.ITEMS}
-    still = sheet_of(simulation.runs_table(context, items["appendix-c-no-leak"])[0])  # type: ignore[arg-type]
-    drift = sheet_of(simulation.runs_table(context, items["appendix-c-drift"])[0])  # type: ignore[arg-type]
-    leak = sheet_of(simulation.runs_table(context, items["appendix-c-leak"])[0])  # type: ignore[arg-type]
+    still = sheet_of(simulation.runs_table(context, ITEMS["appendix-c-no-leak"])[0])  # type: ignore[arg-type]
+    drift = sheet_of(simulation.runs_table(context, ITEMS["appendix-c-drift"])[0])  # type: ignore[arg-type]
+    leak = sheet_of(simulation.runs_table(context, ITEMS["appendix-c-leak"])[0])  # type: ignore[arg-type]
     for sheet in (still, drift):  # beyond 9 to 32 one column in 4000 of coins
         for chamber in CHAMBERS:
             assert 9 <= np.sum(sheet.log_change(chamber, "d1") < 0) <= 32, chamber

@@ -10,7 +10,7 @@ import pytest
 from sealscope.thesis.chapters import chapter6
 from sealscope.thesis.engine.products import Figure, ThesisTable
 
-from .conftest import Kept
+from .conftest import ITEMS, Kept
 
 
 def test_an_amplitude_is_found_beside_a_drift():
@@ -28,7 +28,7 @@ def test_a_leak_has_its_size_under_the_load():
 
 def test_stiffness_falls_with_a_leak_and_comes_back():
     healthy, fixed, tolerant = (
-        chapter6.stiffness(name, lpm) for name, lpm in (("pi", 0.0), ("pi", 0.5), ("fault-tolerant", 0.5))
+        chapter6.ControlledRig(*of).stiffness() for of in (("pi", 0.0), ("pi", 0.5), ("fault-tolerant", 0.5))
     )
     assert fixed < 0.5 * healthy
     assert tolerant > 0.9 * healthy
@@ -58,8 +58,8 @@ class Given(Kept):
             for lpm in (0.0, 0.5)
         ]
         self.tables = {
-            "sec-6.2-valve": ThesisTable("v", "", chapter6.VALVE_COLUMNS, tuple(by_source)),
-            "sec-6.2-controllers": ThesisTable("c", "", chapter6.COLUMNS, tuple(rows)),
+            "sec-6.2-valve": ThesisTable("v", "", ITEMS["sec-6.2-valve"].columns, tuple(by_source)),
+            "sec-6.2-controllers": ThesisTable("c", "", ITEMS["sec-6.2-controllers"].columns, tuple(rows)),
             "sec-6.2-open-loop": ThesisTable(
                 "o", "", ("",) * 6, ((0.0, 38.0, -8.0, 0.0, 0.0, 0.0), (0.5, 37.0, -800.0, -790.0, size["drift"], 0.0))
             ),
@@ -82,26 +82,25 @@ class Given(Kept):
     ],
 )
 def test_claims_follow_their_tables(changed, verdicts):
-    judged = chapter6.judge_claims(Given(**changed), chapter6.ITEMS[-1])
+    judged = chapter6.judge_claims(Given(**changed), ITEMS["chapter-6-claims"])
     assert tuple(claim.verdict for claim in judged) == verdicts
 
 
 @pytest.mark.slow
 def test_the_tables_are_made():
-    by_id = {item.id: item for item in chapter6.ITEMS}
-    table, figure = chapter6.controllers_table(Kept(), by_id["sec-6.2-controllers"])
+    table, figure = chapter6.controllers_table(Kept(), ITEMS["sec-6.2-controllers"])
     assert len(table.rows) == 2 * len(chapter6.CONTROLLERS)
     assert len(figure.panels) == 2
-    (opened,) = chapter6.open_loop_table(Kept(), by_id["sec-6.2-open-loop"])
+    (opened,) = chapter6.open_loop_table(Kept(), ITEMS["sec-6.2-open-loop"])
     assert abs(opened.rows[1][3]) > 600.0
     assert abs(opened.rows[1][4]) < 0.1
 
 
 @pytest.mark.slow
 def test_oil_that_leaves_past_a_rod_seal_lowers_pressure_and_stiffness():
-    (table,) = chapter6.outside_table(Kept(), next(item for item in chapter6.ITEMS if item.id == "sec-6.2-outside"))
+    (table,) = chapter6.outside_table(Kept(), ITEMS["sec-6.2-outside"])
     by = {row[0]: row[3:] for row in table.rows}
-    intact = chapter6.stiffness("pi", 0.0)
+    intact = chapter6.ControlledRig("pi", 0.0).stiffness()
     for side in ("A", "B"):
         error, stiff, made_good, fallen = by[side]
         assert error < 0.1
@@ -113,7 +112,7 @@ def test_oil_that_leaves_past_a_rod_seal_lowers_pressure_and_stiffness():
 
 @pytest.mark.slow
 def test_the_comparison_of_pump_and_valve_is_made():
-    table, figure = chapter6.valve_table(Kept(), next(item for item in chapter6.ITEMS if item.id == "sec-6.2-valve"))
+    table, figure = chapter6.valve_table(Kept(), ITEMS["sec-6.2-valve"])
     assert len(table.rows) == 8
     assert len(figure.panels) == 2
     by = {row[:3]: row[3:] for row in table.rows}

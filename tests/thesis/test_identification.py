@@ -9,7 +9,6 @@ from sealscope.parameters import load_rig
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.signals.details import details
 from sealscope.thesis.identification import (
-    ITEMS,
     Hypothesis,
     fit_table,
     log_residuals,
@@ -29,7 +28,7 @@ from sealscope.thesis.sheet import (
 )
 from sealscope.units import PSI
 
-from .conftest import Kept, needs_sheet
+from .conftest import ITEMS, Kept, needs_sheet
 
 
 def test_conditions_are_the_tests_of_the_appendix() -> None:
@@ -120,7 +119,7 @@ def test_only_the_leak_free_columns_are_read(measured_sheet: DataSheet, residual
 
 
 def test_the_table_of_parameters_shows_every_fitted_value_with_its_interval() -> None:
-    table = parameters_table(Kept(), ITEMS[0])[0]
+    table = parameters_table(Kept(), ITEMS["calibration"])[0]
     values = {row[0]: row for row in table.rows}
     assert {"fluid.K_oil", "motor.omega_per_volt", "line.V_1", "line.V_2", "sensors.p_A.noise"} <= set(values)
     assert all(
@@ -132,7 +131,7 @@ def test_the_table_of_parameters_shows_every_fitted_value_with_its_interval() ->
 
 @needs_sheet
 def test_the_table_of_the_fit_has_every_condition_once(measured_sheet: DataSheet) -> None:
-    summary, by_condition = fit_table(Kept(sheet=measured_sheet), ITEMS[1])
+    summary, by_condition = fit_table(Kept(sheet=measured_sheet), ITEMS["calibration-fit"])
     assert [row[:2] for row in summary.rows] == [(c, q) for c in CHAMBERS for q in QUANTITIES]
     assert sum(int(str(row[2])) for row in by_condition.rows) == 41
     weights = np.array([float(str(row[2])) for row in by_condition.rows])

@@ -8,6 +8,7 @@ import signal
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from threading import Timer
 from typing import Annotated, Any
 
@@ -114,11 +115,15 @@ def spread_baselines(words: Sequence[str]) -> list[str]:
     plain += words[end:]
     if not all(groups):
         raise InputError("--baseline must be followed by one file or more, got none")
-    called: Any = typer.main.get_command(app)
-    files = called.commands[words[0]].make_context(words[0], list(plain), resilient_parsing=True).params["files"]
+    files = _command().commands[words[0]].make_context(words[0], list(plain), resilient_parsing=True).params["files"]
     options = [word for group in groups for name in (group if files else group[:1]) for word in ("--baseline", name)]
     left = [] if files else [name for group in groups for name in group[1:]]
     return [words[0], *options, *left, *plain]
+
+
+@cache
+def _command() -> Any:
+    return typer.main.get_command(app)
 
 
 def main() -> None:
@@ -133,7 +138,7 @@ def main() -> None:
             stream.reconfigure(errors="backslashreplace")
     try:
         with _no_interrupt_lost():
-            status = app(arguments_of(sys.argv[1:]), prog_name="sealscope", standalone_mode=False)
+            status = _command()(arguments_of(sys.argv[1:]), prog_name="sealscope", standalone_mode=False)
             sys.stdout.flush()
     except typer.Exit as error:
         status = error.exit_code

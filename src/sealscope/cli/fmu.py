@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from typer import Option, echo
 
-from sealscope.cli.options import RigOption, SetOption, check_folder, rig_with
+from sealscope.cli.options import RigOption, SetOption, check_folder, declared, rig_with
 from sealscope.errors import InputError
 
 _PLATFORM = (
@@ -28,7 +28,7 @@ def fmu(
     version: Annotated[int, Option("--fmi", help="Version of the interface, 2 or 3.")] = 2,
     platforms: Annotated[list[str] | None, Option("--platform", help=_PLATFORM)] = None,
     error: Annotated[str, Option(help=_ERROR)] = "1[Pa]",
-    step: Annotated[str | None, Option(help="Longest step of the solver [s] instead.")] = None,
+    step: Annotated[str | None, declared("step")] = None,
     sensor: Annotated[str | None, Option(help=_SENSOR)] = None,
     rate: Annotated[str | None, Option(help="Sampling rate of the soft sensor (500 Hz).")] = None,
 ) -> None:

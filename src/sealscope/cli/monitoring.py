@@ -81,8 +81,8 @@ def export(
     folder: Annotated[Path, Option("--output", "-o", metavar="FOLDER", help="Where the tables are written.")],
 ) -> None:
     """Write what persons said of alarms as labelled data: alarms.csv and estimates.csv."""
-    from sealscope.monitor.memory.export import export_labels
-    from sealscope.monitor.memory.store import MonitorStore
+    from sealscope.monitor.database.export import export_labels
+    from sealscope.monitor.database.store import MonitorStore
     from sealscope.monitor.settings import read_settings
     from sealscope.storage.folders import make_folder
 

@@ -9,17 +9,19 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from functools import partial, wraps
+from inspect import Parameter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from textwrap import fill
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-from typer import Context, Option, echo
+from typer import Argument, Context, Option, echo
 
 from sealscope.errors import InputError, SealscopeError, UnreadableFile
+from sealscope.simulation.arguments import Arguments
 
 if TYPE_CHECKING:
     from sealscope.diagnosis.commissioned.machine import CommissionedMachine
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
     from sealscope.recordings import Recording
     from sealscope.recordings.formats.columns import ChannelMap
+    from sealscope.simulation.experiment import Experiment
 
 T = TypeVar("T")
 #: Exit status where a verdict is one of those that `--fail-on` names.
@@ -61,7 +64,20 @@ def _overrides() -> list[str]:
 
 
 complete_rigs = completing(_rig_names)
-RigOption = Annotated[str, Option("--rig", help="Rig by name, or its TOML file.", autocompletion=complete_rigs)]
+
+
+def declared(name: str, *, option: str = "", several: bool = False, **shown: Any) -> Any:
+    """Return the option for an argument of `Experiment.of`, with the text that is declared there."""
+    text = _text_of(name) + (" Repeat for several." if several else "")
+    return Option(option or f"--{name.replace('_', '-')}", help=text, **shown)
+
+
+def _text_of(name: str) -> str:
+    return str(Arguments.__dataclass_fields__[name].metadata["text"])
+
+
+RigOption = Annotated[str, declared("rig", autocompletion=complete_rigs)]
+RigArgument = Annotated[str, Argument(help=_text_of("rig"), autocompletion=complete_rigs)]
 AssumeOption = Annotated[
     str | None,
     Option(
@@ -77,10 +93,9 @@ _DISPLACEMENT = "Displacement of the pump, '4.9 cm^3/rev', which L/min rests on 
 DisplacementOption = Annotated[str | None, Option("--displacement", metavar="VOLUME[unit]", help=_DISPLACEMENT)]
 _LIMIT = "Leak to be repaired: a flow, '5 mL/min', or a speed of creep. [default: 8 mm/min]"
 LimitOption = Annotated[str | None, Option("--limit", metavar="LEAK[unit]", help=_LIMIT)]
-_SET = "Override a parameter; repeat."
 SetOption = Annotated[
     list[str] | None,
-    Option("--set", metavar="NAME=VALUE[unit]", help=_SET, autocompletion=completing(_overrides)),
+    declared("set", several=True, metavar="NAME=VALUE[unit]", autocompletion=completing(_overrides)),
 ]
 MapOption = Annotated[
     list[str] | None,
@@ -99,7 +114,7 @@ BaselineOption = Annotated[list[Path] | None, Option("--baseline", metavar="FILE
 _MACHINE = "The machine's file, by `sealscope commission`; it states map, rig, limit and healthy recordings."
 MachineOption = Annotated[Path | None, Option("--machine", metavar="FILE", help=_MACHINE)]
 FalseAlarmOption = Annotated[float, Option("--false-alarm", help="Probability of `leak` on a leak-free recording.")]
-SeedOption = Annotated[int, Option("--seed", help="Seed of the instruments' noise.")]
+SeedOption = Annotated[int, declared("seed")]
 _JOBS = "Processes; by default one a core, two a core at most."
 JobsOption = Annotated[int | None, Option("--jobs", "-j", help=_JOBS)]
 _FAIL_ON = "End with status 3 on this verdict; repeat."
@@ -206,7 +221,7 @@ class StatedMachine:
         yield files[0], join(whole, names=[file.name for file in files]) if len(whole) == len(files) else None
 
     def diagnose(
-        self, recording: Recording, baseline: Sequence[Recording], file: Path, false_alarm: float, quick: bool
+        self, recording: Recording, baseline: Sequence[Recording], file: Path, false_alarm: float
     ) -> Diagnosis:
         """Diagnose a recording of this machine."""
         from dataclasses import replace
@@ -214,27 +229,57 @@ class StatedMachine:
         from sealscope.diagnosis.diagnose import diagnose
 
         if self.known is not None:
-            own = self.known.diagnose(recording, false_alarm_probability=false_alarm, quick=quick)
+            own = self.known.diagnose(recording, false_alarm_probability=false_alarm)
             return replace(own, file=str(file))
-        stated: dict[str, Any] = {"rig": self.rig, "limit": self.limit, "quick": quick, "file": file}
+        stated: dict[str, Any] = {"rig": self.rig, "limit": self.limit, "file": file}
         return diagnose(recording, baseline, false_alarm_probability=false_alarm, **stated)
 
 
 def stating(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Give a command the options of `StatedMachine.of`, or those of these names, in place of its parameter `stated`."""
+    every = inspect.signature(StatedMachine.of, eval_str=True).parameters
+    return _taking("stated", StatedMachine.of, [every[name] for name in names or every])
+
+
+def simulating(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command an option for each argument of `Experiment.of` in place of its parameter `experiment`."""
+    known = {"rig": RigOption, "set": SetOption, "x_0": Annotated[str, declared("x_0", option="--start-position")]}
+    known |= {name: Annotated[list[str] | None, declared(name, several=True)] for name in ("leak", "fault")}
+    options = []
+    for own in fields(Arguments):
+        if own.name == "drifts":  # no text says what drifts
+            continue
+        default = f"{own.default:g}" if isinstance(own.default, float) else own.default
+        kind = str | None if default is None else type(default)
+        annotation = known.get(own.name, Annotated[kind, declared(own.name)])
+        options.append(Parameter(own.name, Parameter.KEYWORD_ONLY, default=default, annotation=annotation))
+    return _taking("experiment", _experiment, options)(command)
+
+
+def _experiment(rig: str, set: Sequence[str] | None, **given: Any) -> Experiment:
+    from sealscope.simulation.experiment import Experiment
+
+    return Experiment.of(rig=rig_with(rig, set), **given)
+
+
+def _taking(
+    name: str, make: Callable[..., Any], options: Sequence[Parameter]
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command options in place of its parameter `name`, which is what `make` makes of them."""
 
     def decorated(command: Callable[..., None]) -> Callable[..., None]:
+        command.__annotations__[name] = Any  # the type may not be loaded yet
         own = inspect.signature(command, eval_str=True)
-        every = inspect.signature(StatedMachine.of, eval_str=True).parameters
-        options = [every[name] for name in names or every]
 
         @wraps(command)
         def call(**given: Any) -> None:
-            stated = StatedMachine.of(**{option.name: given.pop(option.name) for option in options})
-            command(stated=stated, **given)
+            made = make(**{option.name: given.pop(option.name) for option in options})
+            command(**{name: made}, **given)
 
-        kept = [parameter for parameter in own.parameters.values() if parameter.name != "stated"]
-        by_name = [parameter.replace(kind=parameter.KEYWORD_ONLY) for parameter in (*kept, *options)]
+        parameters = list(own.parameters.values())
+        place = list(own.parameters).index(name)
+        parameters[place : place + 1] = options
+        by_name = [parameter.replace(kind=parameter.KEYWORD_ONLY) for parameter in parameters]
         call.__signature__ = own.replace(parameters=by_name)  # type: ignore[attr-defined]
         return call
 

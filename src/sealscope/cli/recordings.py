@@ -51,7 +51,6 @@ def diagnose(
     output: Annotated[Literal["text", "jsonl"], Option("--format", help="Text, or one JSON object a line.")] = "text",
     join: opt.JoinOption = False,
     false_alarm: opt.FalseAlarmOption = 0.01,
-    quick: Annotated[bool, Option("--quick", help="Stop at the first method with a verdict.")] = False,
     quiet: Annotated[bool, Option("--quiet", "-q", help="Print the first line of each verdict only.")] = False,
     fail_on: Annotated[list[FailOn] | None, Option("--fail-on", metavar="VERDICT|LEVEL", help=_FAIL_ON)] = None,
 ) -> None:
@@ -68,7 +67,7 @@ def diagnose(
     if stated.known is not None and any(path.is_dir() for path in files):
         files = recordings_in(files)
         form = form if form == "jsonl" else "table"
-    work = partial(_dated, machine=stated, joined=join, false_alarm=false_alarm, quick=quick)
+    work = partial(_dated, machine=stated, joined=join, false_alarm=false_alarm)
     jobs = min(cores(), len(files))
     piped = _check_standard_input([*files, *stated.baseline])
     # what a baseline costs is spent once, and standard input is this process's
@@ -134,7 +133,7 @@ def _check_standard_input(files: Iterable[Path]) -> bool:
 
 
 def _diagnoses(
-    files: Sequence[Path], machine: opt.StatedMachine, joined: bool, false_alarm: float, quick: bool = False
+    files: Sequence[Path], machine: opt.StatedMachine, joined: bool, false_alarm: float
 ) -> Iterator[Judged | None]:
     """Yield recording and diagnosis of each file, None for one that cannot be read; no file is its own baseline."""
     baseline = machine.baseline
@@ -154,7 +153,7 @@ def _diagnoses(
             opt.complain(f"no other baseline than the file itself could be read, so it is not diagnosed ({file})")
             yield None
         else:
-            diagnosis = opt.attempt(file, partial(machine.diagnose, recording, others, file, false_alarm, quick))
+            diagnosis = opt.attempt(file, partial(machine.diagnose, recording, others, file, false_alarm))
             yield None if diagnosis is None else (recording, diagnosis)
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from typer import Argument, Context, Option, Typer, echo
 
-from sealscope.cli.options import check_folder, complete_rigs, say_wrapped, write_text
+from sealscope.cli.options import RigArgument, check_folder, declared, say_wrapped, write_text
 from sealscope.errors import InputError
 
 rigs = Typer(
@@ -19,7 +19,6 @@ AreaB = Annotated[
     str, Option("--area-B", help="Piston area on side B: with the rod, if there is one.", prompt="... on side B [mm^2]")
 ]
 Displacement = Annotated[str, Option(help="Displacement of the pump.", prompt="Displacement of the pump [cm^3/rev]")]
-_CONTROLLER = "Controller by name, or your own as FILE.py:NAME or MODULE:NAME."
 
 
 @rigs.callback(invoke_without_command=True)
@@ -76,10 +75,8 @@ def new(
 
 @rigs.command("margins")
 def print_margins(
-    rig: Annotated[
-        str, Argument(help="Rig by name, or its TOML file.", autocompletion=complete_rigs)
-    ] = "thesis-closed-loop",
-    controller: Annotated[str, Option(help=_CONTROLLER)] = "pi",
+    rig: RigArgument = "thesis-closed-loop",
+    controller: Annotated[str, declared("controller")] = "pi",
     load: Annotated[str, Option(help="Force against +x beside the rig's own [N].")] = "0",
 ) -> None:
     """Print gain, phase and delay margin of a position loop, at standstill and at three speeds of the piston."""

@@ -8,54 +8,26 @@ import sys
 from pathlib import Path
 from shutil import get_terminal_size
 from textwrap import fill, wrap
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from typer import Argument, Context, Option, echo
+from typer import Context, Option, echo
 
 from sealscope.cli import options as opt
 from sealscope.errors import InputError
 
-_COMMAND = (
-    "Command, e.g. '3 sin(4t)', 'chirp 3 from 0.1 Hz to 5 Hz over 60 s'; or a target for the piston: 'position 50 mm "
-    "sin(2t)'."
-)
-_LOAD = (
-    "Force against +x beside the rig's own, e.g. '2 kN', 'step 500 N at 3 s', '200 N/mm over x', '2 kN s/m over v', "
-    "'file LOAD.csv' (F [N] over t, x or v)."
-)
-_CONTROLLER = (
-    "What controls the position: pi, flatness, fault-tolerant, fault-tolerant-flatness, or your own as FILE.py:NAME or "
-    "MODULE:NAME. [default: pi]"
-)
-_LEAK = "Leak, e.g. '0.0042 L/min from 90 s'; repeat to combine."
-_FAULT = "Other fault, e.g. 'air 1 % from 90 s', 'sensor p_A offset 2 psi'; repeat."
-_RATE = "Sampling rate [Hz]; by default the rig's own (daq.sample_rate)."
-_ERROR = "Error that a pressure may have, e.g. '20[Pa]', instead of a step. [default: 100]"
+if TYPE_CHECKING:
+    from sealscope.simulation.experiment import Experiment
+
 _PROVE = "Halve the step and report how far everything moves; fail if too far."
 _FMU = "Record this unit (.fmu, a program that runs with your rights) instead of the rig, by the rig's instruments."
 _MAP = "The unit's own name of a channel or an input; repeat."
 
 
+@opt.simulating
 def simulate(
     output: Annotated[Path, Option("--output", "-o", help="Recording to write (.nc, .h5, .csv, .parquet).")],
-    rig: opt.RigOption = "thesis",
-    command: Annotated[str, Option(help=_COMMAND)] = "3 sin(4t)",
-    load: Annotated[str | None, Option(help=_LOAD)] = None,
-    controller: Annotated[str | None, Option(help=_CONTROLLER)] = None,
-    leak: Annotated[list[str] | None, Option(help=_LEAK)] = None,
-    fault: Annotated[list[str] | None, Option(help=_FAULT)] = None,
-    duration: Annotated[str, Option(help="Length, e.g. '180', '3 min' [s].")] = "180",
-    rate: Annotated[str | None, Option(help=_RATE)] = None,
-    start: Annotated[str, Option("--start-position", help="Position at the start, from mid-stroke [m].")] = "0",
-    seed: opt.SeedOption = 0,
-    overrides: opt.SetOption = None,
-    method: Annotated[str, Option(help="auto, rk4 or imex.")] = "auto",
-    step: Annotated[str | None, Option(help="Largest step of the solver [s].")] = None,
-    error: Annotated[str | None, Option(help=_ERROR)] = None,
+    experiment: Experiment,
     prove: Annotated[bool, Option("--prove", help=_PROVE)] = False,
-    allow_unresolved: Annotated[
-        bool, Option("--allow-unresolved", help="Let an unstable or unresolved run through, marked.")
-    ] = False,
     truth: Annotated[Path | None, Option(help="Write what was put in (leaks, onset) to this JSON file.")] = None,
     fmu: Annotated[Path | None, Option(help=_FMU)] = None,
     maps: Annotated[list[str] | None, Option("--map", metavar="CHANNEL=NAME", help=_MAP)] = None,
@@ -63,9 +35,7 @@ def simulate(
     """Simulate the rig, or run somebody else's unit, and record it as the rig's instruments would."""
     from sealscope.recordings import write
     from sealscope.recordings.files import check_target
-    from sealscope.simulation.experiment import Experiment
     from sealscope.simulation.simulate import simulate_with_truth, write_truth
-    from sealscope.units import LITRE_PER_MINUTE
 
     check_target(output)
     opt.check_folder(output)
@@ -73,43 +43,25 @@ def simulate(
         opt.check_folder(truth)
         if truth.resolve() == output.resolve():
             raise InputError(f"recording and truth must be two files, got {output} for both")
-    experiment = Experiment.of(
-        rig=opt.rig_with(rig, overrides), command=command, load=load, controller=controller, leak=leak, fault=fault,
-        duration=duration, rate=rate, x_0=start, seed=seed, step=step, error=error, allow_unresolved=allow_unresolved,
-        method=method,  # type: ignore[arg-type]  # checked by Experiment
-    )  # fmt: skip
-    if fmu is not None:
-        if truth is not None or prove:
-            raise InputError("--truth and --prove are of the rig, got them with --fmu")
-        from sealscope.fmu.recording import record_fmu
-
-        pairs = dict(_pair(text) for text in maps or ())
-        with opt.progress() as report:
-            recording = record_fmu(fmu, experiment, map=pairs, progress=report)
-        write(recording, output)
-        opt.say_wrapped(
-            f"{output}: {len(recording)} samples at {recording.rate:g} Hz, {experiment.command} ({fmu.name})"
-        )
-        return
-    if maps:
+    if fmu is not None and (truth is not None or prove):
+        raise InputError("--truth and --prove are of the rig, got them with --fmu")
+    if fmu is None and maps:
         raise InputError("--map names the variables of a unit, got it without --fmu")
     with opt.progress() as report:
-        run = simulate_with_truth(experiment, report, prove=prove)
-    write(run.recording, output)
-    if truth is not None:
+        if fmu is None:
+            run = simulate_with_truth(experiment, report, prove=prove)
+            recording, (by, *lines) = run.recording, run.lines()
+        else:
+            from sealscope.fmu.recording import record_fmu
+
+            recording = record_fmu(fmu, experiment, map=dict(map(_pair, maps or ())), progress=report)
+            by, lines = fmu.name, []
+    write(recording, output)
+    if fmu is None and truth is not None:
         write_truth(run.truth, truth)
-    if run.proof is not None:
+    if fmu is None and run.proof is not None:
         echo(run.proof.text())
-    solver = run.recording.provenance["solver"]
-    lines = [f"{output}: {len(run.recording)} samples at {experiment.rate:g} Hz, {experiment.command}"]
-    lines[-1] += f" ({solver['method']}, h = {solver['step_s']:.3g} s)"
-    lines += [f"leak: {own}" for own in run.truth.leaks] + [f"fault: {own}" for own in run.truth.faults]
-    if run.truth.leaks:
-        lines.append(f"mean leak while open: {run.truth.mean_leak_lpm:.5g} L/min")
-    if "q_comp" in run.recording:
-        flow = float(run.recording["q_comp"][-max(1, round(experiment.rate)) :].mean()) / LITRE_PER_MINUTE
-        lines.append(f"the controller compensates: {flow:.4g} L/min at the end (channel q_comp)")
-    for line in lines:
+    for line in (f"{output}: {len(recording)} samples at {recording.rate:g} Hz, {experiment.command} ({by})", *lines):
         opt.say_wrapped(line)
 
 
@@ -121,7 +73,7 @@ def _pair(text: str) -> tuple[str, str]:
 
 
 def parameters(
-    rig: Annotated[str, Argument(help="Rig by name, or its TOML file.", autocompletion=opt.complete_rigs)] = "thesis",
+    rig: opt.RigArgument = "thesis",
     overrides: opt.SetOption = None,
     form: Annotated[Literal["table", "csv", "json"], Option("--format", help="Table, CSV or JSON.")] = "table",
 ) -> None:

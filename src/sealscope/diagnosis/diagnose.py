@@ -1,4 +1,4 @@
-"""Diagnosis of a recording: inspect the data, run every detector that its channels allow, state one verdict."""
+"""Diagnosis of a recording: inspect the data, run the detectors that its channels allow, state one verdict."""
 
 from __future__ import annotations
 
@@ -106,24 +106,12 @@ class Examination:
         evidence = checked(detector.examine(self.recording, baseline, self.false_alarm_probability))
         return replace(evidence, detector=name, share=self.share * evidence.share)
 
-    def fused(self, quick: bool = False) -> Evidence:
-        """Return one verdict from all registered detectors; `quick`: from those down to the one that judges.
-
-        Two run at a time: compiled code runs beside the interpreter, and a detector's evidence does not depend on the
-        others.
-        """
-        from concurrent.futures import ThreadPoolExecutor
-
-        from threadpoolctl import threadpool_limits
-
-        names = sorted(detectors(), key=rank)
-        # the limit is the process's: set here, it does not change while detectors come and go
-        with threadpool_limits(limits=1), ThreadPoolExecutor(2) as pool:
-            evidences = [] if quick else list(pool.map(self.evidence, names))
-            for name in names if quick else ():
+    def fused(self) -> Evidence:
+        """Return one verdict from all registered detectors but those that only stand in for one which judges."""
+        evidences: list[Evidence] = []
+        for name in sorted(detectors(), key=rank):
+            if name not in ORDER or judging(evidences) is None:
                 evidences.append(self.evidence(name))
-                if judging(evidences) is not None:
-                    break
         other = None if self.distrust else other_step(self.recording, RAREST)
         return judged(evidences, other, self.refusal)
 
@@ -143,13 +131,12 @@ def diagnose(
     false_alarm_probability: float = FALSE_ALARM_PROBABILITY,
     rig: Rig | str | os.PathLike[str] | None = None,
     limit: str | None = None,
-    quick: bool = False,
     file: str | os.PathLike[str] | None = None,
 ) -> Diagnosis:
     """Say whether oil bypasses the piston in a recording.
 
-    Every detector that the channels allow is run. The first with a verdict judges: by volumes, by the response of the
-    pressures, then plug-ins, last by the change of RMS; the others are stated beside it.
+    The balance of volumes judges; where the channels allow none, the response of the pressures does, then plug-ins,
+    last the change of RMS. What plug-ins and the change of RMS say is stated beside the verdict.
 
     Parameters
     ----------
@@ -165,8 +152,6 @@ def diagnose(
         the thesis's, stated for a recording that was simulated with it, else a mere assumption.
     limit : str, optional
         Leak from which the machine is to be repaired: a flow (``"5 mL/min"``) or a creep (``"8 mm/min"``, the default).
-    quick : bool, optional
-        Stop at the detector that judges: the same verdict and figures in a fraction of the time.
     file : str or path-like, optional
         Name of the recording in the diagnosis; by default that of the file it was read from.
 
@@ -201,7 +186,7 @@ def diagnose(
         distrust=inspection.distrust,
         refusal=compared.refusal,
         share=inspection.share,
-    ).fused(quick)
+    ).fused()
     return Diagnosis.of(
         evidence,
         recording,

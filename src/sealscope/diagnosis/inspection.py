@@ -95,12 +95,10 @@ def _inspection(recording: Recording, names: Sequence[str]) -> Inspection:
                 f"{count} samples"
             )
             findings.append(Finding("part_analysed", "warning", None, count - len(part), float(part.t[0]), text))
-    distrust = None
-    for own in findings:
-        # a chamber that empties into the tank stays at the rail for a while in any stroke
-        spoils = own.code in ("constant", "stuck") or (own.code == "clipped" and own.count > len(part) / 2)
-        if spoils and own.channel in chambers and distrust is None:
-            distrust = f"the pressures cannot be trusted: {own.text}"
+    wrong = [own for own in findings if own.channel in chambers and own.code in ("constant", "stuck")]
+    lost = [own for own in findings if own.channel in chambers and own.code == "clipped" and own.count > len(part) / 2]
+    wrong += lost if len(lost) == len(chambers) else []  # else the other one says what it says
+    distrust = f"the pressures cannot be trusted: {wrong[0].text}" if wrong else None
     if distrust is None and len(part) >= SHORTEST and (reason := no_readings(part)):
         distrust = f"this is no recording of a hydraulic machine: {reason}"
     return Inspection(part, tuple(findings), distrust, len(part) / max(count, 1))

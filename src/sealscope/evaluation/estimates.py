@@ -14,29 +14,17 @@ from sealscope.evaluation.checks import Array, numbers, share
 
 
 @dataclass(frozen=True)
-class EstimateError:
-    """Errors of an estimate.
+class EstimateErrors:
+    """Errors, estimate less truth, over the `n` records that state an estimate; `without` had none.
 
-    `bias`: estimate less truth; `rmse`: root mean square error; `coverage`: how often the estimate's own interval held
-    the truth; `without`: records without an estimate.
-    """
-
-    bias: IntervalEstimate
-    rmse: IntervalEstimate
-    coverage: Proportion
-    without: int
-
-
-@dataclass(frozen=True)
-class OnsetErrors:
-    """Errors of the onset [s] over the `n` records that state one; `without` had none.
-
-    Signed `median` (late is positive), `median_size` and `ninety_size` of its size, and how often the stated interval
-    held the true onset (`coverage`).
+    `bias`: their mean; `rmse`: root mean square; `median` (signed), `median_size` and `ninety_size` of their size;
+    `coverage`: how often the estimate's own interval held the truth.
     """
 
     n: int
     without: int
+    bias: IntervalEstimate
+    rmse: IntervalEstimate
     median: IntervalEstimate
     median_size: IntervalEstimate
     ninety_size: IntervalEstimate
@@ -107,54 +95,34 @@ def _beside(values: npt.ArrayLike | None, n: int, what: str) -> Array:
     return array
 
 
-def estimate_error(
+def estimate_errors(
     estimates: npt.ArrayLike,
     truth: npt.ArrayLike,
     low: npt.ArrayLike | None = None,
     high: npt.ArrayLike | None = None,
     confidence: float = 0.95,
-) -> EstimateError:
-    """Return bias, rmse and coverage of an estimate (a leak in L/min) with intervals.
+) -> EstimateErrors:
+    """Return the errors of an estimate (a leak in L/min, an onset in s) with intervals.
 
     All (n,) in one unit; nan where a record has no estimate or no interval. The interval of the rmse is the square
-    root of the Student interval of the mean square error, cut at 0. Coverage is over the records with an interval.
+    root of the Student interval of the mean square error, cut at 0; those of the quantiles are of order statistics.
+    Coverage is over the records with an interval. Raises InputError where no record has an estimate.
     """
     true = numbers(truth, "true values")
     given = _beside(estimates, true.size, "estimates")
     known = np.isfinite(given)
+    if not known.any():
+        raise InputError(f"errors need at least one estimate, got none in {true.size} records")
     error = given[known] - true[known]
-    square = mean_of(error**2, confidence)
-    roots = [math.sqrt(max(x, 0.0)) if not math.isnan(x) else math.nan for x in (square.value, square.low, square.high)]
-    return EstimateError(
+    square, size = mean_of(error**2, confidence), np.abs(error)
+    roots = [math.sqrt(max(x, 0.0)) for x in (square.value, square.low, square.high)]
+    return EstimateErrors(
+        n=error.size,
+        without=true.size - error.size,
         bias=mean_of(error, confidence),
         rmse=IntervalEstimate(square.n, *roots),
-        coverage=_coverage(low, high, true, confidence),
-        without=int(true.size - known.sum()),
-    )
-
-
-def onset_errors(
-    estimates: npt.ArrayLike,
-    onsets: npt.ArrayLike,
-    low: npt.ArrayLike | None = None,
-    high: npt.ArrayLike | None = None,
-    confidence: float = 0.95,
-) -> OnsetErrors:
-    """Return the errors of the estimated onsets [s] against the true ones, with order-statistic intervals.
-
-    All (n,); nan where none was stated. Raises InputError where no record has an estimate.
-    """
-    true = numbers(onsets, "true onsets")
-    given = _beside(estimates, true.size, "estimated onsets")
-    known = np.isfinite(given)
-    if not known.any():
-        raise InputError(f"onset errors need at least one estimated onset, got none in {true.size} records")
-    error = given[known] - true[known]
-    return OnsetErrors(
-        n=int(known.sum()),
-        without=int(true.size - known.sum()),
         median=quantile_of(error, 0.5, confidence),
-        median_size=quantile_of(np.abs(error), 0.5, confidence),
-        ninety_size=quantile_of(np.abs(error), 0.9, confidence),
+        median_size=quantile_of(size, 0.5, confidence),
+        ninety_size=quantile_of(size, 0.9, confidence),
         coverage=_coverage(low, high, true, confidence),
     )

@@ -1,9 +1,9 @@
-"""The summary of detectors by size of leak, beside two that do not look; and which fault is named for which."""
+"""Events per hour, and which fault is named for which, with exact intervals."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,28 +13,8 @@ from sealscope.errors import InputError
 from sealscope.evaluation.binomial import IntervalEstimate, Proportion, proportion
 from sealscope.evaluation.checks import share
 
-ALWAYS, NEVER = "always fire", "never fire"
 #: The verdict that names no fault; it always has a column of its own, the last.
 CANNOT_TELL = "cannot tell"
-
-
-@dataclass(frozen=True)
-class SummaryRow:
-    """One detector at one size of leak.
-
-    `detection`: alarms over all `n` records of that size, `cannot tell` not among them; `cannot_tell`: over the same
-    records; `false_alarm` and `per_hour`: of that detector on its leak-free records (None where there are none, or no
-    hours); `informedness`: detection less false alarms, 0 for chance.
-    """
-
-    detector: str
-    leak_lpm: float
-    n: int
-    detection: Proportion
-    cannot_tell: Proportion
-    false_alarm: Proportion | None
-    per_hour: IntervalEstimate | None
-    informedness: float
 
 
 def poisson_interval(count: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -58,45 +38,6 @@ def events_per_hour(count: int, hours: float, confidence: float = 0.95) -> Inter
         raise InputError(f"operating hours must be > 0, got {hours}")
     low, high = poisson_interval(count, confidence)
     return IntervalEstimate(int(count), count / hours, low / hours, high / hours)
-
-
-def summary(
-    sizes: Sequence[float],
-    verdicts: Mapping[str, Sequence[str]],
-    confidence: float = 0.95,
-    hours: float | None = None,
-) -> list[SummaryRow]:
-    """Return one row for each detector and size of leak, sizes rising, `always fire` and `never fire` last.
-
-    `sizes` (n,): of the leak in each record, 0 without one; `verdicts`: detector -> (n,); `hours`: operating time of a
-    record. A detector without a record with a leak has one row of size 0, with no detection. Intervals as in
-    `proportion` and `events_per_hour`.
-    """
-    size, rows = np.asarray(sizes, dtype=np.float64), []
-    references = {ALWAYS: ["leak"] * size.size, NEVER: ["no leak"] * size.size}
-    for detector, given in {**verdicts, **references}.items():
-        alarm, unsure = np.array(given) == "leak", np.array(given) == CANNOT_TELL
-        free, false_alarm, hourly = size == 0.0, None, None
-        if free.any():
-            false_alarm = proportion(alarm[free].sum(), free.sum(), confidence)
-            hourly = events_per_hour(false_alarm.count, hours * false_alarm.n, confidence) if hours else None
-        for own in np.unique(size[~free]) if not free.all() else (0.0,):
-            here = size == own
-            leaky = here & ~free
-            detection = proportion(alarm[leaky].sum(), leaky.sum(), confidence)
-            rows.append(
-                SummaryRow(
-                    detector=detector,
-                    leak_lpm=float(own),
-                    n=int(here.sum()),
-                    detection=detection,
-                    cannot_tell=proportion(unsure[here].sum(), here.sum(), confidence),
-                    false_alarm=false_alarm,
-                    per_hour=hourly,
-                    informedness=detection.value - false_alarm.value if false_alarm else math.nan,
-                )
-            )
-    return rows
 
 
 @dataclass(frozen=True)

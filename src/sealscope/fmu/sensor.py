@@ -30,8 +30,11 @@ from numba import carray
 
 from sealscope.compiled import large_law, law, record_at
 from sealscope.diagnosis.inference.blocks import Columns
-from sealscope.diagnosis.inference.live.balance import BLOCK_SECONDS, LEARNED, TELLS, WAKES, live_equations, size_error
-from sealscope.diagnosis.inference.live.known import (
+from sealscope.diagnosis.inference.row_weights import SUPPORT, Workspace, median, weigh, workspace_shapes
+from sealscope.diagnosis.inference.terms import ATMOSPHERE, HALF_DIFFERENCE, LEAST_ABSOLUTE
+from sealscope.diagnosis.inference.weak_form import LARGEST, SPAN, STRIDE, stride_samples, test_function
+from sealscope.diagnosis.live.balance import BLOCK_SECONDS, LEARNED, TELLS, WAKES, live_equations, size_error
+from sealscope.diagnosis.live.known import (
     MISFIT,
     STANDSTILL,
     TINY,
@@ -43,9 +46,6 @@ from sealscope.diagnosis.inference.live.known import (
     says,
     take,
 )
-from sealscope.diagnosis.inference.row_weights import SUPPORT, Workspace, median, weigh, workspace_shapes
-from sealscope.diagnosis.inference.terms import ATMOSPHERE, HALF_DIFFERENCE, LEAST_ABSOLUTE
-from sealscope.diagnosis.inference.weak_form import LARGEST, SPAN, STRIDE, stride_samples, test_function
 from sealscope.errors import InputError
 from sealscope.fmu.machine import unit_code
 from sealscope.fmu.variables import SENSOR_RESULTS, VALUES, Variable, inputs, outputs, parameter

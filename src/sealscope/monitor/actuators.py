@@ -16,16 +16,16 @@ from typing import Any
 import numpy as np
 from sqlalchemy.exc import IntegrityError
 
+from sealscope.diagnosis.live.estimates import BlockEstimate
+from sealscope.diagnosis.live.watch import STATE_VERSION, Watch, watch
 from sealscope.diagnosis.verdict.states import LEAKING, MachineState, state_of
 from sealscope.errors import InputError
 from sealscope.monitor.alarms import Alarm, AlarmJudge
-from sealscope.monitor.memory.machine_files import pass_on
-from sealscope.monitor.memory.sharing import Share
-from sealscope.monitor.memory.store import KEPT_IDENTITIES, MonitorStore, StoredRows, away
+from sealscope.monitor.database.machine_files import pass_on
+from sealscope.monitor.database.sharing import Share
+from sealscope.monitor.database.store import KEPT_IDENTITIES, MonitorStore, StoredRows, away
 from sealscope.monitor.settings import ActuatorSettings
 from sealscope.monitor.sources.source_block import SourceBlock, bytes_of, nothing
-from sealscope.monitor.stream.estimates import BlockEstimate
-from sealscope.monitor.stream.watch import STATE_VERSION, Watch, watch
 from sealscope.monitor.supervisor import Supervisor
 from sealscope.recordings.recording import Recording
 from sealscope.storage.plain_state import part_of, restored, saved
@@ -114,7 +114,7 @@ class _Actuator:
             "t": None if self.last is None else last.t,
             "status": last.status,
             "state": self._machine_state().as_dict(),
-            "by": self.watch.by,
+            "by": self.watch.method,
             "total_lpm": last.total_lpm,
             "leak_lpm": last.leak_lpm,
             "leak_interval_lpm": last.leak_interval_lpm,

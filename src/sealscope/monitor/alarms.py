@@ -12,10 +12,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+from sealscope.diagnosis.live.estimates import BlockEstimate, Interval, WatchedLeak
 from sealscope.diagnosis.verdict.states import state_of
 from sealscope.errors import InputError
 from sealscope.monitor.settings import WatchSettings
-from sealscope.monitor.stream.estimates import BlockEstimate, Interval, WatchedLeak
 from sealscope.storage.plain_state import saved
 
 Level = Literal["warning", "error"]

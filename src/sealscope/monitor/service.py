@@ -18,8 +18,8 @@ from threadpoolctl import threadpool_limits
 
 from sealscope.errors import InputError
 from sealscope.monitor.actuators import WatchedActuators
-from sealscope.monitor.memory.sharing import Share
-from sealscope.monitor.memory.store import MonitorStore, away
+from sealscope.monitor.database.sharing import Share
+from sealscope.monitor.database.store import MonitorStore, away
 from sealscope.monitor.outputs.events import EventLines, Webhook
 from sealscope.monitor.outputs.sparkplug_node import SparkplugNode
 from sealscope.monitor.page.live import LiveSamples
@@ -160,7 +160,7 @@ class Service:
                     self._share.give_back()
             if self.page is not None:
                 self.page.close()
-            self._hold.close()
+            self.close()
 
     def _all_sources(self) -> list[tuple[str, Source]]:
         """Return the sources of the settings by name; raises InputError for a secret that cannot be read."""
@@ -207,6 +207,10 @@ class Service:
     def stop(self) -> None:
         """End `run` after the block at hand."""
         self.stopping.set()
+
+    def close(self) -> None:
+        """Leave the database to another monitor, as `run` does at its end."""
+        self._hold.close()
 
     def _store(self, blocks: list[_Kept], write: Callable[[list[_Kept]], object]) -> None:
         """Keep blocks in one transaction and acknowledge them; raises where the database is locked, full or away.

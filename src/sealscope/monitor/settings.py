@@ -10,8 +10,8 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, model_validator
 
+from sealscope.diagnosis.live.joining import CHANNELS
 from sealscope.errors import InputError
-from sealscope.monitor.stream.joining import CHANNELS
 from sealscope.storage.plain_values import one_line
 from sealscope.storage.toml_file import read_toml
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from functools import cache
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, TypeVar
 
 import numpy as np
 from pydantic import PrivateAttr, model_validator
@@ -22,6 +22,7 @@ from sealscope.parameters.valve import ServoValve, Supply
 from sealscope.units import parse_quantity, to_si
 
 Value = float | int | str
+P = TypeVar("P", bound=Part)
 #: Begins the source of a value that nobody has stated of this machine.
 ASSUMED = "assumed:"
 
@@ -329,22 +330,10 @@ class Rig(Part):
         for full in entries:
             if full not in declared():
                 raise InputError(f"{full} is not a parameter{closest(full, known)} ({entries[full].place})")
-        tree: dict[str, Any] = {}
-        for full, field in declared().items():
+        for full in known:
             if full not in entries:
                 raise InputError(f"{full} is missing ({place})")
-            *groups, symbol = full.split(".")
-            at = tree
-            for group in groups:
-                at = at.setdefault(group, {})
-            at[symbol] = _si_value(full, field, entries[full])
-        values: dict[str, Any] = {
-            group: _part(cls, group, tree[group], group, entries, place) for group in cls.model_fields
-        }
-        try:
-            rig = cls(**values)
-        except InputError as error:
-            raise InputError(f"{error} ({place})") from None
+        rig = _built(cls, "", entries, place)
         rig._name, rig._title = name, title
         rig._entries = tuple((full, entries[full]) for full in known)
         return rig
@@ -371,24 +360,22 @@ def declared_names() -> tuple[str, ...]:
     return tuple(declared())
 
 
-def _part(
-    owner: type[Part], symbol: str, values: dict[str, Any], path: str, entries: Mapping[str, ParameterEntry], place: str
-) -> Part:
-    """Build one group, its groups first; a broken rule is reported with the place of its value, or of the whole rig."""
-    model = owner.model_fields[symbol].annotation
-    assert isinstance(model, type)
-    assert issubclass(model, Part)
-    built = {
-        key: _part(model, key, value, f"{path}.{key}", entries, place) if isinstance(value, dict) else value
-        for key, value in values.items()
-    }
+def _built(model: type[P], path: str, entries: Mapping[str, ParameterEntry], place: str) -> P:
+    """Build a part whose parameters' names begin with `path`; a broken rule is named with the place of its value."""
+    values: dict[str, Any] = {}
+    for symbol, field in model.model_fields.items():
+        kind = field.annotation
+        if isinstance(kind, type) and issubclass(kind, Part):
+            values[symbol] = _built(kind, f"{path}{symbol}.", entries, place)
+        else:
+            values[symbol] = _si_value(path + symbol, field, entries[path + symbol])
     try:
-        return model(**built)
+        return model(**values)
     except InputError as error:
         text = str(error)
-        culprit = f"{path}.{text.split(maxsplit=1)[0]}"
+        culprit = path + text.split(maxsplit=1)[0]
         where = place if isinstance(error, PartsDisagreeError) else entries[culprit].place
-        raise InputError(f"{_qualified(culprit, text)} ({where})") from None
+        raise InputError(f"{_qualified(culprit, text) if path else text} ({where})") from None
 
 
 def _qualified(full: str, text: str) -> str:

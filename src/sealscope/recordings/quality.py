@@ -258,6 +258,12 @@ class Rail(NamedTuple):
     first: int
 
 
+def mostly_clipped(values: Array) -> bool:
+    """Whether more than half of the finite values (n,) are cut off: a chamber that empties into the tank may be."""
+    finite = values[np.isfinite(values)]
+    return sum(rail.samples for rail in clipped(finite)) > len(finite) / 2
+
+
 def clipped(values: Array, held: NDArray[np.intp] | None = None, low: bool = True) -> list[Rail]:
     """Find the ends at which finite values (n,) are cut off; the low one only where `low`.
 

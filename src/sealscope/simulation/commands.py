@@ -270,10 +270,6 @@ _N, _T = NUMBER, rf"[-+]?{TIME}"
 _SIGNED = rf"[-+]\s*{UNSIGNED}"
 _FORMS: tuple[tuple[str, Callable[[list[str | None]], Command]], ...] = (
     (
-        rf"({_N})?\s*\*?\s*sin\(\s*({_N})?\s*\*?\s*t\s*({_SIGNED})?\s*\)\s*({_SIGNED})?\s*v?",
-        lambda g: Sine(_number(g[0], 1.0), _number(g[1], 1.0), _number(g[2], 0.0), _number(g[3], 0.0)),
-    ),
-    (
         rf"trapezoid\s+({_N})\s*v?\s+within\s+({_T})\s+every\s+({_T})",
         lambda g: Trapezoid(_number(g[0], 0.0), seconds(g[1]), seconds(g[2])),
     ),
@@ -320,8 +316,8 @@ def plain_text(text: str, what: str) -> str:
 _SINES = re.compile(rf"\s*([-+])?\s*({_N})?\s*\*?\s*sin\(\s*({_N})?\s*\*?\s*t\s*({_SIGNED})?\s*\)", re.IGNORECASE)
 
 
-def _several_sines(text: str) -> MultiSine | None:
-    """Return the sum of sines that a text is, the offset after the last; None where it is no such sum."""
+def _sines(text: str) -> Sine | MultiSine | None:
+    """Return the sine or the sum of sines that a text is, the offset after the last; None where it is neither."""
     parts: list[Sine] = []
     end = 0
     while (match := _SINES.match(text, end)) is not None and (match[1] or not parts):
@@ -329,9 +325,10 @@ def _several_sines(text: str) -> MultiSine | None:
         parts.append(Sine(sign * _number(match[2], 1.0), _number(match[3], 1.0), _number(match[4], 0.0)))
         end = match.end()
     rest = re.fullmatch(rf"\s*({_SIGNED})?\s*v?", text[end:], re.IGNORECASE)
-    if rest is None or len(parts) < 2:
+    if rest is None or not parts:
         return None
-    return MultiSine((*parts[:-1], replace(parts[-1], offset=_number(rest[1], 0.0))))
+    parts[-1] = replace(parts[-1], offset=_number(rest[1], 0.0))
+    return parts[0] if len(parts) == 1 else MultiSine(tuple(parts))
 
 
 def parse_command(text: str) -> Command:
@@ -352,13 +349,11 @@ def parse_command(text: str) -> Command:
     if "period" in stripped.lower():
         form = r"\s*(\d{1,6})\s+periods?\s+of\s+(.*)"
         parts = [re.fullmatch(form, part, re.IGNORECASE) for part in stripped.split(",")]
-        sines = [(int(part[1]), parse_command(part[2])) for part in parts if part]
-        if len(sines) == len(parts) and all(isinstance(sine, Sine) for _, sine in sines):
-            return Alternating(tuple(sines))  # type: ignore[arg-type]
-    if stripped.lower().count("sin(") > 1:
-        several = _several_sines(stripped)
-        if several is not None:
-            return several
+        turns = [(int(part[1]), parse_command(part[2])) for part in parts if part]
+        if len(turns) == len(parts) and all(isinstance(sine, Sine) for _, sine in turns):
+            return Alternating(tuple(turns))  # type: ignore[arg-type]
+    if (sines := _sines(stripped)) is not None:
+        return sines
     for pattern, make in _FORMS:
         match = re.fullmatch(pattern, stripped, re.IGNORECASE)
         if match:

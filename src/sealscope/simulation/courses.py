@@ -66,13 +66,6 @@ class Force:
         x, v = (np.array(bends or ((0.0, 0.0),), dtype=np.float64) for bends in (self.over_x, self.over_v))
         return x, v
 
-    def at_standstill(self, x: float) -> float:
-        """Return the force [N] at t = 0 on a piston at standstill at x [m]."""
-        from sealscope.physics.cylinder import force_over
-
-        force, tables = float(self.at(np.zeros(()))), self.tables()
-        return force if tables is None else float(force + force_over(x, tables[0]) + force_over(0.0, tables[1]))
-
     def __str__(self) -> str:
         return f"load {self.words}"
 
@@ -83,6 +76,17 @@ def numbers_under(rig: Rig, load: Force | None) -> RigNumbers:
 
     numbers = rig_numbers(rig)
     return numbers if load is None else numbers._replace(pushed=load.tables() or (True,))
+
+
+def state_under(rig: Rig, load: Force | None, x: float) -> Array:
+    """Return the state of a rig at t = 0 with its piston at standstill at x [m] under a load beside its own."""
+    from sealscope.physics.cylinder import force_over
+    from sealscope.physics.standstill import initial_state
+
+    force, tables = (0.0, None) if load is None else (float(load.at(np.zeros(()))), load.tables())
+    if tables is not None:
+        force = float(force + force_over(x, tables[0]) + force_over(0.0, tables[1]))
+    return initial_state(rig, x, force)
 
 
 @dataclass(frozen=True)

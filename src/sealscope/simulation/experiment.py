@@ -5,16 +5,16 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 
-from sealscope.calls import checked_call
+from sealscope.calls import with_arguments_of
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
+from sealscope.simulation.arguments import Arguments, Method
 from sealscope.simulation.changes import Effect, ParameterDrift, Readings
 from sealscope.simulation.commands import Command, Sine, check_command
 from sealscope.simulation.courses import Force, Position, command_or_target, parse_force
@@ -34,7 +34,6 @@ MOST_STEPS = 1_000_000_000
 LONGEST_STEP = 1e-3
 #: Default for the rms error [Pa] that a pressure may have (a transducer's noise is 8600 Pa).
 PRESSURE_TOLERANCE = 100.0
-Method = Literal["auto", "rk4", "imex"]
 _Kind = TypeVar("_Kind", Leak, Fault)
 
 
@@ -86,34 +85,8 @@ class Experiment:
 
     Parameters
     ----------
-    rig : Rig
-        Parameters of the machine and its instruments.
-    command : Command or Position
-        Voltage of the drive, or with a `controller` the position that it follows.
-    duration : float, default 180
-        Length of the run [s].
-    leaks : tuple of Leak
-        Leaks across the piston.
-    seed : int, default 0
-        Seed of the instruments' noise.
-    x_0 : float, default 0
-        Position of the piston at the start, from mid-stroke [m].
-    method : {"auto", "rk4", "imex"}
-        Solver; ``auto`` takes the one that suits the rig.
-    step : float, optional
-        Step of the solver [s], in place of one chosen by `error`.
-    allow_unresolved : bool, default False
-        Lets an unstable or under-resolved run through, marked in its provenance.
-    faults : tuple of Fault
-        Faults beside the leaks.
-    drifts : tuple of ParameterDrift
-        Parameters that change slowly within the run.
-    error : float, optional
-        Rms error that a pressure may have [Pa], by which the step is chosen; None: 100 Pa.
-    load : Force, optional
-        Force on the rod over time, position or velocity.
-    controller : Controller, optional
-        Closes the loop on the position.
+    rig, command, duration, leaks, seed, x_0, method, step, allow_unresolved, faults, drifts, error, load, controller :
+        The arguments of `of` once they are read: numbers in SI units; leaks, faults and drifts as tuples of objects.
 
     Raises
     ------
@@ -187,32 +160,15 @@ class Experiment:
             drift.check(np.linspace(0.0, self.duration, 2001))
         self._effects()
 
-    @classmethod
-    @checked_call
-    def of(
-        cls,
-        *,
-        rig: Rig | str | os.PathLike[str] = "thesis",
-        command: Command | Position | str = "3 sin(4t)",
-        leak: Leak | str | Iterable[Leak | str] | None = None,
-        fault: Fault | str | Iterable[Fault | str] | None = None,
-        drifts: Iterable[ParameterDrift] = (),
-        set: Mapping[str, float | str] | None = None,
-        duration: float | str = 180.0,
-        rate: float | str | None = None,
-        x_0: float | str = 0.0,
-        seed: int = 0,
-        method: Method = "auto",
-        step: float | str | None = None,
-        error: float | str | None = None,
-        allow_unresolved: bool = False,
-        load: Force | str | None = None,
-        controller: Controller | str | None = None,
-    ) -> Experiment:
+    @staticmethod
+    @with_arguments_of(Arguments)
+    def of(given: Arguments) -> Experiment:
         """Make an experiment of numbers in SI units and texts with units; the arguments are those of `simulate`.
 
-        `drifts` are parameters of the rig and of its instruments that change slowly within the run. Raises InputError
-        for whatever breaks a rule.
+        Returns
+        -------
+        Experiment
+            With all texts read; InputError for whatever breaks a rule.
 
         Examples
         --------
@@ -222,39 +178,42 @@ class Experiment:
         """
         from sealscope.parameters import load_rig
 
-        if not isinstance(set, Mapping | None):
-            raise InputError(f"set must map names of parameters to values, got {set!r}")
-        overrides = dict(set or {})
-        if rate is not None:
-            overrides["daq.sample_rate"] = parse_quantity(rate, "Hz", name="rate")
-        loaded = load_rig(rig)
-        if isinstance(command, str):
-            command = command_or_target(command)
+        numbers: dict[str, Any] = {}
+        for own in fields(given):
+            value, unit = getattr(given, own.name), own.metadata["unit"]
+            if unit and value is not own.default:
+                value = parse_quantity(value, unit, name=own.name, finite=False)
+            if unit:
+                numbers[own.name] = value
+        rate = numbers.pop("rate")
+        if not isinstance(given.set, Mapping | None):
+            raise InputError(f"set must map names of parameters to values, got {given.set!r}")
+        overrides = {**(given.set or {}), **({} if rate is None else {"daq.sample_rate": rate})}
+        rig = load_rig(given.rig)
+        command = command_or_target(given.command) if isinstance(given.command, str) else given.command
         if not (hasattr(command, "volts") or isinstance(command, Position)):
             raise InputError(f"command must be a text or a Command, got {command!r}")
-        if not isinstance(load, str | Force | None):
-            raise InputError(f"load must be a text or a Force, got {load!r}")
-        if isinstance(seed, bool) or not isinstance(seed, int | np.integer):
-            raise InputError(f"seed must be a whole number, got {seed!r}")
+        if not isinstance(given.load, str | Force | None):
+            raise InputError(f"load must be a text or a Force, got {given.load!r}")
+        if isinstance(given.seed, bool) or not isinstance(given.seed, int | np.integer):
+            raise InputError(f"seed must be a whole number, got {given.seed!r}")
+        controller = given.controller
         if isinstance(controller, str):
             from sealscope.control import controller_named
 
-            controller = controller_named(controller, loaded)
-        return cls(
-            rig=loaded.with_overrides(overrides) if overrides else loaded,
+            controller = controller_named(controller, rig)
+        return Experiment(
+            rig=rig.with_overrides(overrides) if overrides else rig,
             command=command,
-            duration=parse_quantity(duration, "s", name="duration", finite=False),
-            leaks=_each(leak, Leak, parse_leak, "leak"),
-            seed=int(seed),
-            x_0=parse_quantity(x_0, "m", name="x_0", finite=False),
-            method=method,
-            step=None if step is None else parse_quantity(step, "s", name="step", finite=False),
-            allow_unresolved=allow_unresolved,
-            faults=_each(fault, Fault, parse_fault, "fault"),
-            drifts=tuple(drifts),
-            error=None if error is None else parse_quantity(error, "Pa", name="error", finite=False),
-            load=parse_force(load) if isinstance(load, str) else load,
+            leaks=_each(given.leak, Leak, parse_leak, "leak"),
+            seed=int(given.seed),
+            method=given.method,
+            allow_unresolved=given.allow_unresolved,
+            faults=_each(given.fault, Fault, parse_fault, "fault"),
+            drifts=tuple(given.drifts),
+            load=parse_force(given.load) if isinstance(given.load, str) else given.load,
             controller=controller,
+            **numbers,
         )
 
     def __repr__(self) -> str:

@@ -11,7 +11,7 @@ import re
 import sys
 import tomllib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,7 +19,7 @@ import numpy as np
 
 from sealscope.errors import InputError
 from sealscope.recordings.recording import CHANNEL_UNITS, Array
-from sealscope.simulation.changes import RESOLUTION, THROTTLES, Effect, Hold, fields_of
+from sealscope.simulation.changes import RESOLUTION, SHORTEST_BLOCK, THROTTLES, Effect, Hold, fields_of
 from sealscope.simulation.commands import NUMBER, TIME, UNSIGNED, Command, number_text, plain_text, seconds
 from sealscope.simulation.leaks import WHEN, Between, From, Growing, Opening, Part, opening_of
 from sealscope.units import LITRE_PER_MINUTE, parse_quantity
@@ -61,6 +61,7 @@ def _number(text: str | None) -> float:
 class FaultRow:
     """What a fault of a kind changes, in what words: an entry of `faults.toml`, whose head says what its keys are."""
 
+    name: str
     kind: str
     pattern: str
     words: str
@@ -69,6 +70,7 @@ class FaultRow:
     factor: bool = False
     needs: tuple[str, str] | None = None
     over: str | None = None
+    adds: str | None = None
     unit: str = ""
     least: float = 0.0
     most: float = sys.float_info.max
@@ -80,14 +82,23 @@ class FaultRow:
         """Whether it is a fault of a sensor."""
         return self.kind.startswith("sensor")
 
-    def match(self, text: str) -> Part | None:
-        """Return the groups of a text that is such a fault; None for any other."""
+    def read(self, text: str) -> Fault | None:
+        """Return the fault that a text states; None where it is another."""
         pattern = self.pattern.format(**_PATTERNS).replace(" ", r"\s+") + _WHEN[self.when]
         match = re.fullmatch(pattern, text)
-        return None if match is None else match.groupdict()
+        if match is None:
+            return None
+        part = match.groupdict()
+        at = part.get("at") or ""
+        at = at if self.of_sensor else at.upper()
+        if self.when == "grows":
+            opening: Opening = opening_of(part)
+        else:
+            until = math.inf if part["until"] is None else seconds(part["until"])
+            opening = Between(seconds(part["since"]), until, seconds(part.get("ramp")))
+        return Fault(self.name, self._value(part), at, opening, _number(part.get("pace") or "1"))
 
-    def value(self, part: Part) -> float:
-        """Return the value that the groups of a text state."""
+    def _value(self, part: Part) -> float:
         if part.get("size") is not None:
             unit = CHANNEL_UNITS.get(part["at"] or "", "Pa") if self.of_sensor else self.unit
             return parse_quantity(part["size"] or "", unit, name=self.what)
@@ -96,13 +107,6 @@ class FaultRow:
         if part.get("share") is not None:
             return _number(part["share"]) / (100.0 if part["sign"] else 1.0)
         return _number(part.get("times") or part.get("value") or ("1" if self.factor else "0"))
-
-    def opening(self, part: Part) -> Opening:
-        """Return the opening that the groups of a text state."""
-        if self.when == "grows":
-            return opening_of(part)
-        until = math.inf if part["until"] is None else seconds(part["until"])
-        return Between(seconds(part["since"]), until, seconds(part.get("ramp")))
 
 
 @dataclass(frozen=True)
@@ -155,15 +159,22 @@ class Fault:
         if self.name in _EFFECTS:
             return _EFFECTS[self.name](self, rig)
         if row.factor:
-            step = SHARE_RESOLUTION * max(abs(self.value - 1.0), 1e-3)
-            return tuple(
-                Effect(
-                    name, lambda t: 1.0 + (self.value - 1.0) * self.opening.share(t), step, jumps=self.opening.bends()
-                )
-                for name in self._parameters()
+            size, step = self.value - 1.0, SHARE_RESOLUTION * max(abs(self.value - 1.0), 1e-3)
+        else:
+            size = float(rig[row.adds]) if row.adds else self.value / (float(rig[row.over]) if row.over else 1.0)
+            step = SHARE_RESOLUTION * size or math.inf
+        whole = 1.0 if row.factor else 0.0
+        return tuple(
+            Effect(
+                name.format(at=self.at, gain=GAINS.get(self.at)),
+                lambda t: whole + size * self.opening.share(t),
+                step,
+                added=not row.factor,
+                jumps=self.opening.bends(),
+                shortest=_VALVE_BLOCK if row.when == "operated" else SHORTEST_BLOCK,
             )
-        size = self.value if row.over is None else self.value / float(rig[row.over])
-        return tuple(self._plus(name, size) for name in self._parameters())
+            for name in row.parameters
+        )
 
     def holds(self) -> tuple[Hold, ...]:
         """Return the readings that it makes repeat themselves."""
@@ -194,14 +205,6 @@ class Fault:
 
     def _warmth(self, rig: Rig, t: Array) -> Array:
         return np.asarray(rig.fluid.T_oil + self.value * self.opening.share(t))
-
-    def _parameters(self) -> tuple[str, ...]:
-        return tuple(name.format(at=self.at, gain=GAINS.get(self.at)) for name in self.row.parameters)
-
-    def _plus(self, name: str, size: float) -> Effect:
-        """Return a number to which `size` is added when the fault is whole."""
-        step = SHARE_RESOLUTION * size or math.inf
-        return Effect(name, lambda t: size * self.opening.share(t), step, added=True, jumps=self.opening.bends())
 
     def __str__(self) -> str:
         words = self.row.words
@@ -264,14 +267,6 @@ def _shut_off(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
     return tuple(effect(name, c) for name, c in zip(THROTTLES, whole, strict=True) if name[2] == fault.at)
 
 
-def _circulation(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
-    """Return the change of `G_pump`: Q = `line.G_circ` (p_1 - p_2) beside the pump's slip."""
-    G = rig.line.G_circ
-    if G == 0:
-        raise InputError(f"a circulation valve must have line.G_circ > 0, got 0 ({fault})")
-    return (replace(fault._plus("G_pump", G), shortest=_VALVE_BLOCK),)
-
-
 def _warmer(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
     """Return the change of all numbers that go with the oil: its viscosity, density and bulk modulus.
 
@@ -294,10 +289,10 @@ def _warmer(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
 
 
 #: Faults that change more than a parameter or two.
-_EFFECTS = {"shut-off": _shut_off, "circulation": _circulation, "oil": _warmer}
+_EFFECTS = {"shut-off": _shut_off, "oil": _warmer}
 #: What faults change, by name.
 FAULTS: Mapping[str, FaultRow] = {
-    name: FaultRow(**row)
+    name: FaultRow(name, **row)
     for name, row in tomllib.loads(Path(__file__).with_name("faults.toml").read_text(encoding="utf-8")).items()
 }
 
@@ -315,11 +310,9 @@ def parse_fault(text: str) -> Fault | None:
     stripped = plain_text(text, "fault")
     if stripped.lower() in ("none", "no fault"):
         return None
-    for name, row in FAULTS.items():
-        if part := row.match(stripped):
-            at = part.get("at") or ""
-            at = at if row.of_sensor else at.upper()
-            return Fault(name, row.value(part), at, row.opening(part), _number(part.get("pace") or "1"))
+    for row in FAULTS.values():
+        if fault := row.read(stripped):
+            return fault
     raise InputError(
         "fault must be like 'pump leak x3 from 90 s', 'rod seal A 0.01 L/min from 90 s', 'friction +20 % growing from "
         "60 s to 120 s', 'air 1 % from 90 s', 'sensor p_A offset 2 psi from 90 s', 'sensor p_A gain 1 %', 'sensor p_A "

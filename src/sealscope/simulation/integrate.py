@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -17,13 +17,16 @@ import numpy as np
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
+from sealscope.simulation.arguments import Method
 from sealscope.simulation.changes import Effect, Schedule
 from sealscope.simulation.closed_loop import Feedback, outputs_per_sample
 from sealscope.simulation.commands import Sine, check_command
-from sealscope.simulation.courses import Force, numbers_under
-from sealscope.simulation.experiment import LONGEST_STEP, PRESSURE_TOLERANCE, Experiment, Method, choose_method
+from sealscope.simulation.courses import Force, numbers_under, state_under
+from sealscope.simulation.experiment import LONGEST_STEP, PRESSURE_TOLERANCE, Experiment, choose_method
 from sealscope.simulation.instruments import FILTER_REACH
 from sealscope.simulation.leaks import Leak
+from sealscope.simulation.sizing import leak_flow, mean_while_open, settled
+from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -118,7 +121,7 @@ def oversampling(experiment: Experiment) -> int:
 
 def oversampling_of(rate: float, step: float) -> int:
     """Return the outputs per sample at `rate` [Hz] where the solver has a step about every `step` [s]."""
-    return max(1, min(_OVERSAMPLING, math.ceil(1.0 / (rate * step) * (1.0 - 1e-9))))
+    return min(_OVERSAMPLING, steps_per_output(rate, step))
 
 
 def steps_per_output(rate: float, step: float) -> int:
@@ -127,14 +130,22 @@ def steps_per_output(rate: float, step: float) -> int:
 
 
 def trajectory(
-    experiment: Experiment, leaks: tuple[Leak, ...], *, step: float | None = None, progress: Progress | None = None
+    experiment: Experiment,
+    leaks: tuple[Leak, ...],
+    *,
+    step: float | None = None,
+    error: float | None = None,
+    duration: float | None = None,
+    progress: Progress | None = None,
 ) -> Trajectory:
     """Integrate an experiment and report states and flows as often as its instruments need them.
 
     `leaks` take the place of the experiment's and have coefficients; `step` [s], if given, that of its own step, and is
-    not checked: the caller compares runs.
+    not checked: the caller compares runs. `error` [Pa] takes the place of its own, `duration` [s] of its length and of
+    what the anti-alias filter needs beyond.
     """
-    duration = (round(experiment.duration * experiment.rate) + FILTER_REACH) / experiment.rate
+    if duration is None:
+        duration = (round(experiment.duration * experiment.rate) + FILTER_REACH) / experiment.rate
     rate, target, controller = experiment.rate * oversampling(experiment), experiment.target, experiment.controlled
     feedback = None
     if target is not None and controller is not None:
@@ -149,11 +160,66 @@ def trajectory(
         x_0=experiment.x_0,
         method=experiment.method,
         step=step or experiment.step,
-        error=experiment.error_allowed if step is None else None,
+        error=(experiment.error_allowed if error is None else error) if step is None else None,
         allow_unresolved=experiment.allow_unresolved,
         progress=progress,
         effects=experiment.effects(),
     )
+
+
+def _unsized(leaks: Sequence[Leak]) -> tuple[Leak, ...]:
+    """Return leaks in which those of a stated mean have a coefficient of 0."""
+    return tuple(leak if leak.mean is None else replace(leak, mean=None, coefficient=0.0) for leak in leaks)
+
+
+def sized_leaks(experiment: Experiment, progress: Callable[[str, float], None] | None = None) -> tuple[Leak, ...]:
+    """Return the experiment's leaks with a coefficient each, so that each one's mean is what was asked for."""
+    if not any(leak.mean for leak in experiment.leaks):
+        return _unsized(experiment.leaks)
+    return sized_run(experiment, progress)[0]
+
+
+def sized_run(
+    experiment: Experiment,
+    progress: Callable[[str, float], None] | None = None,
+    simulating: Callable[[float], None] | None = None,
+) -> tuple[tuple[Leak, ...], Trajectory]:
+    """Return the experiment's leaks with a coefficient each, and its run with them.
+
+    `progress` is called while leaks are sized, `simulating` with the time reached where there is nothing to size.
+
+    Raises InputError for a leak larger than the pump's mean |Q_1| or never open within the run; SimulationFailed
+    where the search does not settle.
+    """
+    leaks, dp_0 = experiment.leaks, experiment.rig.line.dp_0
+    current = _unsized(leaks)
+    if not any(leak.mean for leak in leaks):
+        return current, trajectory(experiment, current, progress=simulating)
+    first = True
+
+    def measure(sizes: Array) -> tuple[Array, tuple[tuple[Leak, ...], Trajectory]]:
+        nonlocal first
+        now = tuple(replace(leak, coefficient=float(size)) for leak, size in zip(current, sizes, strict=True))
+        run = trajectory(experiment, now)
+        pump_flow = float(np.mean(np.abs(run["Q_1"])))
+        units = np.zeros(len(leaks))
+        for k, leak in enumerate(leaks):
+            if not leak.mean:
+                continue
+            if first and leak.mean >= pump_flow:
+                raise InputError(
+                    f"a leak must be smaller than the pump's mean flow, {pump_flow / LITRE_PER_MINUTE:.4g} L/min for "
+                    f"this command, got {leak.mean / LITRE_PER_MINUTE:.4g} L/min ({leak})"
+                )
+            (flowing,) = experiment.flowing((replace(now[k], coefficient=1.0),))
+            units[k] = mean_while_open(leak, run.t, leak_flow(flowing, run.t, run["p_A"] - run["p_B"], dp_0))
+            if not units[k] > 0:
+                raise InputError(f"a leak with a mean flow must be open within the run, got {leak}")
+        first = False
+        return units, (now, run)
+
+    sizes = np.array([leak.coefficient or 0.0 for leak in current])
+    return settled(leaks, sizes, measure, progress)[1]
 
 
 def integrate(
@@ -188,11 +254,10 @@ def integrate(
     a pressure falls below vacuum; `allow_unresolved` lets all but a state that is not finite pass.
     """
     from sealscope.physics.solvers.limits import longest_step
-    from sealscope.physics.standstill import initial_state
     from sealscope.physics.state import OUTPUTS, P_2, P_A, STATES
 
     base = numbers_under(rig, load)
-    start_state = initial_state(rig, x_0, 0.0 if load is None else load.at_standstill(x_0))
+    start_state = state_under(rig, load, x_0)
     if step is not None and not (math.isfinite(step) and step > 0):
         raise InputError(f"step must be > 0 s, got {step}")
     if error is not None and not (math.isfinite(error) and error > 0):

@@ -15,13 +15,14 @@ from sealscope.calls import checked_call, with_arguments_of
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.chambers import CHAMBERS, PRESSURES
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
+from sealscope.simulation.arguments import Arguments
 from sealscope.simulation.changes import ParameterDrift
 from sealscope.simulation.experiment import PRESSURE_TOLERANCE, Experiment
 from sealscope.simulation.faults import Fault
 from sealscope.simulation.instruments import decimate, record
-from sealscope.simulation.integrate import DETAIL_TOLERANCE, Trajectory, oversampling, trajectory
+from sealscope.simulation.integrate import DETAIL_TOLERANCE, Trajectory, oversampling, sized_run, trajectory
 from sealscope.simulation.leaks import Leak
-from sealscope.simulation.sizing import leak_flow, mean_while_open, sized_run
+from sealscope.simulation.sizing import leak_flow, mean_while_open
 from sealscope.storage.atomic import atomic_write
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -107,6 +108,19 @@ class Run:
     recording: Recording
     truth: Truth
     proof: Proof | None = None
+
+    def lines(self) -> list[str]:
+        """Return the run in words: its solver and step, leaks, other faults, and mean flows."""
+        solver = self.recording.provenance["solver"]
+        lines = [f"{solver['method']}, h = {solver['step_s']:.3g} s"]
+        lines += [f"leak: {leak}" for leak in self.truth.leaks] + [f"fault: {fault}" for fault in self.truth.faults]
+        if self.truth.leaks:
+            lines.append(f"mean leak while open: {self.truth.mean_leak_lpm:.5g} L/min")
+        if "q_comp" in self.recording:
+            last_second = self.recording["q_comp"][-max(1, round(self.recording.rate)) :]
+            flow = float(last_second.mean()) / LITRE_PER_MINUTE
+            lines.append(f"the controller compensates: {flow:.4g} L/min at the end (channel q_comp)")
+        return lines
 
 
 @checked_call
@@ -312,55 +326,12 @@ def _drift_of(drift: ParameterDrift, t: Array) -> dict[str, Any]:
     return {"parameter": drift.parameter, "span_pct": 100.0 * span, "start_to_end_pct": 100.0 * end}
 
 
-@with_arguments_of(Experiment.of)
-def simulate(experiment: Experiment) -> Recording:
+@with_arguments_of(Arguments)
+def simulate(given: Arguments) -> Recording:
     """Simulate a rig under a command and record it as its instruments would.
 
-    A quantity is a number in the SI unit stated below, or a text with a unit of its own (``"3 min"``, ``"20[Pa]"``),
-    as on the command line.
-
-    Parameters
-    ----------
-    rig : Rig, str or path-like, optional
-        A rig, the name of a packaged one, or the path of a TOML file.
-    command : str or Command, optional
-        Voltage sent to the servo drive: ``"3 sin(4t)"``, ``"step 5 at 1 s"``, ``"ramp 5 from 1 s to 3 s"``, ``"chirp 3
-        from 0.1 Hz to 5 Hz over 60 s"``, ``"prbs 2 every 0.5 s seed 1"``, or ``"file LOG"`` (channel u of a recording).
-        Or a target for the piston, from mid-stroke, that a controller follows: ``"position 50 mm sin(2t)"``.
-    leak : str, Leak or sequence, optional
-        Leakage across the piston: ``"0.0042 L/min from 90 s"`` (mean flow while open), ``"0.01[L/min] orifice growing
-        from 1 min to 2 min"``, ``"G = 6.1e-13 from 90 s"``, ``"C = 2e-10"``, ``"table LEAK.csv"`` or ``"none"``.
-    fault : str, Fault or sequence, optional
-        Other faults: ``"pump leak x3 from 90 s"``, ``"rod seal A 0.01 L/min"``, ``"friction +20 %"``, ``"air 1 %"``,
-        ``"sensor p_A offset 2 psi"``, ``"sensor p_A gain -1 %"``, ``"sensor p_A stuck from 90 s to 100 s"``, ``"duty
-        amplitude x1.5"``.
-    drifts : iterable of ParameterDrift, optional
-        Parameters of the rig and of its instruments that change slowly within the run.
-    set : mapping of str to float or str, optional
-        Overrides of the rig's parameters: ``{"V_1": "50[cm^3]"}``.
-    duration : float or str, optional
-        Length of the recording [s].
-    rate : float or str, optional
-        Sampling rate [Hz]; the rig's own (``daq.sample_rate``) by default.
-    x_0 : float or str, optional
-        Position of the piston at the start, from mid-stroke [m].
-    seed : int, optional
-        Seed of the instruments' noise.
-    method : {"auto", "rk4", "imex"}, optional
-        Integration method; "auto" takes the implicit-explicit one for a rig with throttles.
-    step : float or str, optional
-        Largest step of the solver [s], instead of one chosen by `error`.
-    error : float or str, optional
-        Error that a pressure may have [Pa rms], 100 Pa by default; the step is chosen by it.
-    allow_unresolved : bool, optional
-        Let an unstable or under-resolved run through, marked in the provenance.
-    load : str or Force, optional
-        Force against +x beside the rig's own (``cylinder.F_l``), in a command's words: ``"2 kN"``, ``"500 N sin(2t)"``,
-        ``"step 2 kN at 3 s"``; terms over the piston's position and velocity may be added: ``"200 N/mm over x"``, ``"5
-        kN/mm over x from 50 mm"``, ``"2 kN s/m over v"``; or ``"file LOAD.csv"``: F [N] over t [s], x [m] or v [m/s].
-    controller : Controller or str, optional
-        What follows a target: a controller, or the name of one (``"pi"``, ``"flatness"``, ``"fault-tolerant"``,
-        ``"FILE.py:NAME"`` of your own), which assumes the rig as it is; by default ``"pi"``.
+    A quantity is a number in the SI unit stated below, or a text with a unit of its own ("3 min", "20[Pa]"), as on the
+    command line.
 
     Returns
     -------
@@ -381,4 +352,4 @@ def simulate(experiment: Experiment) -> Recording:
     >>> recording.rate, len(recording)
     (500.0, 1000)
     """
-    return simulate_with_truth(experiment).recording
+    return simulate_with_truth(Experiment.of(**vars(given))).recording

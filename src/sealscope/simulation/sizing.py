@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
 
-from sealscope.errors import InputError, SimulationFailed
+from sealscope.errors import SimulationFailed
 from sealscope.recordings.recording import Array
-from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.integrate import Trajectory, trajectory
 from sealscope.simulation.leaks import Leak
-from sealscope.units import LITRE_PER_MINUTE
 
 #: Relative distance from the mean asked for at which the search ends, and within which the closest run is taken after
 #: the last: where friction sticks under a sampled controller, runs of nearly the same leak scatter by more.
@@ -97,58 +93,3 @@ def settled(
         f"{', '.join(str(leak) for leak in leaks)} is more than this "
         "rig's pressures can drive; ask for a smaller leak"
     )
-
-
-def _unsized(leaks: Sequence[Leak]) -> tuple[Leak, ...]:
-    """Return leaks in which those of a stated mean have a coefficient of 0."""
-    return tuple(leak if leak.mean is None else replace(leak, mean=None, coefficient=0.0) for leak in leaks)
-
-
-def sized_leaks(experiment: Experiment, progress: Callable[[str, float], None] | None = None) -> tuple[Leak, ...]:
-    """Return the experiment's leaks with a coefficient each, so that each one's mean is what was asked for."""
-    if not any(leak.mean for leak in experiment.leaks):
-        return _unsized(experiment.leaks)
-    return sized_run(experiment, progress)[0]
-
-
-def sized_run(
-    experiment: Experiment,
-    progress: Callable[[str, float], None] | None = None,
-    simulating: Callable[[float], None] | None = None,
-) -> tuple[tuple[Leak, ...], Trajectory]:
-    """Return the experiment's leaks with a coefficient each, and its run with them.
-
-    `progress` is called while leaks are sized, `simulating` with the time reached where there is nothing to size.
-
-    Raises InputError for a leak larger than the pump's mean |Q_1| or never open within the run; SimulationFailed
-    where the search does not settle.
-    """
-    leaks, dp_0 = experiment.leaks, experiment.rig.line.dp_0
-    current = _unsized(leaks)
-    if not any(leak.mean for leak in leaks):
-        return current, trajectory(experiment, current, progress=simulating)
-    first = True
-
-    def measure(sizes: Array) -> tuple[Array, tuple[tuple[Leak, ...], Trajectory]]:
-        nonlocal first
-        now = tuple(replace(leak, coefficient=float(size)) for leak, size in zip(current, sizes, strict=True))
-        run = trajectory(experiment, now)
-        pump_flow = float(np.mean(np.abs(run["Q_1"])))
-        units = np.zeros(len(leaks))
-        for k, leak in enumerate(leaks):
-            if not leak.mean:
-                continue
-            if first and leak.mean >= pump_flow:
-                raise InputError(
-                    f"a leak must be smaller than the pump's mean flow, {pump_flow / LITRE_PER_MINUTE:.4g} L/min for "
-                    f"this command, got {leak.mean / LITRE_PER_MINUTE:.4g} L/min ({leak})"
-                )
-            (flowing,) = experiment.flowing((replace(now[k], coefficient=1.0),))
-            units[k] = mean_while_open(leak, run.t, leak_flow(flowing, run.t, run["p_A"] - run["p_B"], dp_0))
-            if not units[k] > 0:
-                raise InputError(f"a leak with a mean flow must be open within the run, got {leak}")
-        first = False
-        return units, (now, run)
-
-    sizes = np.array([leak.coefficient or 0.0 for leak in current])
-    return settled(leaks, sizes, measure, progress)[1]

@@ -9,10 +9,8 @@ sigma is independent of it and has the RMS sigma in each detail d_j, so the RMS 
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib.resources import files
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -22,8 +20,8 @@ from sealscope.recordings.recording import Array
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, ThesisTable
+from sealscope.thesis.engine.texts import note, texts_of
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, QUANTITIES, Condition, DataSheet, experiment_values, groups
-from sealscope.thesis.texts import note
 from sealscope.units import PSI
 
 if TYPE_CHECKING:
@@ -55,8 +53,7 @@ def noise_free_squares(
     from sealscope.signals.details import details
     from sealscope.simulation.experiment import Experiment
     from sealscope.simulation.instruments import decimate
-    from sealscope.simulation.integrate import oversampling
-    from sealscope.simulation.sizing import sized_run
+    from sealscope.simulation.integrate import oversampling, sized_run
 
     padded = USED + SETTLING + 128.0 / rig.daq.sample_rate  # the deepest detail looks 120 samples ahead
     values = {**experiment_values(condition), **(values or {})}
@@ -118,9 +115,8 @@ class Hypothesis:
     law: Literal["laminar", "orifice"] = "laminar"
 
 
-_TREE = tomllib.loads(files(__package__).joinpath("hypotheses.toml").read_text(encoding="utf-8"))
 #: The hypotheses on what the symmetric rig leaves unexplained; the first is that rig itself.
-HYPOTHESES: tuple[Hypothesis, ...] = tuple(Hypothesis(name, **values) for name, values in _TREE.items())
+HYPOTHESES = tuple(Hypothesis(name, **values) for name, values in texts_of("hypotheses.toml").items())
 
 
 def predicted_sheet(
@@ -154,14 +150,13 @@ def parameters_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     from sealscope.parameters import load_rig
 
     fitted, printed = _identified_rig(), {row.name: row for row in load_rig("thesis").table()}
-    rows = tuple(
+    rows = [
         (row.name, row.meaning, printed[row.name].given, row.given, row.source)
         for row in fitted.table()
         if row.given != printed[row.name].given
-    )
+    ]
     sigma = ", ".join(f"{noise_of(fitted, chamber):.2f} psi in {chamber}" for chamber in CHAMBERS)
-    heads = ("parameter", "meaning", "rig thesis", f"rig {BENCH_RIG}", "source and interval")
-    return (ThesisTable(item.id, item.title, heads, rows, notes=f"Noise of a sample, all sources together: {sigma}."),)
+    return (item.table(rows, f"Noise of a sample, all sources together: {sigma}."),)
 
 
 def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
@@ -169,23 +164,17 @@ def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     assert context.sheet is not None
     log = log_residuals(_identified_rig(), context.sheet)
     columns = [(c, q, log[:, k, j]) for k, c in enumerate(CHAMBERS) for j, q in enumerate(QUANTITIES)]
-    heads: tuple[str, ...] = (
-        "chamber",
-        "detail",
-        "geometric mean of simulated / measured leak-free RMS",
-        "within 25 %",
-    )
     rows: list[tuple[Cell, ...]] = []
     for chamber, name, of in columns:
         mean, scatter = float(np.exp(of.mean())), float(np.exp(of.std(ddof=1)))
         rows.append((chamber, name, mean, "yes" if abs(mean - 1.0) <= 0.25 else "no", scatter))
-    heads = (*heads, "scatter between tests [factor]")
-    summary = ThesisTable(item.id, item.title, heads, tuple(rows), notes=note("fit"))
-    heads, rows = ("input", "closed [%]", "tests", *(f"{c} {q} simulated / measured" for c, q, _ in columns)), []
+    by_condition: list[tuple[Cell, ...]] = []
     for group in groups():
         own = np.array([condition.group == group for condition in APPENDIX_C])
-        rows.append((*group, int(own.sum()), *np.exp(log[own].mean(axis=0)).ravel().tolist()))
-    return summary, ThesisTable(f"{item.id}-conditions", f"{item.title}, by operating condition", heads, tuple(rows))
+        by_condition.append((*group, int(own.sum()), *np.exp(log[own].mean(axis=0)).ravel().tolist()))
+    heads = ("input", "closed [%]", "tests", *(f"{c} {q} simulated / measured" for c, q, _ in columns))
+    title = f"{item.title}, by operating condition"
+    return item.table(rows, note("fit")), item.table(by_condition, "", heads, tail="-conditions", title=title)
 
 
 def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
@@ -211,13 +200,4 @@ def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
         changes = [100 * (float(np.exp(np.mean(predicted.log_change(c, q)))) - 1.0) for c, q in changed]
         same = [int(np.sum(signs(predicted, c, q) == signs(sheet, c, q))) for c, q in shown]
         rows.append((hypothesis.name, *(float(np.exp(level)) for level in levels), *changes, *same))
-    return (ThesisTable(item.id, item.title, tuple(heads), tuple(rows), notes=note("hypotheses")),)
-
-
-_FIT = "How the calibrated rig fits the leak-free columns of Appendix C"
-_WHY = "What could explain the columns that the calibrated rig does not"
-ITEMS: tuple[Item, ...] = (
-    Item("calibration", 5, "table", "What the thesis leaves unknown, fitted to Appendix C", parameters_table),
-    Item("calibration-fit", 5, "table", _FIT, fit_table, needs_sheet=True),
-    Item("calibration-hypotheses", 5, "table", _WHY, hypotheses_table, needs_sheet=True),
-)
+    return (item.table(rows, note("hypotheses"), heads),)

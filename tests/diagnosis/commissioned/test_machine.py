@@ -52,7 +52,6 @@ def test_the_predicted_smallest_leak_is_what_is_found(machine):
         share: [
             machine.diagnose(
                 ss.simulate(command="3 sin(4t)", duration="20 s", leak=f"{share * smallest:.6g} L/min", seed=seed),
-                quick=True,
             ).verdict
             == "leak"
             for seed in range(50, 56)
@@ -188,7 +187,6 @@ def test_another_actuator_is_named_and_is_no_leak(machine):
                 set={"cylinder.A_A": f"{area} mm^2", "cylinder.A_B": f"{area} mm^2"},
                 seed=70,
             ),
-            quick=True,
         )
         for area in (633, 728)
     }

@@ -9,8 +9,8 @@ Processing I, 1993, eq. 3.31). What is left out of R (drift, hum, a leak's own s
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -42,20 +42,6 @@ UNKNOWN = (
 BOUND_SECONDS = 25.2
 #: Reciprocal condition of the scaled information below which a parameter cannot be told from the others.
 _SINGULAR = 1e-12
-
-
-@dataclass(frozen=True)
-class LeakBound:
-    """Standard deviation of the best unbiased estimate of a small leak over one run, as conductance G [m^3/(s Pa)].
-
-    `known`: all else known; `unknown`: other parameters estimated from the same run, None where there are none;
-    `duration` [s]; `nonlinearity`: of the worst derivative.
-    """
-
-    known: float
-    unknown: float | None
-    duration: float
-    nonlinearity: float
 
 
 def unknown_of(rig: Rig) -> tuple[str, ...]:
@@ -115,35 +101,20 @@ def cramer_rao(fisher: Array) -> Array:
     raise InputError("the parameters must be told apart by the channels, got a singular information matrix")
 
 
-def leak_bound(
-    experiment: Experiment,
-    *,
-    covariance: Array | None = None,
-    unknown: Sequence[str] = (),
-    progress: Callable[[float], None] | None = None,
-) -> LeakBound:
-    """Return the bound on a small leak that is open over the whole experiment, from the chambers' pressures.
+def leak_bound(experiment: Experiment, unknown: Sequence[str] = (), covariance: Array | None = None) -> float:
+    """Return the standard deviation of the best unbiased estimate of a small leak, as conductance G [m^3/(s Pa)].
 
-    `covariance` (c, c) of one sample, default that of the rig's sensors; `unknown`: parameters that the estimate must
-    find beside the leak. The command and everything not named are taken as known.
+    The leak is open over the whole experiment and is estimated from the chambers' pressures; `unknown`: parameters that
+    the estimate must find beside it, command and all else are taken as known. `covariance` (c, c) of one sample,
+    default that of the rig's sensors.
 
     Raises InputError for a parameter that cannot vary and where the leak cannot be told from the unknown ones,
     SimulationFailed where a derivative cannot be had.
     """
     R = noise_covariance(experiment.rig) if covariance is None else covariance
-    progress = progress or (lambda share: None)
-    sensitivities = [leak_sensitivity(experiment)]
-    for k, name in enumerate(unknown):
-        progress((k + 1.0) / (len(unknown) + 1.0))
-        sensitivities.append(parameter_sensitivity(experiment, name))
-    progress(1.0)
+    sensitivities = [leak_sensitivity(experiment), *(parameter_sensitivity(experiment, name) for name in unknown)]
     fisher = information(np.stack([sensitivity.slope for sensitivity in sensitivities]), R)
-    return LeakBound(
-        known=1.0 / math.sqrt(fisher[0, 0]),
-        unknown=math.sqrt(cramer_rao(fisher)[0, 0]) if unknown else None,
-        duration=experiment.duration,
-        nonlinearity=max(sensitivity.nonlinearity for sensitivity in sensitivities),
-    )
+    return math.sqrt(cramer_rao(fisher)[0, 0])
 
 
 def change_bound(experiment: Experiment, before: float, after: float, dp: float) -> float | None:
@@ -161,10 +132,8 @@ def change_bound(experiment: Experiment, before: float, after: float, dp: float)
         experiment, leaks=(), faults=(), drifts=(), duration=min(BOUND_SECONDS, experiment.duration), step=None
     )
     try:
-        bound = leak_bound(_opened(run), unknown=unknown_of(run.rig)).unknown
+        bound = leak_bound(_opened(run), unknown_of(run.rig))
     except (InputError, SimulationFailed):
-        return None
-    if bound is None:
         return None
     return in_lpm(bound * math.sqrt(run.duration / before + run.duration / after), dp)
 

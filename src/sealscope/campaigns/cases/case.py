@@ -34,23 +34,29 @@ _NOT_IN_ROWS = (
 )
 
 
-@dataclass(frozen=True)
-class CampaignCase:
-    """One record to make and judge; `id` and seeds derive from its content alone, so they are the same anywhere.
+@dataclass(frozen=True, kw_only=True)
+class CaseInputs:
+    """What a case is: what a record is made of and used for.
 
-    `levels`: factor -> level; `leak_lpm` [L/min] and `fault`: what is put in at the plan's onset; `replicate` counts
-    within the cell.
+    `levels`: factor -> level; `leak_lpm` [L/min] of that `law` and `fault`: what is put in at the plan's onset;
+    `replicate` counts within the cell.
     """
 
     id: str
-    machine_seed: int
-    noise_seed: int
     use: Use
     leak_lpm: float
-    law: str
-    fault: str
+    law: str = "laminar"
+    fault: str = ""
     levels: Mapping[str, str | float]
-    replicate: int
+    replicate: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class CampaignCase(CaseInputs):
+    """One record to make and judge; `id` and seeds derive from its content alone, so they are the same anywhere."""
+
+    machine_seed: int
+    noise_seed: int
 
 
 def digest(value: Any) -> str:
@@ -119,7 +125,8 @@ def cases_of(plan: SimulatedPlan) -> list[CampaignCase]:
             }
             name = digest({"world": shared, **content, **named})
             machine, noise = np.random.SeedSequence(int(name, 16)).generate_state(2, np.uint64)
-            cases.append(CampaignCase(name[:16], int(machine >> np.uint64(1)), int(noise >> np.uint64(1)), **content))
+            machine_seed, noise_seed = int(machine >> np.uint64(1)), int(noise >> np.uint64(1))
+            cases.append(CampaignCase(id=name[:16], machine_seed=machine_seed, noise_seed=noise_seed, **content))
     return cases
 
 

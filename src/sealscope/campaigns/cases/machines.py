@@ -96,7 +96,7 @@ def sized_once(experiment: Experiment) -> tuple[Leak, ...]:
     Sizing on the whole record would cost it two or three times over; the mean that the record really had is in its
     row.
     """
-    from sealscope.simulation.sizing import sized_leaks
+    from sealscope.simulation.integrate import sized_leaks
 
     if not experiment.leaks:
         return ()

@@ -74,9 +74,7 @@ def _row(plan: RecordedPlan, recordings: RecordingSet, path: Path, name: str) ->
         id=hashlib.sha256(os.fsencode(name)).hexdigest()[:16],
         use=recordings.use,
         leak_lpm=recordings.size,
-        fault="",
         levels={"set": label, STROKE: "unknown"},
-        replicate=0,
     )
     try:
         recording = read(path, map=plan.channel_map or None, rate=plan.rate_hz)

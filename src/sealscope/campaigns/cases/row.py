@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
-from sealscope.campaigns.cases.case import CampaignCase
+from sealscope.campaigns.cases.case import CampaignCase, CaseInputs
 from sealscope.campaigns.plans.duty import COMMAND
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause, Evidence, Verdict
 from sealscope.errors import SealscopeError
@@ -104,8 +104,8 @@ def error_text(error: Exception) -> str:
     return f"{type(error).__name__}: {error}".splitlines()[0]
 
 
-@dataclass(frozen=True)
-class CaseRow:
+@dataclass(frozen=True, kw_only=True)
+class CaseRow(CaseInputs):
     """What a campaign stores of a case: its inputs and the scores; or the `error` of it.
 
     `flow_lpm`: mean leak [L/min] while open, as the run really had it; `bound_lpm`: standard deviation [L/min] of the
@@ -114,18 +114,11 @@ class CaseRow:
     time, which takes no part in the result.
     """
 
-    id: str
-    use: str
-    leak_lpm: float
-    fault: str
-    levels: Mapping[str, str | float]
-    replicate: int
     flow_lpm: float | None = None
     scores: Scores = field(default_factory=dict)
     error: str | None = None
     seconds: float = 0.0
     statements: Mapping[str, Statement] = field(default_factory=dict)
-    law: str = "laminar"
     bound_lpm: float | None = None
 
     def as_dict(self) -> dict[str, Any]:
@@ -135,9 +128,7 @@ class CaseRow:
     @classmethod
     def of(cls, case: CampaignCase, **values: Any) -> CaseRow:
         """Return the row of a case, with its results or its `error`."""
-        return cls(
-            case.id, case.use, case.leak_lpm, case.fault, case.levels, case.replicate, law=case.law, **values
-        )  # fmt: skip
+        return cls(**{of.name: getattr(case, of.name) for of in fields(CaseInputs)}, **values)
 
     @classmethod
     def from_dict(cls, tree: Any) -> CaseRow:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from sealscope.campaigns.cases.row import Scores, Statement, finite, rank_of
-from sealscope.campaigns.plans.detectors import ALL_CHANNELS, DIAGNOSE, PlanDetector, Views, plan_detector
+from sealscope.campaigns.plans.detectors import ALL_CHANNELS, DIAGNOSE, WATCH, PlanDetector, Views, plan_detector
 from sealscope.campaigns.plans.scorers import Sides
 from sealscope.diagnosis.diagnose import Examination
 from sealscope.diagnosis.verdict.evidence import Evidence
-from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
 
 if TYPE_CHECKING:
@@ -46,10 +46,10 @@ def stated(
 
 
 def _evidence(detector: PlanDetector, examination: Examination) -> Evidence:
-    if detector.online:
-        return online(examination.recording, examination.rig, examination.false_alarm_probability)
+    if detector.of == WATCH:
+        return watched(examination.recording, examination.rig, examination.false_alarm_probability)
     if detector.of == DIAGNOSE:
-        return examination.fused(detector.quick)
+        return examination.fused()
     return examination.evidence(detector.of)
 
 
@@ -72,20 +72,17 @@ def _share(evidence: Statement) -> float | None:
     return rank / threshold if threshold > 0 else rank - threshold
 
 
-def online(recording: Recording, rig: Rig | str | os.PathLike[str], false_alarm: float) -> Evidence:
-    """Return the alarm of the volume balance's stream as it stands at the record's end, or its last word without one.
+def watched(recording: Recording, rig: Rig | str | os.PathLike[str], false_alarm: float) -> Evidence:
+    """Return what the watch of a machine says at the record's end; an alarm that was raised stays.
 
     Its rate of alarms is the one at which a healthy machine alarms within the record with the probability
-    `false_alarm` at most. An alarm that was raised stays, whatever came later. A record without its channels is
-    `cannot tell`.
+    `false_alarm` at most.
     """
-    from sealscope.diagnosis.inference.live.stream import SequentialBalance
+    from sealscope.diagnosis.live.watch import Watch
+    from sealscope.parameters import load_rig
 
-    stream = SequentialBalance(rig, alarms_per_hour=false_alarm * 3600.0 / recording.duration)
+    watch = Watch(load_rig(rig), false_alarm * 3.6e6 / recording.duration, learn_hours=1000.0)
     begin = float(recording.t[0])
-    try:
-        for second in range(math.ceil(recording.duration / _PORTION)):
-            stream.update(recording.between(begin + second * _PORTION, begin + (second + 1) * _PORTION))
-    except InputError as error:
-        return Evidence("cannot tell", str(error))
-    return stream.state.alarm or stream.state.evidence
+    for second in range(math.ceil(recording.duration / _PORTION)):
+        watch.update(recording.between(begin + second * _PORTION, begin + (second + 1) * _PORTION))
+    return replace(watch.evidence, detector=WATCH)

@@ -188,7 +188,15 @@ class StepChooser:
             steps: dict[str, float] = {}
             for number in range(SCOUTS):
                 seed = int(digest([self._world, dict(levels), f"scout {number}"])[:15], 16)
-                scout = CampaignCase("", seed, 0, "calibrate", 0.0, "laminar", "", levels, number)
+                scout = CampaignCase(
+                    id="",
+                    machine_seed=seed,
+                    noise_seed=0,
+                    use="calibrate",
+                    leak_lpm=0.0,
+                    levels=levels,
+                    replicate=number,
+                )
                 try:
                     method, step = _chosen(unsized(self._plan, scout, self._profile))
                 except SealscopeError:  # a machine of the bench that cannot do this duty

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from sealscope.campaigns.cases.case import CampaignCase, cases_of, interleaved
 from sealscope.campaigns.cases.recordings import ProgressCallback
@@ -20,8 +19,8 @@ from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.errors import InputError
 from sealscope.storage.folders import inner_folder
 
-#: Carries out one case of a plan; the last argument is the folder to write its recording into, None for none.
-Task = Callable[[SimulatedPlan, CampaignCase, "Path | None"], CaseRow]
+#: Carries out one case of a plan; `folder` to write its recording into, None for none.
+Task = Callable[..., CaseRow]
 RECORDINGS = "recordings"
 
 
@@ -71,8 +70,9 @@ def run(
         if batch:
             new_rows = batches.in_batches(plan, waiting, jobs)
         else:
-            carry = partial(on_cluster, address=cluster) if cluster else partial(carried_out, jobs=jobs)
-            new_rows = _rows(partial(_carry_out, task, plan, recordings), waiting, carry)
+            carry_out = partial(task, plan, folder=recordings)
+            ended = on_cluster(carry_out, waiting, cluster) if cluster else carried_out(carry_out, waiting, jobs)
+            new_rows = _rows(ended)
         with store.appending(place) as append, closing(new_rows):
             for row in new_rows:
                 append(row)
@@ -82,21 +82,8 @@ def run(
     return store.progress_of(plan, place)
 
 
-def _carry_out(task: Task, plan: SimulatedPlan, recordings: Path | None, case: CampaignCase) -> CaseRow:
-    return task(plan, case, recordings)
-
-
-def _rows(
-    task: Callable[[CampaignCase], CaseRow], cases: Sequence[CampaignCase], carry: Callable[..., Any]
-) -> Generator[CaseRow, None, None]:
-    """Yield the rows of the cases as they end; a case whose process dies is tried once more, then failed."""
-    died: list[CampaignCase] = []
-    for waiting in (cases, died):
-        with closing(carry(task, tuple(waiting))) as ended:
-            for case, row in ended if waiting else ():
-                if row is not None:
-                    yield row
-                elif waiting is cases:  # by a hand or the memory's end
-                    died.append(case)
-                else:
-                    yield CaseRow.of(case, error="the process that carried it out died")
+def _rows(ended: Generator[tuple[CampaignCase, CaseRow | None], None, None]) -> Generator[CaseRow, None, None]:
+    """Yield the rows of the cases as they end."""
+    with closing(ended):
+        for case, row in ended:
+            yield row or CaseRow.of(case, error="the process that carried it out died")

@@ -6,11 +6,11 @@ import json
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from sealscope.campaigns.cases.case import cases_of, code_key, digest, world
+from sealscope.campaigns.cases.case import CaseInputs, cases_of, code_key, digest, world
 from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.plans.detectors import DIAGNOSE, plan_detector
 from sealscope.campaigns.plans.model import SimulatedPlan
@@ -37,7 +37,6 @@ FORMAT = 3
 ROWS, HEAD, LOCK = "rows.jsonl", "campaign.json", ".lock"
 #: Longest line of a row, and largest head [bytes].
 _LONGEST_ROW = _LARGEST_HEAD = 1_000_000
-_INPUTS = ("use", "leak_lpm", "fault", "levels", "replicate")
 #: How rows are made unless in batches.
 RUN_BY_RUN = "run by run"
 
@@ -142,7 +141,7 @@ def rows_of(plan: SimulatedPlan, folder: Path) -> dict[str, CaseRow]:
         row = rows.get(case.id)
         if row is None:
             continue
-        if any(getattr(row, name) != getattr(case, name) for name in _INPUTS):
+        if any(getattr(row, of.name) != getattr(case, of.name) for of in fields(CaseInputs)):
             raise UnreadableFile(f"a row must say the inputs of its case, got others of {case.id} ({folder / ROWS})")
         if row.error is not None or wanted <= set(row.scores):
             of_plan[row.id] = row

@@ -35,9 +35,9 @@ def carried_out(
     """Yield each item and its result as it ends, from up to `jobs` spawned processes; 1: from this process.
 
     An item is taken from `items` when a process is free for it. `task` and items are pickled; `task` goes to each
-    process once. Every process is an executor of its own, so that one that dies breaks no other: its item has the
-    result None. Processes ignore the interrupt, and end when the generator is closed or the parent ends, however that
-    ends. Raises what `task` raised.
+    process once. Every process is an executor of its own, so that one that dies, by a hand or the memory's end, breaks
+    no other: its item is tried once more after all others, and has then the result None. Processes ignore the
+    interrupt, and end when the generator is closed or the parent ends, however that ends. Raises what `task` raised.
     """
     if jobs == 1:
         yield from ((item, task(item)) for item in items)
@@ -46,6 +46,8 @@ def carried_out(
     lifeline, held = context.Pipe(duplex=False)
     idle: list[ProcessPoolExecutor] = []
     busy: dict[Future[Result], tuple[ProcessPoolExecutor, Item]] = {}
+    died: list[Item] = []
+    tried_again = False
     try:
         while True:
             for item in islice(waiting, jobs - len(busy)):
@@ -53,14 +55,21 @@ def carried_out(
                     pool = idle.pop() if idle else ProcessPoolExecutor(1, context, _begin, (task, lifeline))
                     busy[pool.submit(_carry_out, item)] = pool, item
             if not busy:
-                return
+                if tried_again or not died:
+                    return
+                waiting, tried_again = iter(died), True
+                continue
             for future in wait(busy, return_when=FIRST_COMPLETED).done:
                 pool, item = busy.pop(future)
                 try:
-                    result: Result | None = future.result()
-                    idle.append(pool)
+                    result = future.result()
                 except BrokenProcessPool:
-                    result = None
+                    if tried_again:
+                        yield item, None
+                    else:
+                        died.append(item)
+                    continue
+                idle.append(pool)
                 yield item, result
     finally:
         held.close()

@@ -161,9 +161,7 @@ def held_out_rows(plan: HeldOutPlan, samples: MeasuredSamples) -> list[CaseRow]:
             id=hashlib.sha256(f"{plan.data} {k}".encode()).hexdigest()[:16],
             use="judge",
             leak_lpm=float(leak),
-            fault="",
             levels=samples.levels[k],
-            replicate=0,
             flow_lpm=float(leak),
             scores={name: (float(odds[k]), None) for name, odds in scores.items()},
         )

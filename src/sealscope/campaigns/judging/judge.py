@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -28,17 +28,17 @@ from sealscope.campaigns.cases.row import (
 from sealscope.campaigns.plans.detectors import plan_detector
 from sealscope.errors import InputError
 from sealscope.evaluation.binomial import IntervalEstimate, Proportion, proportion
-from sealscope.evaluation.estimates import EstimateError, OnsetErrors, estimate_error, onset_errors, quantile_of
+from sealscope.evaluation.estimates import EstimateErrors, estimate_errors
 from sealscope.evaluation.pod import HitMiss, SizeDetection, by_size, fit_hit_miss, proven_size
 from sealscope.evaluation.roc import Area, Roc, auc, roc_curve
-from sealscope.evaluation.table import ALWAYS, CANNOT_TELL, NEVER, Confusion, SummaryRow, confusion_matrix, summary
+from sealscope.evaluation.table import CANNOT_TELL, Confusion, confusion_matrix, events_per_hour
 from sealscope.evaluation.thresholds import Promise, Threshold, quantile_threshold, records_needed
 
-_K = TypeVar("_K")
-#: (detector, row id) -> verdict
-Verdicts = Mapping[tuple[str, str], str]
+_T = TypeVar("_T")
 #: (detector, duty) -> threshold from leak-free records of that duty
 Thresholds = Mapping[tuple[str, str], Threshold]
+#: Two detectors that do not look, beside which the others are shown.
+ALWAYS, NEVER = "always fire", "never fire"
 #: What stands for all families together, and for all laws of a leak.
 ALL, ANY_LAW = "all", "any"
 #: Probability with which the best test finds a leak that the bound allows.
@@ -59,6 +59,11 @@ class DetectorPod:
     why: str
     proven: float
 
+    @property
+    def how(self) -> str:
+        """How the curve was fitted, or why there is none."""
+        return self.curve.estimator if self.curve else self.why
+
 
 @dataclass(frozen=True)
 class SizeRoc:
@@ -74,18 +79,21 @@ class SizeRoc:
 class AlarmShares:
     """Alarms of one detector on records that have something in common.
 
-    `leak_lpm` (0: no leak) and `law` of the leak, `fault` that is no leak, `family` of machines, `levels` of the
-    factors: what they have in common, where it was asked for. `coverage`: how often a stated interval holds the flow
-    that there was; `named`: alarms that name the fault's cause, alone or with the piston, None where the detector names
-    no cause; `reachable`: records whose leak the Cramer-Rao bound of their machine allows to find, over those that have
-    a bound, and `allowed`: alarms over these, both None where there is no bound; `failed`: records without a result,
-    which are among those that cannot be told.
+    `leak_lpm` (0: no leak, nan: any) and `law` of the leak, `fault` that is no leak, `family` of machines, `levels` of
+    the factors: what they have in common, where it was asked for. `coverage`: how often a stated interval holds the
+    flow that there was; `false_alarm` and `per_hour`: of that detector on its leak-free records, None where there are
+    none, or no hours; `named`: alarms that name the fault's cause, alone or with the piston, None where the detector
+    names no cause; `reachable`: records whose leak the Cramer-Rao bound of their machine allows to find, over those
+    that have a bound, and `allowed`: alarms over these, both None where there is no bound; `failed`: records without a
+    result, which are among those that cannot be told.
     """
 
     detector: str
     alarms: Proportion
     cannot_tell: Proportion
     coverage: Proportion
+    false_alarm: Proportion | None = None
+    per_hour: IntervalEstimate | None = None
     leak_lpm: float = 0.0
     law: str = ANY_LAW
     fault: str = ""
@@ -96,28 +104,22 @@ class AlarmShares:
     allowed: Proportion | None = None
     failed: int = 0
 
-
-@dataclass(frozen=True)
-class OnsetAccuracy:
-    """Errors [s] of the onsets that one detector stated in its alarms at one size of leak."""
-
-    detector: str
-    leak_lpm: float
-    errors: OnsetErrors
+    @property
+    def informedness(self) -> float:
+        """Share of alarms less that of false alarms, 0 for chance."""
+        return self.alarms.value - self.false_alarm.value if self.false_alarm else math.nan
 
 
 @dataclass(frozen=True)
-class FlowAccuracy:
-    """Errors of the flow that one detector states at one size of leak (0: leak-free records), alarm or not.
+class StatedErrors:
+    """Errors of what one detector states at one size of leak (0: leak-free records).
 
-    `errors`: mean, and coverage of the stated interval; `median` (signed) and `median_size` of the error.
+    Of the onset [s] over its alarms, or of the flow over all records, alarm or not.
     """
 
     detector: str
     leak_lpm: float
-    errors: EstimateError
-    median: IntervalEstimate
-    median_size: IntervalEstimate
+    errors: EstimateErrors
 
 
 @dataclass(frozen=True)
@@ -147,10 +149,10 @@ class Judgement:
     leak_free: int
     judged: int
     failed: tuple[CaseRow, ...]
-    table: tuple[SummaryRow, ...]
-    overall: tuple[SummaryRow, ...]
-    onsets: tuple[OnsetAccuracy, ...]
-    flows: tuple[FlowAccuracy, ...]
+    table: tuple[AlarmShares, ...]
+    overall: tuple[AlarmShares, ...]
+    onsets: tuple[StatedErrors, ...]
+    flows: tuple[StatedErrors, ...]
     causes: tuple[NamedCauses, ...]
     pods: tuple[DetectorPod, ...]
     rocs: tuple[SizeRoc, ...]
@@ -219,22 +221,19 @@ def judge(
         for name in detectors
         if (rule := plan_detector(name).scorer) is not None and rule.threshold is not None
     }
-    verdicts = {
-        (name, row.id): _verdict(row, name, fixed.get(name), thresholds) for name in detectors for row in judged
+    every = {
+        name: [_Judged(row, _verdict(row, name, fixed.get(name), thresholds), _statement(row, name)) for row in judged]
+        for name in detectors
     }
+    these = _Judging(every, confidence, false_alarm)
     plain = [row for row in judged if not row.fault]
-    of_plain = {name: [verdicts[name, row.id] for row in plain] for name in detectors}
-    sizes = [row.leak_lpm for row in plain]
-    any_size = [1.0 if size else 0.0 for size in sizes]
-    overall = [replace(row, leak_lpm=math.nan) for row in summary(any_size, of_plain, confidence, hours)]
-    these = _Judging(plain, judged, detectors, verdicts, confidence, false_alarm)
     return Judgement(
         thresholds=thresholds,
         leak_free=sum(row.use == "calibrate" and row.error is None for row in rows) if thresholds else 0,
         judged=sum(row.error is None for row in judged),
         failed=tuple(row for row in sorted(rows, key=lambda row: row.id) if row.error is not None),
-        table=tuple(summary(sizes, of_plain, confidence, hours)) if plain else (),
-        overall=tuple(overall) if plain else (),
+        table=tuple(these.by_size(lambda of: of.leak, hours)),
+        overall=tuple(these.by_size(lambda of: math.nan, hours)),
         onsets=() if onset_s is None else tuple(these.onsets(onset_s)),
         flows=tuple(these.flows()),
         causes=tuple(these.causes()),
@@ -269,12 +268,12 @@ def _flow(row: CaseRow) -> float:
     return row.leak_lpm if row.flow_lpm is None else row.flow_lpm
 
 
-def _by(rows: Iterable[CaseRow], key: Callable[[CaseRow], _K]) -> dict[_K, list[CaseRow]]:
-    """Return the rows by what they have in common, in rising order."""
-    groups: dict[_K, list[CaseRow]] = {}
-    for row in rows:
-        groups.setdefault(key(row), []).append(row)
-    return dict(sorted(groups.items(), key=lambda group: group[0]))  # type: ignore[arg-type, return-value]
+def _by(items: Iterable[_T], key: Callable[[_T], Any]) -> dict[Any, list[_T]]:
+    """Return the items by what they have in common, in rising order."""
+    groups: dict[Any, list[_T]] = {}
+    for item in items:
+        groups.setdefault(key(item), []).append(item)
+    return dict(sorted(groups.items(), key=lambda group: group[0]))
 
 
 def _realised(rows: Sequence[CaseRow]) -> dict[float, tuple[float, float]]:
@@ -287,34 +286,83 @@ def _realised(rows: Sequence[CaseRow]) -> dict[float, tuple[float, float]]:
     return realised
 
 
-def _ends(pairs: Iterable[tuple[float, float] | None]) -> tuple[list[float], list[float]]:
-    ends = [(math.nan, math.nan) if pair is None else pair for pair in pairs]
-    return [low for low, _ in ends], [high for _, high in ends]
+class _Judged(NamedTuple):
+    """A row, one detector's verdict on it, and what it stated."""
+
+    row: CaseRow
+    verdict: str
+    stated: Statement | None
+
+    @property
+    def leak(self) -> float:
+        return self.row.leak_lpm
+
+    @property
+    def alarm(self) -> bool:
+        return self.verdict == "leak"
+
+
+def _errors(
+    detector: str,
+    leak_lpm: float,
+    stated: Sequence[tuple[float | None, float, tuple[float, float] | None]],
+    confidence: float,
+) -> Iterator[StatedErrors]:
+    """Yield the errors of (estimate, truth, interval), where there is any estimate."""
+    estimates, truth, intervals = zip(*stated, strict=True) if stated else ((), (), ())
+    given = [math.nan if value is None else value for value in estimates]
+    if np.isfinite(given).any():
+        low, high = zip(*((math.nan, math.nan) if pair is None else pair for pair in intervals), strict=True)
+        yield StatedErrors(detector, leak_lpm, estimate_errors(given, truth, low, high, confidence))
 
 
 @dataclass(frozen=True)
 class _Judging:
-    """What follows from the verdicts: `plain` rows have no fault beside the leak, `rows` are all."""
+    """What follows from the verdicts by detector."""
 
-    plain: Sequence[CaseRow]
-    rows: Sequence[CaseRow]
-    detectors: Sequence[str]
-    verdicts: Verdicts
+    every: Mapping[str, Sequence[_Judged]]
     confidence: float
     false_alarm: float
 
+    @property
+    def plain(self) -> dict[str, list[_Judged]]:
+        """Those on rows that have no fault beside the leak."""
+        return {name: [of for of in own if not of.row.fault] for name, own in self.every.items()}
+
+    @property
+    def references(self) -> dict[str, list[_Judged]]:
+        """Two detectors that do not look."""
+        first = next(iter(self.every.values()), ())
+        verdicts = {ALWAYS: "leak", NEVER: "no leak"}
+        return {name: [_Judged(of.row, verdict, None) for of in first] for name, verdict in verdicts.items()}
+
+    def by_size(self, size_of: Callable[[_Judged], float], hours: float | None) -> Iterator[AlarmShares]:
+        """Yield alarms by size, and false alarms beside; those that do not look last.
+
+        A detector without a record with a leak has one row of size 0, with no detection.
+        """
+        for name, every in {**self.every, **self.references}.items():
+            own = [of for of in every if not of.row.fault]
+            free, leaky = ([of for of in own if bool(of.leak) == leaks] for leaks in (False, True))
+            groups = _by(leaky, size_of) or ({size_of(free[0]): free} if free else {})
+            alarms = proportion(sum(of.alarm for of in free), len(free), self.confidence) if free else None
+            hourly = events_per_hour(alarms.count, hours * alarms.n, self.confidence) if alarms and hours else None
+            for size, here in groups.items():
+                shares = self._shares(name, here, leak_lpm=size)
+                detected = shares.alarms if leaky else proportion(0, 0, self.confidence)
+                yield replace(shares, alarms=detected, false_alarm=alarms, per_hour=hourly)
+
     def by_cell(self) -> Iterator[AlarmShares]:
         """Yield the alarms at each size in each cell of the factors."""
-        groups = _by(self.plain, lambda row: (row.leak_lpm, repr(tuple(row.levels.items()))))
-        for name in self.detectors:
-            for (size, _), here in groups.items():
-                yield self._shares(name, here, leak_lpm=size, levels=dict(here[0].levels))
+        for name, own in self.plain.items():
+            for (size, _), here in _by(own, lambda of: (of.leak, repr(tuple(of.row.levels.items())))).items():
+                yield self._shares(name, here, leak_lpm=size, levels=dict(here[0].row.levels))
 
     def by_fault(self) -> Iterator[AlarmShares]:
         """Yield the alarms on records with each fault that is no piston leak."""
-        groups = _by((row for row in self.rows if row.fault and row.leak_lpm == 0), lambda row: row.fault)
-        for name in (*self.detectors, ALWAYS, NEVER):
-            for fault, here in groups.items():
+        for name, own in {**self.every, **self.references}.items():
+            faulty = (of for of in own if of.row.fault and of.leak == 0)
+            for fault, here in _by(faulty, lambda of: of.row.fault).items():
                 yield self._shares(name, here, fault=fault)
 
     def by_family(self) -> Iterator[AlarmShares]:
@@ -322,58 +370,49 @@ class _Judging:
 
         Each size has its laws apart, and together where there are several.
         """
-        own = _by((row for row in self.plain if FAMILY in row.levels), lambda row: str(row.levels[FAMILY]))
-        for name in self.detectors if own else ():
-            for family, rows in {ALL: self.plain, **own}.items():
-                for size, here in _by(rows, lambda row: row.leak_lpm).items():
-                    laws = _by(here, lambda row: row.law) if size else {}
+        for name, own in self.plain.items():
+            families = _by((of for of in own if FAMILY in of.row.levels), lambda of: str(of.row.levels[FAMILY]))
+            for family, members in {ALL: own, **families}.items() if families else ():
+                for size, here in _by(members, lambda of: of.leak).items():
+                    laws = _by(here, lambda of: of.row.law) if size else {}
                     for law, these in laws.items() if len(laws) == 1 else {ANY_LAW: here, **laws}.items():
                         yield self._shares(name, these, family=family, leak_lpm=size, law=law)
 
-    def _shares(self, detector: str, rows: Sequence[CaseRow], **common: Any) -> AlarmShares:
-        given = [{ALWAYS: "leak", NEVER: "no leak"}.get(detector) or self.verdicts[detector, row.id] for row in rows]
-        stated = [_statement(row, detector) for row in rows]
-        held = [
-            ev.leak_interval_lpm[0] <= _flow(row) <= ev.leak_interval_lpm[1]
-            for row, ev in zip(rows, stated, strict=True)
-            if ev is not None and ev.leak_interval_lpm is not None
-        ]
+    def _shares(self, detector: str, here: Sequence[_Judged], **common: Any) -> AlarmShares:
+        def share(flags: Iterable[bool]) -> Proportion:
+            of = list(flags)
+            return proportion(sum(of), len(of), self.confidence)
+
+        intervals = [(_flow(row), ev.leak_interval_lpm) for row, _, ev in here if ev is not None]
         named = [
-            ev is not None and verdict == "leak" and covers(named_cause(ev), cause_of(row.fault))
-            for row, ev, verdict in zip(rows, stated, given, strict=True)
+            ev is not None and alarm == "leak" and covers(named_cause(ev), cause_of(row.fault))
+            for row, alarm, ev in here
         ]
-        bounded = sum(row.bound_lpm is not None for row in rows) if common.get("leak_lpm") else 0
-        detected = [verdict == "leak" for row, verdict in zip(rows, given, strict=True) if self._allowed(row)]
+        bounded = [of for of in here if of.row.bound_lpm is not None] if common.get("leak_lpm") else []
         return AlarmShares(
             detector=detector,
-            alarms=self._proportion(given.count("leak"), len(rows)),
-            cannot_tell=self._proportion(given.count(CANNOT_TELL), len(rows)),
-            coverage=self._proportion(sum(held), len(held)),
-            named=self._proportion(sum(named), len(named)) if any(stated) else None,
-            reachable=self._proportion(len(detected), bounded) if bounded else None,
-            allowed=self._proportion(sum(detected), len(detected)) if bounded else None,
-            failed=sum(row.error is not None for row in rows),
+            alarms=share(of.alarm for of in here),
+            cannot_tell=share(of.verdict == CANNOT_TELL for of in here),
+            coverage=share(ends[0] <= flow <= ends[1] for flow, ends in intervals if ends is not None),
+            named=share(named) if any(of.stated for of in here) else None,
+            reachable=share(map(self._allowed, bounded)) if bounded else None,
+            allowed=share(of.alarm for of in bounded if self._allowed(of)) if bounded else None,
+            failed=sum(of.row.error is not None for of in here),
             **common,
         )
 
-    def _proportion(self, k: int, n: int) -> Proportion:
-        return proportion(k, n, self.confidence)
-
-    def _allowed(self, row: CaseRow) -> bool:
+    def _allowed(self, of: _Judged) -> bool:
         """Whether the best test at this false-alarm probability finds the leak of a row nine times in ten."""
-        bound = row.bound_lpm
-        return bound is not None and smallest_detectable(bound, self.false_alarm, ALLOWED_DETECTION) <= _flow(row)
-
-    def _stating(self, rows: Sequence[CaseRow]) -> list[str]:
-        """Return the detectors that state evidence."""
-        return [name for name in self.detectors if any(name in row.statements for row in rows)]
+        bound = of.row.bound_lpm
+        return bound is not None and smallest_detectable(bound, self.false_alarm, ALLOWED_DETECTION) <= _flow(of.row)
 
     def pods(self) -> Iterator[DetectorPod]:
         """Yield the probability of detection over the size, where there are leaks."""
-        leaky = [row for row in self.plain if row.leak_lpm > 0]
-        sizes = [row.leak_lpm for row in leaky]
-        for name in self.detectors if leaky else ():
-            hits = [self.verdicts[name, row.id] == "leak" for row in leaky]
+        for name, own in self.plain.items():
+            leaky = [of for of in own if of.leak > 0]
+            if not leaky:
+                continue
+            sizes, hits = [of.leak for of in leaky], [of.alarm for of in leaky]
             detections = by_size(sizes, hits, self.confidence)
             curve, why = None, ""
             try:
@@ -384,64 +423,51 @@ class _Judging:
 
     def rocs(self) -> Iterator[SizeRoc]:
         """Yield curves over the scores, with no threshold; a record that cannot be judged counts as the lowest."""
-        for name in self.detectors:
-            value = {row.id: row.scores[name][0] if row.error is None else None for row in self.plain}
-            lowest = min((score for score in value.values() if score is not None), default=None)
+        for name, own in self.plain.items():
+            scored = [(of.leak, of.row.scores[name][0] if of.row.error is None else None) for of in own]
+            lowest = min((score for _, score in scored if score is not None), default=None)
             if lowest is None:
                 continue
             by_leak: dict[float, list[float]] = {}
-            for row in self.plain:
-                score = value[row.id]
-                by_leak.setdefault(row.leak_lpm, []).append(lowest - 1.0 if score is None else score)
+            for leak, score in scored:
+                by_leak.setdefault(leak, []).append(lowest - 1.0 if score is None else score)
             free = by_leak.pop(0.0, [])
             together = [score for scores in by_leak.values() for score in scores]
             for size, leaky in ((math.nan, together), *sorted(by_leak.items())):
                 if min(len(free), len(leaky)) > 1:
-                    curve, area = (of(free, leaky, self.confidence) for of in (roc_curve, auc))
-                    yield SizeRoc(name, size, curve, area)  # type: ignore[arg-type]
+                    curve, area = roc_curve(free, leaky, self.confidence), auc(free, leaky, self.confidence)
+                    yield SizeRoc(name, size, curve, area)
 
-    def onsets(self, onset_s: float) -> Iterator[OnsetAccuracy]:
+    def onsets(self, onset_s: float) -> Iterator[StatedErrors]:
         """Yield, for detectors that search for the onset, its error over the alarms, by size."""
-        groups = _by((row for row in self.plain if row.leak_lpm > 0), lambda row: row.leak_lpm)
-        for name in self.detectors:
-            for size, rows in groups.items():
-                alarmed = [row for row in rows if self.verdicts[name, row.id] == "leak"]
-                timed = [(at, row) for row in alarmed if (at := row.scores[name][1]) is not None]
-                if timed:
-                    stated = [_statement(row, name) for _, row in timed]
-                    low, high = _ends(None if ev is None else ev.onset_interval_s for ev in stated)
-                    truth = [onset_s] * len(timed)
-                    errors = onset_errors([at for at, _ in timed], truth, low, high, self.confidence)
-                    yield OnsetAccuracy(name, size, errors)
+        for name, own in self.plain.items():
+            for size, here in _by((of for of in own if of.leak > 0 and of.alarm), lambda of: of.leak).items():
+                timed = [(of.row.scores[name][1], of.stated) for of in here if of.row.scores[name][1] is not None]
+                stated = [(at, onset_s, None if ev is None else ev.onset_interval_s) for at, ev in timed]
+                yield from _errors(name, size, stated, self.confidence)
 
-    def flows(self) -> Iterator[FlowAccuracy]:
+    def flows(self) -> Iterator[StatedErrors]:
         """Yield, for detectors that state a flow, its errors against the flow that the record really had, by size."""
-        for name in self._stating(self.plain):
-            for size, rows in _by(self.plain, lambda row: row.leak_lpm).items():
-                own = [(row, ev) for row in rows if (ev := _statement(row, name)) is not None]
-                truth = [_flow(row) for row, _ in own]
-                given = [math.nan if ev.leak_lpm is None else ev.leak_lpm for _, ev in own]
-                if not np.isfinite(given).any():
-                    continue
-                low, high = _ends(ev.leak_interval_lpm for _, ev in own)
-                error = np.array(given) - np.array(truth)
-                error = error[np.isfinite(error)]
-                errors = estimate_error(given, truth, low, high, self.confidence)
-                medians = (quantile_of(of, 0.5, self.confidence) for of in (error, np.abs(error)))
-                yield FlowAccuracy(name, size, errors, *medians)
+        for name, own in self.plain.items():
+            for size, here in _by((of for of in own if of.stated is not None), lambda of: of.leak).items():
+                stated = [(ev.leak_lpm, _flow(row), ev.leak_interval_lpm) for row, _, ev in here if ev is not None]
+                yield from _errors(name, size, stated, self.confidence)
 
     def causes(self) -> Iterator[NamedCauses]:
         """Yield the causes that detectors name, where there are faults.
 
         A record with a leak and another fault is left out; one that failed is `cannot tell`.
         """
-        single = [row for row in self.rows if not (row.leak_lpm > 0 and row.fault)]
-        order = sorted({cause_of(row.fault) for row in single if row.fault})
-        truth = [PISTON_LEAK if row.leak_lpm > 0 else cause_of(row.fault) if row.fault else NO_CAUSE for row in single]
-        causes = [cause for cause in (NO_CAUSE, PISTON_LEAK) if cause in truth] + order
-        for name in self._stating(single) if order else ():
-            statements = [_statement(row, name) for row in single]
-            named = [CANNOT_TELL if ev is None else named_cause(ev) for ev in statements]
+        for name, own in self.every.items():
+            single = [of for of in own if not (of.leak > 0 and of.row.fault)]
+            order = sorted({cause_of(of.row.fault) for of in single if of.row.fault})
+            if not order or not any(name in of.row.statements for of in single):
+                continue
+            truth = [
+                PISTON_LEAK if of.leak > 0 else cause_of(of.row.fault) if of.row.fault else NO_CAUSE for of in single
+            ]
+            causes = [cause for cause in (NO_CAUSE, PISTON_LEAK) if cause in truth] + order
+            named = [CANNOT_TELL if of.stated is None else named_cause(of.stated) for of in single]
             others = sorted(set(named) - set(causes) - {CANNOT_TELL})
-            covered = self._proportion(sum(map(covers, named, truth)), len(truth))
+            covered = proportion(sum(map(covers, named, truth)), len(truth), self.confidence)
             yield NamedCauses(name, confusion_matrix(truth, named, [*causes, *others], self.confidence), covered)

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import csv
 import math
+import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from typing import Any
 
-from sealscope.campaigns.cases.row import CaseRow, Statement
+from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.judging.judge import ALLOWED_DETECTION, Judgement
-from sealscope.evaluation.binomial import IntervalEstimate, Proportion
 from sealscope.storage.atomic import atomic_write
 
 Value = str | float | int | None
 #: Name of a column -> value; every row of a table has the same columns.
 TableRow = dict[str, Value]
-_ONSET = "true onset given"
+_SHARE = ("count", "of", "fraction", "low", "high")
 
 
 @dataclass(frozen=True)
@@ -31,146 +33,77 @@ class PriorKnowledge:
     channels: tuple[str, ...]
     rig: str
 
-
-def _share(what: str, share: Proportion | None) -> TableRow:
-    """Return the five columns of a proportion, empty where there is none."""
-    parts = (None,) * 5 if share is None else (share.count, share.n, share.value, share.low, share.high)
-    return {f"{what}: {part}": of for part, of in zip(("count", "of", "fraction", "low", "high"), parts, strict=True)}
+    def plain(self) -> TableRow:
+        """Return what a table says of it."""
+        return {"onset": "yes" if self.onset else "no", "channels": " ".join(self.channels), "rig": self.rig}
 
 
-def _coverage(what: str, coverage: Proportion) -> TableRow:
-    return _share(f"interval holds the {what}", coverage if coverage.n else None)
+@cache
+def _columns() -> dict[str, dict[str, str]]:
+    return tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
-def _interval(what: str, name: str, estimate: IntervalEstimate | None) -> TableRow:
-    parts = (None,) * 3 if estimate is None else (estimate.value, estimate.low, estimate.high)
-    return dict(zip((name, f"{what}: low", f"{what}: high"), parts, strict=True))
+def _attribute(of: Any, path: str) -> Any:
+    """Return an attribute by its path, of a mapping or of a tuple its entry; None where there is none on the way."""
+    for name in path.split("."):
+        if of is None:
+            return None
+        of = of[name] if isinstance(of, Mapping) else of[int(name)] if name.isdigit() else getattr(of, name)
+    return of
 
 
-def _known(known: PriorKnowledge | None) -> TableRow:
-    if known is None:
-        return dict.fromkeys((_ONSET, "channels given", "rig assumed"))
-    onset = "yes" if known.onset else "no"
-    return {_ONSET: onset, "channels given": " ".join(known.channels), "rig assumed": known.rig}
-
-
-def _size(leak_lpm: float) -> Value:
-    return "any" if math.isnan(leak_lpm) else leak_lpm
+def _cells(column: str, content: str, row: Any, factors: Sequence[str]) -> TableRow:
+    """Return the cells of one column of `tables.toml`: one, or several by name."""
+    *how, path = content.split(" ")
+    value = _attribute(row, path)
+    if path == "levels":
+        return {name: value.get(name) for name in factors}
+    if "share" in how:
+        known = value is not None and (value.n or "stated" not in how)
+        parts = (value.count, value.n, value.value, value.low, value.high) if known else (None,) * 5
+        return {f"{column}: {part}": of for part, of in zip(_SHARE, parts, strict=True)}
+    return {column: "any" if "size" in how and math.isnan(value) else value}
 
 
 def tables_of(
     judgement: Judgement, unit: str = "L/min", known: Mapping[str, PriorKnowledge] | None = None, part: str = ""
 ) -> dict[str, list[TableRow]]:
-    """Return every table of a judgement by the stem of its file.
+    """Return every table of a judgement by the stem of its file, as `tables.toml` lays them out.
 
     Sizes of leaks in `unit`, `known`: what each detector was given, `part`: what the campaign's families are for.
     """
-    leak, known, j = f"leak [{unit}]", known or {}, judgement
+    j, given = judgement, {name: of.plain() for name, of in (known or {}).items()}
     factors = list(dict.fromkeys(name for cell in j.cells for name in cell.levels))
-    return {
-        "table": [
-            {
-                "detector": row.detector, leak: _size(row.leak_lpm), **_share("detected", row.detection),
-                **_share("false alarms", row.false_alarm), **_share("cannot tell", row.cannot_tell),
-                **_interval("per hour", "false alarms per hour", row.per_hour),
-                "detected less false alarms": row.informedness,
-                **(_known(known.get(row.detector)) if known else {}),
-            }
-            for row in (*j.table, *j.overall)
-        ],
-        "pod": [
-            {
-                "detector": pod.detector, leak: at.size, **_share("detected", at.proportion),
-                "one-sided lower bound": at.lower, f"a50 [{unit}]": pod.curve.a50 if pod.curve else None,
-                f"a90 [{unit}]": pod.curve.a90 if pod.curve else None,
-                f"a90/95 [{unit}]": pod.curve.a90_95 if pod.curve else None,
-                f"a90/95 without a curve [{unit}]": pod.proven,
-                "curve": pod.curve.estimator if pod.curve else pod.why,
-            }
-            for pod in j.pods
-            for at in pod.sizes
-        ],
-        "roc": [
-            {
-                "detector": roc.detector, leak: _size(roc.leak_lpm),
-                "AUC": roc.area.value, "low": roc.area.low, "high": roc.area.high,
-            }
-            for roc in j.rocs
-        ],
-        "cells": [
-            {
-                "detector": cell.detector, leak: cell.leak_lpm, **{name: cell.levels.get(name) for name in factors},
-                **_share("alarms", cell.alarms),
-            }
-            for cell in j.cells
-        ],
-        "onsets": [
-            {
-                "detector": onset.detector, leak: onset.leak_lpm, "alarms": onset.errors.n,
-                "median error [s]": onset.errors.median.value,
-                **_interval("median size", "median size [s]", onset.errors.median_size),
-                "90 % size [s]": onset.errors.ninety_size.value, **_coverage("onset", onset.errors.coverage),
-            }
-            for onset in j.onsets
-        ],
-        "estimates": [
-            {
-                "detector": flow.detector, leak: flow.leak_lpm, "with an estimate": flow.errors.bias.n,
-                "without": flow.errors.without, **_interval("bias", f"bias [{unit}]", flow.errors.bias),
-                f"median error [{unit}]": flow.median.value,
-                f"median size of the error [{unit}]": flow.median_size.value,
-                f"rms error [{unit}]": flow.errors.rmse.value, **_coverage("flow", flow.errors.coverage),
-            }
-            for flow in j.flows
-        ],
-        "thresholds": [
-            {
-                "detector": name, "duty": duty, "leak-free records": at.n, "threshold": at.value,
-                "asked probability": at.false_alarm_probability, "expected probability": at.expected,
-                "low": at.low, "high": at.high,
-            }
-            for (name, duty), at in j.thresholds.items()
-        ],
-        "faults": [
-            {
-                "detector": fault.detector, "fault that is no leak": fault.fault, **_share("alarms", fault.alarms),
-                **_share("cannot tell", fault.cannot_tell), **_share("alarms that name it", fault.named),
-            }
-            for fault in j.faults
-        ],
-        "causes": [
-            {
-                "detector": causes.detector, "there is": true, "named": named,
-                **_share("records", causes.confusion.shares[i][k]),
-            }
-            for causes in j.causes
-            for i, true in enumerate(causes.confusion.rows)
-            for k, named in enumerate(causes.confusion.columns)
-            if causes.confusion.counts[i].any()
-        ],
-        "families": [
-            {
-                "part": part, "family": row.family, "detector": row.detector,
-                **{name: of for name, of in _known(known.get(row.detector)).items() if name != _ONSET},
-                leak: row.leak_lpm, "law": row.law, **_share("alarms", row.alarms),
-                **_share("cannot tell", row.cannot_tell), **_coverage("flow", row.coverage),
-                **_share(f"bound allows {ALLOWED_DETECTION:.0%} detection", row.reachable),
-                **_share("alarms where the bound allows", row.allowed), "failed": row.failed,
-            }
-            for row in j.families
-        ],
-    }  # fmt: skip
+    rows: dict[str, Iterable[Any]] = {
+        "table": (*j.table, *j.overall),
+        "pod": ({"pod": pod, "at": at} for pod in j.pods for at in pod.sizes),
+        "roc": j.rocs,
+        "cells": j.cells,
+        "onsets": j.onsets,
+        "estimates": j.flows,
+        "thresholds": ({"detector": name, "duty": duty, "at": at} for (name, duty), at in j.thresholds.items()),
+        "faults": j.faults,
+        "causes": (
+            {"detector": of.detector, "true": true, "named": named, "records": share}
+            for of in j.causes
+            for true, shares in zip(of.confusion.rows, of.confusion.shares, strict=True)
+            for named, share in zip(of.confusion.columns, shares, strict=True)
+            if share.n
+        ),
+        "families": ({"of": of, "part": part, "detector": of.detector} for of in j.families),
+    }
 
+    def laid_out(columns: Mapping[str, str], row: Any) -> TableRow:
+        cells: TableRow = {}
+        for column, content in columns.items():
+            if content.startswith("known ") and given:
+                cells[column] = _attribute(given.get(_attribute(row, "detector")), content.removeprefix("known "))
+            elif not content.startswith("known "):
+                name = column.format(unit=unit, allowed=ALLOWED_DETECTION)
+                cells |= _cells(name, content, row, factors)
+        return cells
 
-def _stated(name: str, statement: Statement | None) -> TableRow:
-    own = statement or Statement("cannot tell")
-    onset, flow = own.onset_interval_s or (None, None), own.leak_interval_lpm or (None, None)
-    return {
-        f"{name}: verdict": statement.verdict if statement else None, f"{name}: threshold": own.threshold,
-        f"{name}: onset [s]": own.onset_s, f"{name}: onset: low": onset[0], f"{name}: onset: high": onset[1],
-        f"{name}: flow": own.leak_lpm, f"{name}: flow: low": flow[0], f"{name}: flow: high": flow[1],
-        f"{name}: cause": own.cause,
-    }  # fmt: skip
+    return {name: [laid_out(_columns()[name], row) for row in own] for name, own in rows.items()}
 
 
 def records_table(rows: Iterable[CaseRow], detectors: Sequence[str], unit: str = "L/min") -> list[TableRow]:
@@ -191,7 +124,8 @@ def records_table(rows: Iterable[CaseRow], detectors: Sequence[str], unit: str =
             **{name: row.scores[name][0] if name in row.scores else None for name in detectors},
         }
         for name in stating:
-            record |= _stated(name, row.statements.get(name))
+            for column, content in _columns()["records"].items():
+                record[f"{name}: {column}"] = _attribute(row.statements.get(name), content)
         table.append({**record, "error": row.error})
     return table
 

@@ -1,11 +1,10 @@
-"""The names in a plan's `detectors`: scorers, registered detectors and the fused verdict, each on a set of channels.
+"""The names in a plan's `detectors`: scorers, registered detectors and `diagnose`, each on a set of channels.
 
 "d3 of p_A fell"            a scorer, its threshold from the plan's leak-free records
 "volume balance"            a registered detector by its own verdict at the plan's false-alarm probability
-"diagnose"                  the fused verdict of all registered detectors
+"diagnose"                  the verdict of `diagnose`
 "diagnose @ pressures"      the same, given the channels of the view `pressures` alone
-"diagnose, quick"           the same verdict, by the detectors down to the one that judges
-"volume balance, online"    what its stream has raised by the record's end, samples coming second by second
+"watch"                     what the watch of the machine has raised by the record's end, second by second
 """
 
 from __future__ import annotations
@@ -21,9 +20,8 @@ from sealscope.errors import InputError
 from sealscope.recordings.recording import CHANNEL_UNITS
 
 DIAGNOSE = "diagnose"
-_QUICK, _ONLINE, _VIEW = ", quick", ", online", " @ "
-#: Detectors that have a stream which raises alarms at a stated rate.
-_STREAMED = ("volume balance",)
+WATCH = "watch"
+_VIEW = " @ "
 #: name -> channels; the name "" stands for what detectors see that name no view.
 Views = Mapping[str, tuple[str, ...]]
 #: Channels that detectors see by default: all but the flow meter of the bypass, which is no part of the machine.
@@ -34,17 +32,14 @@ ALL_CHANNELS = tuple(name for name in CHANNEL_UNITS if name != "q_leak")
 class PlanDetector:
     """One name of a plan's `detectors`, parsed.
 
-    `of`: the scorer, the detector or `diagnose`; `scorer`: None where it is a detector, judged by its own verdict;
-    `view`: the set of channels it sees, "" where none is named; `quick`: whether it ends at the detector that judges
-    (`diagnose(..., quick=True)`); `online`: whether it is the detector's stream.
+    `of`: the scorer, the detector, `diagnose` or `watch`; `scorer`: None where it is judged by its own verdict;
+    `view`: the set of channels it sees, "" where none is named.
     """
 
     name: str
     of: str
     view: str
     scorer: Scorer | None = None
-    quick: bool = False
-    online: bool = False
 
     @property
     def needs_threshold(self) -> bool:
@@ -58,8 +53,7 @@ def plan_detector(name: str) -> PlanDetector:
     base, _, view = name.partition(_VIEW)
     if base in SCORERS:
         return PlanDetector(name, base, view, SCORERS[base])
-    quick, online = base == f"{DIAGNOSE}{_QUICK}", base.endswith(_ONLINE)
-    return PlanDetector(name, base.removesuffix(_QUICK if quick else _ONLINE), view, None, quick, online)
+    return PlanDetector(name, base, view)
 
 
 def check_detector(name: str, views: Views) -> None:
@@ -68,9 +62,7 @@ def check_detector(name: str, views: Views) -> None:
     if parsed.view and parsed.view not in views:
         known_views = ", ".join(view for view in views if view) or "none"
         raise InputError(f"what stands behind '@' must be one of [views] ({known_views}), got {name!r}")
-    known = [DIAGNOSE, *detectors()]
-    if parsed.online and parsed.of not in _STREAMED:
-        raise InputError(f"online must be one of {', '.join(_STREAMED)}, got {name!r}")
+    known = [DIAGNOSE, WATCH, *detectors()]
     if parsed.scorer is not None or parsed.of in known:
         return
     near = nearest(name.partition(_VIEW)[0], [*SCORERS, *known], share=0.6)

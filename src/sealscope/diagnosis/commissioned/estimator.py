@@ -79,4 +79,4 @@ class LeakDetector(OutlierMixin, BaseEstimator):  # type: ignore[misc]
     def _diagnoses(self, X: Paths) -> list[Diagnosis]:
         check_is_fitted(self)
         p = self.false_alarm_probability
-        return [self.machine_.diagnose(path, false_alarm_probability=p, quick=True) for path in X]
+        return [self.machine_.diagnose(path, false_alarm_probability=p) for path in X]

@@ -117,7 +117,6 @@ class CommissionedMachine:
         recording: Recording | str | os.PathLike[str],
         *,
         false_alarm_probability: float = 0.01,
-        quick: bool = False,
     ) -> Diagnosis:
         """Say whether oil bypasses the piston in a recording, or in the file of one, against the healthy ones.
 
@@ -130,7 +129,6 @@ class CommissionedMachine:
             false_alarm_probability=false_alarm_probability,
             rig=self.rig,
             limit=self.limit,
-            quick=quick,
             file=None if isinstance(recording, Recording) else recording,
         )
 
@@ -150,7 +148,7 @@ class CommissionedMachine:
         be trusted.
         """
         added = self._with(recording, file, checksum)
-        if self.healthy and (result := self.diagnose(recording, quick=True)).verdict == "leak":
+        if self.healthy and (result := self.diagnose(recording)).verdict == "leak":
             raise InputError(f"a healthy recording must not leak, got one that does: {result.reason} ({file})")
         start_s = start_seconds(recording, file)
         if start_s is not None and (leak := self._leak_at(start_s)) is not None:

@@ -89,9 +89,17 @@ _BALANCE = _table(
 #: What Sealscope's own methods were taught; those of others are plain tables.
 _LESSONS = {
     "volume balance": (Annotated[_BALANCE, AfterValidator(_with_sums_of_its_terms)], None),
-    "pressure response": (_table("allow", by=str, level=float), None),
+    "pressure response": (_table("allow", level=float), None),
     "rms change": (
-        _table("allow", chambers=list[str], rate=float, start_s=(float, None), levels=_Numbers, duty=_Numbers),
+        _table(
+            "allow",
+            chambers=list[str],
+            recorded=(list[str], None),
+            rate=float,
+            start_s=(float, None),
+            levels=_Numbers,
+            duty=_Numbers,
+        ),
         None,
     ),
 }

@@ -176,7 +176,7 @@ class BlockStream:
         length = self._strides * self._stride
         if self._zeros is None:
             early = slice(0, (self._support or end) * length)
-            self._zeros = {name: _zero(samples[name][early]) for name in ("p_A", "p_B") if name in samples}
+            self._zeros = {name: _gauge_to_absolute(samples[name][early]) for name in ("p_A", "p_B") if name in samples}
         each = max(1, AT_ONCE // length)
         cuts = [self._cut(samples, k, min(k + each, end)) for k in range(first, end, each)]
         whole = np.concatenate([cut.whole for cut in cuts])
@@ -228,7 +228,7 @@ class _Cut(NamedTuple):
     pressures: Array
 
 
-def _zero(pressure: Array) -> float:
+def _gauge_to_absolute(pressure: Array) -> float:
     """Return what makes a gauge pressure absolute: the atmosphere, or more where its zero is surely too low."""
     finite = pressure[np.isfinite(pressure)]
     lowest = float(np.min(finite)) if finite.size else 0.0

@@ -139,7 +139,7 @@ class Columns:
         self.driven = tuple(term.driven for term in equation.terms)
         self.healthy = beliefs("inference")["healthy"][equation.healthy] if equation.healthy else float("inf")
 
-    def level(self, test: int, blocks: Blocks) -> float:
+    def level_deviation(self, test: int, blocks: Blocks) -> float:
         """Return the standard deviation of a healthy machine's coefficient of a column; infinite for other columns."""
         driven = self.driven[test] if test < self.left else ""
         pressure, root = (float(np.mean(blocks.driving(root=of_root))) for of_root in (False, True))
@@ -147,7 +147,7 @@ class Columns:
             self.healthy * {"": float("inf"), "pressure": 1.0, "root": pressure / root if root > 0.0 else 1.0}[driven]
         )
 
-    def zero(self, test: int, blocks: Blocks) -> float:
+    def zero_deviation(self, test: int, blocks: Blocks) -> float:
         """Return the standard deviation of the zero of a column's pressure, by its slope; 0 where none drives it.
 
         No more than the pressure itself, which may be in counts.
@@ -232,7 +232,7 @@ def information(blocks: Blocks, columns: Sequence[Columns], test: int, replaces:
         part, lead = _eliminated(blocks.gram[:, e], blocks, own, test, others)
         precision += part
         vector += lead
-    return Information(blocks.time, precision, vector, columns[0].level(test, blocks))
+    return Information(blocks.time, precision, vector, columns[0].level_deviation(test, blocks))
 
 
 def _drifts(blocks: Blocks) -> tuple[Array, float]:
@@ -337,7 +337,7 @@ def _fit(gram: Array, blocks: Blocks, columns: Columns, test: int, others: list[
     the bias, by -g z. About the zero of the sums (`zero.about_zero`) it is small, and found by Gauss's and Newton's
     steps.
     """
-    zero, width = 0.0, columns.zero(test, blocks)
+    zero, width = 0.0, columns.zero_deviation(test, blocks)
     powers, minutes = _drifts(blocks)
     rows, degrees = max(float(blocks.rows.sum()), 1.0), powers.shape[1]
     total = gram.sum(axis=0)

@@ -20,11 +20,11 @@ import numpy as np
 
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, information, mean_of, zero_of
-from sealscope.diagnosis.inference.causes import StepHypothesis, hypotheses, probabilities
-from sealscope.diagnosis.inference.causes import stepped as stepped_cause
 from sealscope.diagnosis.inference.onset import Course, Information, Interval, StepTest, course, step_test
+from sealscope.diagnosis.inference.other_steps.causes import StepHypothesis, hypotheses, probabilities
+from sealscope.diagnosis.inference.other_steps.causes import stepped as stepped_cause
 from sealscope.diagnosis.inference.other_steps.step import other_step
-from sealscope.diagnosis.inference.scatter import Rise, Taught, rise
+from sealscope.diagnosis.inference.scatter import RecordingSums, Rise, rise
 from sealscope.diagnosis.inference.terms import LAG, ORIFICE, PUMP, Equation
 from sealscope.diagnosis.verdict.evidence import (
     LEAKS,
@@ -109,10 +109,10 @@ class RecordedBalance:
         return hypotheses(self.blocks, self.plain or self.blocks, self.equations, self.columns, self.lost)
 
     @cached_property
-    def taught(self) -> Taught:
+    def recording_sums(self) -> RecordingSums:
         """What the recording says of a healthy machine."""
         dated, oil = start_seconds(self.recording), oil_temperature(self.recording)
-        return Taught.of(self.blocks, self.columns, dated, oil)
+        return RecordingSums.of(self.blocks, self.columns, dated, oil)
 
     @cached_property
     def zero(self) -> float:
@@ -227,13 +227,13 @@ def _area(balance: RecordedBalance, motion: list[int]) -> _Area:
     return _Area(value, value - half, value + half, float(shares @ stated))
 
 
-def judge(balance: RecordedBalance, probability: float, baseline: Sequence[Taught] = ()) -> Evidence:
-    """Return the evidence of a balance at a false-alarm probability, against what healthy recordings have taught."""
+def judge(balance: RecordedBalance, probability: float, baseline: Sequence[RecordingSums] = ()) -> Evidence:
+    """Return the evidence of a balance at a false-alarm probability, against what healthy recordings say."""
     test = balance.test
-    against = rise(balance.taught, baseline, balance.columns) if baseline else None
+    against = rise(balance.recording_sums, baseline, balance.columns) if baseline else None
     if test is None and against is None:
         return Evidence("cannot tell", "p_A and p_B hardly differ, or too few samples are whole: no leak would show")
-    questions = _questions(balance, against, probability)
+    questions = questions_of(balance, against, probability)
     answered = next((own for own in questions if own.chance < own.probability), None)
     causes: dict[Cause, float] = {}
     if answered is not None and answered.name == WITHIN and test is not None:
@@ -275,7 +275,7 @@ class Question(NamedTuple):
     probability: float
 
 
-def _questions(balance: RecordedBalance, against: Rise | None, probability: float) -> list[Question]:
+def questions_of(balance: RecordedBalance, against: Rise | None, probability: float) -> list[Question]:
     """Return the questions that can be asked of a balance."""
     healthy = balance.rig.pump.G_healthy
     # a drive's droop with the load passes for a level of the leak

@@ -14,7 +14,7 @@ from sealscope.diagnosis.inference.blocks import Columns
 from sealscope.diagnosis.inference.circuit.store import lost_beside
 from sealscope.diagnosis.inference.circuit.without_position import circulations
 from sealscope.diagnosis.inference.decision import RecordedBalance, bound_of, judge
-from sealscope.diagnosis.inference.scatter import Rise, Taught, motion_change, rise
+from sealscope.diagnosis.inference.scatter import RecordingSums, Rise, motion_change, rise
 from sealscope.diagnosis.inference.terms import CYLINDER, LOCKED, circulation, equations, locked
 from sealscope.diagnosis.inference.weak_form import STRIDE, stride_samples
 from sealscope.diagnosis.learnt import Healthy, Lesson, lessons_of
@@ -98,7 +98,7 @@ class VolumeBalance:
         return RecordedBalance(blocks[0], balances, blocks[2], self.rig, recording, lost, blocks[1])
 
     def learn(self, recording: Recording) -> Lesson | None:
-        """Return what a healthy recording teaches (`scatter.Taught`), by the terms of its balance.
+        """Return what a healthy recording teaches (`scatter.RecordingSums`), by the terms of its balance.
 
         `scale` makes flows by the rig's displacement the machine's, 0 where its size is not stated.
         """
@@ -106,21 +106,21 @@ class VolumeBalance:
         if own is None:
             return None
         scale = own.size.scale if own.size.stated else 0.0
-        known = {name: value for name, value in own.taught._asdict().items() if value is not None}
+        known = {name: value for name, value in own.recording_sums._asdict().items() if value is not None}
         return {"terms": list(own.columns[0].names), "scale": scale, **known}
 
     def rises(self, lessons: Sequence[Lesson], channels: frozenset[str]) -> list[Rise]:
         """Return how far each of several healthy recordings of the same channels is above the others."""
-        columns, taught = self._columns(channels), [_taught(lesson) for lesson in lessons]
-        return [rise(own, taught[:k] + taught[k + 1 :], columns) for k, own in enumerate(taught)]
+        columns, healthy = self._columns(channels), [_sums_of(lesson) for lesson in lessons]
+        return [rise(own, healthy[:k] + healthy[k + 1 :], columns) for k, own in enumerate(healthy)]
 
     def next_rise(self, lessons: Sequence[Lesson], channels: frozenset[str], repeated: int = 1) -> Rise:
         """Return the rise of a healthy recording like these on a later day, as after `repeated` times as many days."""
-        taught = [_taught(lesson) for lesson in lessons]
-        later = [own._replace(start_s=_later(own, k)) for k in range(repeated) for own in taught]
+        healthy = [_sums_of(lesson) for lesson in lessons]
+        later = [own._replace(start_s=_later(own, k)) for k in range(repeated) for own in healthy]
         flow, pressure = (float(np.median([lesson[of] for lesson in lessons])) for of in ("flow", "pressure"))
-        middle = Taught(taught[0].sums, flow, pressure, oil_degC=taught[0].oil_degC)
-        dated = next((own for own in taught if own.start_s is not None), middle)
+        middle = RecordingSums(healthy[0].sums, flow, pressure, oil_degC=healthy[0].oil_degC)
+        dated = next((own for own in healthy if own.start_s is not None), middle)
         return rise(middle._replace(start_s=_later(dated, repeated)), later, self._columns(channels))
 
     def _columns(self, channels: frozenset[str]) -> list[Columns]:
@@ -133,7 +133,7 @@ class VolumeBalance:
             return Evidence("cannot tell", _NO_BALANCE["x" in recording].format(recording.duration), usable=False)
         names = list(own.columns[0].names)
         lessons = [lesson for lesson in lessons_of(self, baseline) if lesson["terms"] == names]
-        healthy = [_taught(lesson) for lesson in lessons]
+        healthy = [_sums_of(lesson) for lesson in lessons]
         evidence, rows = judge(own, false_alarm_probability, healthy), own.blocks.rows
         if own.equations[0].name != CYLINDER and len(own.columns) == 1:
             return evidence
@@ -144,19 +144,19 @@ class VolumeBalance:
         return replace(evidence, share=float(rows.mean() / max(rows.max(), 1.0)))
 
 
-def _later(taught: Taught, times: int) -> float | None:
+def _later(recorded: RecordingSums, times: int) -> float | None:
     """Return the date of a recording as many times later as no recordings of one machine are apart."""
-    return None if taught.start_s is None else taught.start_s + times * _AGES
+    return None if recorded.start_s is None else recorded.start_s + times * _AGES
 
 
-def _taught(lesson: Lesson) -> Taught:
+def _sums_of(lesson: Lesson) -> RecordingSums:
     sums = np.asarray(lesson["sums"], dtype=float)
-    return Taught(sums, lesson["flow"], lesson["pressure"], lesson.get("start_s"), lesson.get("oil_degC"))
+    return RecordingSums(sums, lesson["flow"], lesson["pressure"], lesson.get("start_s"), lesson.get("oil_degC"))
 
 
-def _of_another_machine(own: RecordedBalance, healthy: Sequence[Taught], probability: float) -> str:
+def _of_another_machine(own: RecordedBalance, healthy: Sequence[RecordingSums], probability: float) -> str:
     """Return in words that motion takes another flow than in the healthy recordings, empty where it does not."""
-    change = motion_change(own.taught.sums[0], [of.sums[0] for of in healthy], own.columns[0])
+    change = motion_change(own.recording_sums.sums[0], [of.sums[0] for of in healthy], own.columns[0])
     if abs(change.score) <= change.threshold(0.5 * probability):
         return ""
     return (

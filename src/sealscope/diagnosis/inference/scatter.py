@@ -2,25 +2,24 @@
 
 The sums of the baseline's recordings, the zero of the flow of each set aside, are added up and give the coefficients of
 all terms; what a recording's own rows leave of them along the leak's column is its rise. The rise of each healthy
-recording against the others measures how recordings differ; whatever the model does not describe is in it, once.
+recording against the others measures how recordings differ; whatever the model does not describe is in it, once. With
+r_j the rise of recording j of n against the n - 1 others, y_j = r_j (n - 1)/n; for the judged one y is its rise.
 
-Recordings of one session, by their dates, share oil and set-up: y_j of session s is m_s + e_j, with m_s ~ N(m, tau^2)
-and e_j ~ N(0, sigma^2). With r_j the rise of recording j of n against the n - 1 others, y_j = r_j (n - 1)/n,
+All y are normal about a mean near that of the sums, with the variance sigma^2 of each by itself and a covariance
+between them of which there are several candidates (`Among`). sigma^2 has a scaled inverse chi square prior (s_0, nu_0):
+the rise, y beyond what the others let expect, follows a mixture over both; with no covariance it is Student's with
+nu_0 + n - 1 degrees of freedom. Recordings of one session, by their dates, share oil and set-up: a deviation tau of
+sessions, half-normal beforehand, of leakage in proportion to its level, for it goes with the inverse of the oil's
+viscosity. Recordings without a date are of one session. Where the oil's temperature T is known of all, what it makes of
+the level is taken off, and only that factor's error remains. What is believed stands in `priors.toml`.
 
-    t = (rise - (1 - q) m_k) / d,    d^2 = sigma^2 + q tau^2 + q^2 (sigma^2/n + tau^2 sum_s (n_s/n)^2),
-
-for a judged recording of session k, q = sigma^2 / (sigma^2 + n_k tau^2); of a new session n_k = m_k = 0 and q = 1.
-tau has a half-normal prior, sigma^2 a scaled inverse chi square one (s_0, nu_0); with the restricted likelihood of what
-is observed, the rise is a mixture over both. Where all are of a single session, d^2 = sigma^2 (1 + 1/n), and t is
-Student's with nu_0 + n - 1 degrees of freedom. What is believed stands in `priors.toml`: between sessions leakage goes
-with the inverse of the oil's viscosity, in proportion to its level. Recordings without a date are of one session. Where
-the oil's temperature T is known of all, what it makes of the level is taken off, and only that factor's error remains.
-
-Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sections 3.2, 5.4 and 5.7.
+Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sections 3.2, 5.4 and 5.7; C. E. Rasmussen and C. K.
+I. Williams, Gaussian Processes for Machine Learning (2006), section 2.7 (an unknown mean).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -31,15 +30,16 @@ from sealscope.diagnosis.inference.blocks import Blocks, Columns, solve, total
 from sealscope.diagnosis.inference.weak_form import LARGEST
 from sealscope.recordings.recording import Array
 
-#: Nodes of a deviation, and the largest one between sessions over what is believed.
-NODES, WIDEST = 32, 3.0
+#: Nodes of a deviation, and the largest one between sessions over what is believed; most recordings that are compared.
+NODES, WIDEST, MOST = 32, 3.0, 60
 
 
 class Mixture(NamedTuple):
-    """A mixture of normal laws about zero: `weights` and `deviations`, (k,) each."""
+    """A mixture of normal laws: `weights`, `deviations` and `centres` beside that of the whole, (k,) each."""
 
     weights: Array
     deviations: Array
+    centres: Array
 
 
 class Rise(NamedTuple):
@@ -68,7 +68,8 @@ class Rise(NamedTuple):
 
         if self.parts is None:
             return float(stdtr(self.freedom, -score))
-        return float(self.parts.weights @ ndtr(-score * self.deviation / self.parts.deviations))
+        weights, deviations, centres = self.parts
+        return float(weights @ ndtr((centres - score * self.deviation) / deviations))
 
     def threshold(self, chance: float) -> float:
         """Return the score that a healthy recording exceeds with a probability."""
@@ -77,7 +78,7 @@ class Rise(NamedTuple):
 
         if self.parts is None:
             return float(stdtrit(self.freedom, 1.0 - chance))
-        ends = np.sort(-ndtri(chance) * self.parts.deviations / self.deviation)
+        ends = np.sort((self.parts.centres - ndtri(chance) * self.parts.deviations) / self.deviation)
         return float(brentq(lambda score: self._beyond(score) - chance, ends[0], ends[-1]))
 
     def interval(self, probability: float = 0.95) -> tuple[float, float]:
@@ -86,8 +87,8 @@ class Rise(NamedTuple):
         return self.value - half, self.value + half
 
 
-class Taught(NamedTuple):
-    """What a healthy recording teaches of its machine.
+class RecordingSums(NamedTuple):
+    """What a recording says of its machine, to be added to what others say.
 
     `sums` (E, m, m) of its rows, the zero of its flow set aside; `flow` of the pump and `pressure`, mean sizes
     [m^3/s], [Pa]; `start_s`: its date [s since 1970], and `oil_degC`, its oil's temperature, None where
@@ -107,79 +108,101 @@ class Taught(NamedTuple):
         columns: Sequence[Columns],
         start_s: float | None = None,
         oil_degC: float | None = None,
-    ) -> Taught:
+    ) -> RecordingSums:
         """Return that of a recording's blocks."""
         weights = np.maximum(blocks.rows, 1e-9)
         flow, pressure = (float(np.average(of, weights=weights)) for of in (blocks.flow, blocks.driving()))
         return cls(_about_own(total(blocks, columns), columns), flow, pressure, start_s, oil_degC)
 
 
-def rise(judged: Taught, baseline: Sequence[Taught], columns: Sequence[Columns]) -> Rise:
+def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[Columns]) -> Rise:
     """Return how far the leak's coefficient of a recording is beyond that of healthy recordings of the same machine."""
     everything, count = np.sum([own.sums for own in baseline], axis=0), len(baseline)
     believed, by_flow = beliefs("inference")["scatter"], judged.flow / judged.pressure if judged.pressure > 0.0 else 0.0
-    apart = np.array([_rise(own.sums, everything - own.sums, columns) for own in baseline] if count > 1 else [0.0])
+    beyond = np.array([_rise(own.sums, everything - own.sums, columns) for own in baseline] if count > 1 else [0.0])
     *by_oil, warmer, oil = _of_oil([*baseline, judged], *_level(everything, columns))
-    value, deviations = _rise(judged.sums, everything, columns) - warmer, apart * ((count - 1) / count) - by_oil
-    *of_baseline, of_judged = sessions = _sessions([*baseline, judged])
+    value, deviations = _rise(judged.sums, everything, columns) - warmer, beyond * ((count - 1) / count) - by_oil
+    starts, pause = [own.start_s for own in (*baseline, judged)], 3600.0 * beliefs("inference")["oil"]["shift"]
+    sessions = np.array(sessions_of(starts, pause))
+    usual, apart = believed["leak"] * by_flow, float(np.hypot(oil, believed["session"] * by_flow))
     if len(set(sessions)) == 1:
-        return student(value, deviations * (count / max(count - 1, 1)), believed["leak"] * by_flow)
-    members = [deviations[np.equal(of_baseline, session)] for session in dict.fromkeys(of_baseline)]
-    at = list(dict.fromkeys(of_baseline)).index(of_judged) if of_judged in of_baseline else None
-    scales = believed["leak"] * by_flow, float(np.hypot(oil, believed["session"] * by_flow))
-    return _between_sessions(value, members, at, *scales)
+        return student(value, deviations * (count / max(count - 1, 1)), usual)
+    nodes = WIDEST * ((np.arange(NODES) + 0.5) / NODES) ** 2  # closer near zero
+    alike = np.equal.outer(sessions, sessions)
+    believed_of = 0.5 * np.log(nodes) - 0.5 * nodes**2
+    among = Among(((apart * nodes) ** 2)[:, None, None] * alike, believed_of)
+    return among.rise(value, deviations - deviations.mean(), usual, believed["freedom"])
 
 
-def _between_sessions(value: float, members: Sequence[Array], at: int | None, usual: float, apart: float) -> Rise:
-    """Return a rise, where recordings are of several sessions: a mixture over the deviations within and between them.
+class Among:
+    """Values that are normal about an unknown mean, the last of them the judged one.
 
-    `members`: of each session of the baseline, its recordings' deviations from the mean; `at`: the judged recording's
-    session, None for a new one; `usual` within a session, and how far sessions are `apart`, as believed.
+    Parameters
+    ----------
+    candidates : array of float, shape (g, n + 1, n + 1)
+        Covariances between them, beside the variance of each by itself; those of n = 0 are of a single value.
+    logarithms : array of float, shape (g,)
+        Of what is believed of each candidate.
     """
-    sizes, means = np.array([len(own) for own in members]), np.array([own.mean() for own in members])
-    count, weight = int(sizes.sum()), beliefs("inference")["scatter"]["freedom"]
-    squares = weight * usual**2 + float(sum(((own - own.mean()) ** 2).sum() for own in members))
-    everything = float(sum((own**2).sum() for own in members))
-    least, most = 0.1 * np.sqrt(squares / (weight + count)), 100.0 * np.sqrt(squares + everything)
-    if not most < LARGEST:  # numbers that cannot be computed with bound nothing
-        return Rise(value, np.inf, weight)
-    within = np.geomspace(max(least, 1.0 / LARGEST), max(most, 10.0 / LARGEST), NODES)[:, None] ** 2
-    nodes = np.square((np.arange(NODES) + 0.5) / NODES)  # closer near zero
-    between = (WIDEST * apart * nodes) ** 2
-    spread = between[:, None] + within[..., None] / sizes
-    precision = (1.0 / spread).sum(axis=2)
-    centre = (means / spread).sum(axis=2) / precision
-    left = ((means - centre[..., None]) ** 2 / spread).sum(axis=2) + np.log(spread).sum(axis=2) + np.log(precision)
-    left += (weight + count - len(members)) * np.log(within) + squares / within + (WIDEST * nodes) ** 2
-    weights = np.exp(-0.5 * (left - left.min())) * np.sqrt(nodes)
-    weights /= weights.sum()
-    alike, mean = (0, 0.0) if at is None else (int(sizes[at]), float(means[at]))
-    q = within / (within + alike * between)
-    # of a known session q tau^2 = (1 - q) sigma^2 / n_k
-    variance = within * (1.0 + q**2 / count + ((1.0 - q) / alike if alike else 0.0))
-    variance = variance + between * (float(alike == 0) + q**2 * float(((sizes / count) ** 2).sum()))
-    parts = Mixture(weights.ravel(), np.sqrt(variance).ravel())
-    shrunk = value - float((weights * (1.0 - q)).sum()) * mean
-    return Rise(shrunk, float(np.sqrt((weights * variance).sum())), np.inf, parts)
+
+    def __init__(self, candidates: Array, logarithms: Array) -> None:
+        n = candidates.shape[1] - 1
+        self._chosen = np.unique(np.linspace(0, n - 1, min(n, MOST)).astype(int))
+        known = candidates[:, self._chosen[:, None], self._chosen]
+        eigen, basis = np.linalg.eigh(known)
+        self._eigen, self._basis = np.maximum(eigen, 0.0)[:, None], basis  # (g, 1, n), beside nodes of sigma
+        self._cross = np.einsum("gij,gi->gj", basis, candidates[:, self._chosen, n])[:, None]
+        self._ones = basis.sum(axis=1)[:, None]
+        self._own, self._logarithms = candidates[:, n, n, None], logarithms[:, None]
+
+    def rise(self, value: float, known: Array, usual: float, freedom: float) -> Rise:
+        """Return by how much a `value` is beyond what those `known` (n,) let expect.
+
+        `usual`, `freedom`: what is believed of the deviation sigma.
+        """
+        others, count = known[self._chosen], len(self._chosen)
+        spread = float(np.sum((others - others.mean()) ** 2))
+        squares = freedom * usual**2 + spread
+        least = math.sqrt(max(0.1 * freedom * usual**2, 1e-9 * squares) / (freedom + count))
+        most = 100.0 * math.sqrt(squares)
+        if not most < LARGEST:  # numbers that cannot be computed with bound nothing
+            return Rise(value, np.inf, freedom)
+        variance = np.geomspace(max(least, 1.0 / LARGEST), max(most, 10.0 / LARGEST), NODES) ** 2
+        weight = 1.0 / (variance[:, None] + self._eigen)  # (g, nodes, n)
+        of_ones, cross = weight * self._ones, self._cross
+        precision = (of_ones * self._ones).sum(axis=2)
+        rotated = np.einsum("gij,i->gj", self._basis, others)[:, None]
+        mean = (of_ones * rotated).sum(axis=2) / precision
+        left = weight * (rotated - mean[..., None] * self._ones)
+        logarithm = 0.5 * (np.log(weight).sum(axis=2) - np.log(precision) - (left * rotated).sum(axis=2))
+        logarithm += self._logarithms - 0.5 * freedom * (np.log(variance) + usual**2 / variance)
+        weights = np.exp(logarithm - logarithm.max())
+        weights /= weights.sum()
+        centres = mean + (left * cross).sum(axis=2)
+        missing = 1.0 - (of_ones * cross).sum(axis=2)
+        variances = variance + self._own - (weight * cross**2).sum(axis=2) + missing**2 / precision
+        middle = float((weights * centres).sum())
+        parts = Mixture(weights.ravel(), np.sqrt(variances).ravel(), (centres - middle).ravel())
+        total = float((weights * (variances + (centres - middle) ** 2)).sum())
+        return Rise(value - middle, float(np.sqrt(total)), np.inf, parts)
 
 
-def _sessions(taught: Sequence[Taught]) -> list[int]:
-    """Return the session of each recording: a number of its own after every gap in which the oil may have warmed."""
-    apart = 3600.0 * beliefs("inference")["oil"]["shift"]
-    dates = sorted(own.start_s for own in taught if own.start_s is not None)
-    begins = [date for before, date in zip([-np.inf, *dates], dates, strict=False) if date - before > apart]
-    return [-1 if own.start_s is None else int(np.searchsorted(begins, own.start_s, "right")) for own in taught]
+def sessions_of(starts: Sequence[float | None], pause: float) -> list[int]:
+    """Return the session of each recording: a number of its own after every gap [s] longer than `pause`."""
+    dates = sorted(own for own in starts if own is not None)
+    begins = [date for before, date in zip([-np.inf, *dates], dates, strict=False) if date - before > pause]
+    return [-1 if own is None else int(np.searchsorted(begins, own, "right")) for own in starts]
 
 
-def _of_oil(taught: Sequence[Taught], level: float, error: float) -> list[float]:
+def _of_oil(recordings: Sequence[RecordingSums], level: float, error: float) -> list[float]:
     """Return by how much each recording's leakage is beyond its mean over all but the last, for its oil's temperature.
 
     Last the deviation of the last one's: what may still differ, as far as the `level` within its `error` goes.
     """
     believed = beliefs("inference")["oil"]
-    known = [own.oil_degC for own in taught if own.oil_degC is not None]
-    if len(known) < len(taught):  # the difference of two sessions has twice the variance of each
-        return [0.0] * len(taught) + [0.5**1.5 * (believed["warmest"] - 1.0) * (level + error)]
+    known = [own.oil_degC for own in recordings if own.oil_degC is not None]
+    if len(known) < len(recordings):  # the difference of two sessions has twice the variance of each
+        return [0.0] * len(recordings) + [0.5**1.5 * (believed["warmest"] - 1.0) * (level + error)]
     warmer = np.array(known) - np.mean(known[:-1])
     factor = np.exp(believed["per_kelvin"] * warmer)
     deviation = believed["per_kelvin_deviation"] * abs(warmer[-1]) * factor[-1] * (level + error)
@@ -218,16 +241,16 @@ def motion_change(judged: Array, baseline: Sequence[Array], columns: Columns) ->
     return student(logarithm(judged, everything), apart, beliefs("inference")["between"]["motion"])
 
 
-def student(value: float, apart: Sequence[float] | Array, believed: float) -> Rise:
-    """Return a rise against n healthy recordings, each of which is so far `apart` from the others.
+def student(value: float, deviations: Sequence[float] | Array, believed: float) -> Rise:
+    """Return a rise against n healthy recordings, each of which deviates so far from the others.
 
     `believed`: what is believed of the scatter beforehand.
     """
-    width, count = beliefs("inference")["scatter"], len(apart)
+    width, count = beliefs("inference")["scatter"], len(deviations)
     squares = width["freedom"] * believed * believed
     freedom = width["freedom"] + count - 1
     if count > 1:
-        squares += float(np.sum(np.square(apart))) * ((count - 1) / count) ** 2
+        squares += float(np.sum(np.square(deviations))) * ((count - 1) / count) ** 2
     deviation = np.sqrt(squares / freedom * (1.0 + 1.0 / count))
     return Rise(value, max(float(deviation), np.finfo(float).tiny), freedom)
 
@@ -236,10 +259,10 @@ def _about_own(sums: Array, columns: Sequence[Columns]) -> Array:
     """Return a recording's sums (E, m, m) with the coefficients set aside that nothing ties to another recording's."""
     reduced = sums.copy()
     for e, column in enumerate(columns):
-        apart = [k for k in column.nuisance if k != column.leak and not np.isfinite(column.between[k])]
-        cross = sums[e][:, apart]
-        reduced[e] -= cross @ solve(sums[e][np.ix_(apart, apart)], cross.T)
-        reduced[e][apart] = reduced[e][:, apart] = 0.0
+        untied = [k for k in column.nuisance if k != column.leak and not np.isfinite(column.between[k])]
+        cross = sums[e][:, untied]
+        reduced[e] -= cross @ solve(sums[e][np.ix_(untied, untied)], cross.T)
+        reduced[e][untied] = reduced[e][:, untied] = 0.0
     return reduced
 
 
@@ -252,7 +275,7 @@ def _rise(own: Array, reference: Array, columns: Sequence[Columns]) -> float:
     for e, column in enumerate(columns):
         chosen = [k for k in column.nuisance if k == column.leak or np.isfinite(column.between[k])]
         coefficients = solve(reference[e][np.ix_(chosen, chosen)], reference[e][chosen, column.left])
-        left = own[e][:, column.left] - own[e][:, chosen] @ coefficients
+        residual = own[e][:, column.left] - own[e][:, chosen] @ coefficients
         others = [k for k in chosen if k != column.leak]
         size = np.abs(coefficients[[chosen.index(k) for k in others]])
         with np.errstate(divide="ignore", over="ignore"):
@@ -260,7 +283,7 @@ def _rise(own: Array, reference: Array, columns: Sequence[Columns]) -> float:
         matrix = own[e][np.ix_(others, others)]
         matrix = matrix + np.diag(np.minimum(belief, 1e9 * np.diag(matrix)))
         along = own[e][others, column.leak]
-        solved = solve(matrix, np.column_stack([along, left[others]]))
+        solved = solve(matrix, np.column_stack([along, residual[others]]))
         precision += float(own[e][column.leak, column.leak] - along @ solved[:, 0])
-        vector += float(left[column.leak] - along @ solved[:, 1])
+        vector += float(residual[column.leak] - along @ solved[:, 1])
     return vector / precision if precision > 0.0 else 0.0

@@ -49,7 +49,7 @@ def about_zero(blocks: Blocks, columns: Sequence[Columns]) -> Blocks:
         return blocks
     within, offset, z = effects
     usual, far = (beliefs("inference")["zero"][name] for name in ("pressure", "far"))
-    width = columns[0].zero(columns[0].leak, blocks)
+    width = columns[0].zero_deviation(columns[0].leak, blocks)
     walks = WALKS[: int(_likelihoods(within, z, WALKS).argmax()) + 1]
 
     def likelihood(position: float) -> float:

@@ -17,6 +17,7 @@ from sealscope.recordings.chambers import CHAMBERS, chambers_of
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.gaps import touched
 from sealscope.recordings.motion import ROUNDING
+from sealscope.recordings.quality import mostly_clipped
 from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.details import Details, details
 from sealscope.signals.filters import IntArray
@@ -77,6 +78,12 @@ def columns_of(chambers: Sequence[str]) -> list[str]:
     return [f"{quantity} of {chamber}" for chamber in chambers for quantity in QUANTITIES]
 
 
+def judged_chambers(recording: Recording) -> tuple[str, ...]:
+    """Return the chambers whose details are judged: those whose readings are not mostly cut off, or all."""
+    chambers = chambers_of(recording)
+    return tuple(name for name in chambers if not mostly_clipped(recording[name])) or chambers
+
+
 def mean_squares(transformed: Details, bounds: IntArray) -> Array:
     """Return the mean squares of d1..d4 and d3d4 between consecutive sample bounds: (len(bounds) - 1, 5)."""
     return _means(np.vstack([transformed.values**2, transformed.product()[None, :] ** 2]), bounds).T
@@ -90,8 +97,8 @@ def _means(values: Array, bounds: IntArray) -> Array:
 
 
 def whole(recording: Recording) -> tuple[Array, Array]:
-    """Return the log RMS (5 per chamber,) and the duty (4,) of the whole recording but its edges."""
-    transformed = [details(recording[chamber]) for chamber in chambers_of(recording)]
+    """Return the log RMS (5 per judged chamber,) and the duty (4,) of the whole recording but its edges."""
+    transformed = [details(recording[chamber]) for chamber in judged_chambers(recording)]
     inside = transformed[0].inside()
     log_rms, duty = _columns(recording, transformed, np.array([inside.start, inside.stop]))
     return log_rms[0], duty[0]
@@ -117,7 +124,7 @@ def _columns(recording: Recording, transformed: list[Details], bounds: IntArray)
 
 def cut(recording: Recording) -> RmsBlocks:
     """Cut a uniformly sampled recording without missing samples into blocks, edges of the transform dropped."""
-    chambers, rate, believed = chambers_of(recording), recording.rate, beliefs("rms_change")["blocks"]
+    chambers, rate, believed = judged_chambers(recording), recording.rate, beliefs("rms_change")["blocks"]
     transformed = [details(recording[chamber]) for chamber in chambers]
     inside, cycle = transformed[0].inside(), find_cycle(recording)
     wanted = max(believed["seconds"], believed["samples"] / rate)

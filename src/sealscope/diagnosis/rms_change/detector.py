@@ -17,14 +17,14 @@ import numpy as np
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Interval, step_tests
 from sealscope.diagnosis.learnt import Healthy, Lesson, lessons_of
-from sealscope.diagnosis.rms_change.blocks import JUDGED, RmsBlocks, columns_of, cut, whole
+from sealscope.diagnosis.rms_change.blocks import JUDGED, RmsBlocks, columns_of, cut, judged_chambers, whole
 from sealscope.diagnosis.rms_change.ringing import information, rises
 from sealscope.diagnosis.verdict.evidence import Evidence, Verdict
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.hydraulics import lack_of_chambers
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.motion import constant
-from sealscope.recordings.recording import Recording
+from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.details import shortest
 
 
@@ -74,8 +74,9 @@ class RmsChange:
     def learn(self, recording: Recording) -> Lesson:
         """Return what a healthy recording teaches: its log RMS and duty, whose they are, and when."""
         levels, duty = whole(recording)
-        chambers, start = list(chambers_of(recording)), start_seconds(recording)
-        return {"chambers": chambers, "rate": recording.rate, "start_s": start, "levels": levels, "duty": duty}
+        chambers, start = list(judged_chambers(recording)), start_seconds(recording)
+        known = {"chambers": chambers, "recorded": list(chambers_of(recording)), "rate": recording.rate}
+        return {**known, "start_s": start, "levels": levels, "duty": duty}
 
     def examine(self, recording: Recording, baseline: Sequence[Healthy], false_alarm_probability: float) -> Evidence:
         """Return the evidence on a recording that is `usable`, within it or against the baseline."""
@@ -126,24 +127,30 @@ def within(blocks: RmsBlocks, probability: float) -> Evidence:
 
 def against(recording: Recording, baseline: Sequence[Healthy], probability: float) -> Evidence:
     """Return the evidence of a rise or fall against leak-free recordings of the machine."""
-    chambers = chambers_of(recording)
-    alike = [own for own in lessons_of(RmsChange(), baseline) if own["chambers"] == list(chambers)]
+    chambers, recorded = judged_chambers(recording), list(chambers_of(recording))  # these make the duty
+    alike = [own for own in lessons_of(RmsChange(), baseline) if (own.get("recorded") or own["chambers"]) == recorded]
+    alike = [own for own in alike if set(chambers) <= set(own["chambers"])]
     alike = [own for own in alike if abs(own["rate"] / recording.rate - 1.0) < 1e-3]
     if not alike:
         return Evidence("cannot tell", f"no baseline recording has the same chambers at {recording.rate:g} Hz")
-    start, pause = start_seconds(recording), beliefs("rms_change")["recordings"]["pause"]
-    others = [other for own in alike if (other := own.get("start_s")) is not None]
-    known = start is not None and bool(others)
-    apart = known and all(abs(start - other) > pause for other in others)  # type: ignore[operator]
-    levels, duties = (np.stack([np.asarray(own[name], dtype=float) for own in alike]) for name in ("levels", "duty"))
+    starts = [*(own.get("start_s") for own in alike), start_seconds(recording)]
+    times = None if None in starts else np.array(starts, dtype=float)
+    duties = np.array([own["duty"] for own in alike], dtype=float)
+    levels = np.array([_levels(own, chambers) for own in alike])
     share, changes = probability / (2 * len(JUDGED) * len(chambers)), []
-    for name, rise, weight in zip(columns_of(chambers), *rises(*whole(recording), levels, duties, apart), strict=True):
+    for name, rise, weight in zip(columns_of(chambers), *rises(*whole(recording), levels, duties, times), strict=True):
         size = rise._replace(value=abs(rise.value))
         bound = size.value + size.threshold(0.05) * size.deviation
         changes.append(_Change(name, rise.value, size.score, size.chance, size.threshold(share), bound, weight))
-    session = " of another session" if apart else "" if known else ", maybe of another session or machine"
-    count = f"{len(alike)} comparable leak-free recording{'s' if len(alike) > 1 else ''}{session}"
+    unknown = ", maybe of another session or machine" if times is None else ""
+    count = f"{len(alike)} comparable leak-free recording{'s' if len(alike) > 1 else ''}{unknown}"
     return _evidence(changes, 1.0, f"against {count}", None)
+
+
+def _levels(lesson: Lesson, chambers: Sequence[str]) -> Array:
+    """Return the log RMS (5 per chamber,) of some of the chambers of a healthy recording."""
+    levels = np.asarray(lesson["levels"], dtype=float).reshape(len(lesson["chambers"]), -1)
+    return np.concatenate([levels[lesson["chambers"].index(chamber)] for chamber in chambers])
 
 
 def _evidence(changes: Sequence[_Change], share: float, where: str, onset: Interval | None) -> Evidence:

@@ -16,9 +16,12 @@ import numpy as np
 
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Information
-from sealscope.diagnosis.inference.scatter import Rise
+from sealscope.diagnosis.inference.scatter import Among, Rise, sessions_of
 from sealscope.diagnosis.rms_change.blocks import DUTY, QUANTITIES, RmsBlocks
 from sealscope.recordings.recording import Array
+
+#: Rates of the walk between recordings that are tried: quantiles of what is believed.
+WALKS = 16
 
 
 def beyond_noise(log_rms: Array, known: Array) -> tuple[Array, Array]:
@@ -59,29 +62,30 @@ def information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
 
 
 def rises(
-    log_rms: Array, duty: Array, known: Array, known_duty: Array, apart: bool = False
+    log_rms: Array, duty: Array, known: Array, known_duty: Array, times: Array | None = None
 ) -> tuple[list[Rise], Array]:
     """Return the rise g of each quantity of a recording beyond n leak-free ones of the machine, duty taken out, and w.
 
     `log_rms` (5 per chamber,), `duty` (4,); `known` (n, 5 per chamber), `known_duty` (n, 4). The quantities of healthy
-    recordings are normal about a mean and what the duty explains (Gelman et al., Bayesian Data Analysis, 3rd ed.,
-    section 14.8); the rise is Student's, as in `inference.scatter`. `apart`: the recording is of another
-    session than all of these, whose own deviation no scatter within a session shows.
+    recordings are normal about a mean, what the duty explains, and a deviation that fades with the time between them,
+    an Ornstein-Uhlenbeck process: it grows as a walk of a rate nobody knows, up to what sessions differ by; a session
+    begins anew after a pause. `times` (n + 1,) of these and of the recording [s], None where they are not known.
     """
-    belief, n = beliefs("rms_change")["recordings"], len(known)
-    freedom = belief["freedom"] + n - 1
-    design = np.column_stack([np.ones(n), known_duty - duty])
+    belief, walk, n = beliefs("rms_change")["recordings"], beliefs("rms_change")["walk"], len(known)
     exponents = np.array([float(beliefs("rms_change")["duty"][name]) for name in DUTY])
+    apart = (np.vstack([known_duty, duty]) - duty) * exponents
+    gained = walk["machine"] * np.tan(0.5 * np.pi * (np.arange(WALKS) + 0.5) / WALKS)
+    rates = (gained / belief["session"]) ** 2 / (2.0 * walk["time"])
+    since, alike = np.zeros((n + 1, n + 1)), np.ones((n + 1, n + 1))
+    if times is not None:
+        sessions = sessions_of(list(times), belief["pause"])
+        since, alike = np.abs(np.subtract.outer(times, times)), np.equal.outer(sessions, sessions).astype(float)
+    fading = belief["session"] ** 2 * np.exp(-rates[:, None, None] * since) * alike
+    among = Among(fading + apart @ apart.T, np.zeros(WALKS))
     values, weights = beyond_noise(np.vstack([log_rms, known]), known)
     weight = weights[1:].mean(axis=0)
     stated = []
-    for own, others, w in zip(values[0], values[1:].T, weight, strict=True):
-        scatter = float(np.hypot(w * belief["scatter"], belief["error"]))
-        penalty = np.diag([0.0, *(scatter / (w * exponents)) ** 2])
-        inverse = np.linalg.inv(design.T @ design + penalty)
-        fitted = inverse @ design.T @ others
-        squares = np.sum((others - design @ fitted) ** 2) + fitted @ penalty @ fitted
-        variance = (belief["freedom"] * scatter**2 + squares) / freedom * (1.0 + inverse[0, 0])
-        variance += (w * belief["session"]) ** 2 if apart else 0.0
-        stated.append(Rise(float(own - fitted[0]) / w, float(np.sqrt(variance)) / w, freedom))
+    for own, others, w in zip(values[0] / weight, values[1:].T / weight[:, None], weight, strict=True):
+        scatter = float(np.hypot(belief["scatter"], belief["error"] / w))
+        stated.append(among.rise(own, others, scatter, belief["freedom"]))
     return stated, weight

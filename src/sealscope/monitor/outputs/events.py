@@ -13,7 +13,7 @@ from typing import Any, TextIO
 
 import httpx
 
-from sealscope.monitor.memory.store import MonitorStore
+from sealscope.monitor.database.store import MonitorStore
 from sealscope.monitor.supervisor import PartAway
 
 logging.getLogger("httpx").setLevel(logging.WARNING)  # which tells each request

@@ -17,7 +17,7 @@ from importlib.resources import files
 from typing import Any
 
 from sealscope.monitor import sparkplug as spb
-from sealscope.monitor.memory.store import MonitorStore
+from sealscope.monitor.database.store import MonitorStore
 from sealscope.monitor.mqtt_client import KEEP_ALIVE_S, check_mqtt, check_running, client_of, published
 from sealscope.monitor.settings import BrokerSettings, SparkplugSettings, topic_part
 

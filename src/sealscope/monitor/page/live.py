@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sealscope.diagnosis.live.joining import CHANNELS
 from sealscope.errors import InputError
-from sealscope.monitor.stream.joining import CHANNELS
 from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.details import Details, details, shortest
 from sealscope.signals.windows import WINDOW_SIZE, windowed_rms
@@ -113,6 +113,11 @@ class LiveSamples:
             window = self._windows.get(name)
             if window is not None:
                 window.add(samples)
+
+    @property
+    def watched(self) -> frozenset[str]:
+        """The actuators that somebody looks at."""
+        return frozenset(self._windows)
 
     def version(self, name: str) -> int:
         """Return a number that changes with the samples of an actuator that is looked at, 0 where there are none."""

@@ -29,7 +29,7 @@ from starlette.routing import Route
 from sealscope.errors import InputError
 from sealscope.monitor.actuators import WatchedActuators
 from sealscope.monitor.alarms import ranked
-from sealscope.monitor.memory.store import away
+from sealscope.monitor.database.store import away
 from sealscope.monitor.outputs.prometheus import CONTENT_TYPE, metrics_text
 from sealscope.monitor.page.guard import BACKLOG, Admission, limited_protocol, most_connections
 from sealscope.monitor.page.live import DRAWN, PRESSURES, LiveSamples, machine_of

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from sealscope.diagnosis.live.joining import CHANNELS
 from sealscope.errors import InputError, MissingExtra
-from sealscope.monitor.stream.joining import CHANNELS
 from sealscope.monitor.supervisor import place_of
 from sealscope.recordings.channels import CHANNEL_UNITS, SLOW
 from sealscope.recordings.recording import Recording

@@ -17,11 +17,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from sealscope.diagnosis.live.joining import CHANNELS
 from sealscope.monitor import sparkplug as spb
 from sealscope.monitor.settings import ActuatorSettings
 from sealscope.monitor.sources import source_block as blocks
 from sealscope.monitor.sources.source_block import RefusedMessage, SourceBlock, digest_of, in_si, nothing, refusing
-from sealscope.monitor.stream.joining import CHANNELS
 from sealscope.recordings.channels import SLOW
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
 

@@ -27,7 +27,6 @@ CHANNELS = 2
 #: Rows of a lane's account: sum of |Q_L| [m^3/s] over the outputs, sum of the leak's opening, largest |x| [m],
 #: lowest pressure [Pa], 0 while all is finite.
 ACCOUNTS = 5
-Drive = tuple[float, float]
 Leak = tuple[float, float, float, float, float, float]
 Account = tuple[float, float, float, float, float]
 FLOW, OPEN, REACH, LEAST, DIVERGED = range(ACCOUNTS)
@@ -57,42 +56,27 @@ def opening(leak: Leak, t: float) -> float:
     return min(max((t - leak[2]) * leak[3], 0.0), 1.0)
 
 
-@contracted
-def _rk4(
-    z: State, h: float, t: float, nodes: np.ndarray, shape: np.ndarray, k: int, drive: Drive, leak: Leak, q: RigNumbers
-) -> State:
-    u = (
-        drive[1] + drive[0] * shape[k, 0],
-        drive[1] + drive[0] * shape[k, 1],
-        drive[1] + drive[0] * shape[k, 2],
+def _inputs(count: int) -> Any:
+    """Return the compiled function (t, nodes, shape, k, drive, leak, p): u, G, C, F at the `count` nodes of step k."""
+
+    def each(text: str) -> str:
+        return ", ".join(text.format(n=n, behind=count + n) for n in range(count))
+
+    return _written(
+        f"""def law(t, nodes, shape, k, drive, leak, p):
+    s = ({each("opening(leak, t + nodes[{n}])")})
+    u = ({each("drive[1] + drive[0] * shape[k, {n}]")})
+    G, C = ({each("leak[0] * s[{n}]")}), ({each("leak[1] * s[{n}]")})
+    F = ({each("0.0")})
+    if len(p.pushed) > 0:
+        F = ({each("shape[k, {behind}]")})
+    return u, G, C, F
+""",
+        opening=opening,
     )
-    s = (opening(leak, t + nodes[0]), opening(leak, t + nodes[1]), opening(leak, t + nodes[2]))
-    G = (leak[0] * s[0], leak[0] * s[1], leak[0] * s[2])
-    C = (leak[1] * s[0], leak[1] * s[1], leak[1] * s[2])
-    F = (shape[k, 3], shape[k, 4], shape[k, 5]) if len(q.pushed) > 0 else (0.0, 0.0, 0.0)
-    return rk4_step(z, h, u, G, C, F, q, False)
 
 
-@contracted
-def _imex(
-    z: State, h: float, t: float, nodes: np.ndarray, shape: np.ndarray, k: int, drive: Drive, leak: Leak, q: RigNumbers
-) -> State:
-    u = (
-        drive[1] + drive[0] * shape[k, 0],
-        drive[1] + drive[0] * shape[k, 1],
-        drive[1] + drive[0] * shape[k, 2],
-        drive[1] + drive[0] * shape[k, 3],
-        drive[1] + drive[0] * shape[k, 4],
-        drive[1] + drive[0] * shape[k, 5],
-    )
-    s_0, s_1, s_2 = opening(leak, t + nodes[0]), opening(leak, t + nodes[1]), opening(leak, t + nodes[2])
-    s_3, s_4, s_5 = opening(leak, t + nodes[3]), opening(leak, t + nodes[4]), opening(leak, t + nodes[5])
-    G = (leak[0] * s_0, leak[0] * s_1, leak[0] * s_2, leak[0] * s_3, leak[0] * s_4, leak[0] * s_5)
-    C = (leak[1] * s_0, leak[1] * s_1, leak[1] * s_2, leak[1] * s_3, leak[1] * s_4, leak[1] * s_5)
-    F = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    if len(q.pushed) > 0:
-        F = (shape[k, 6], shape[k, 7], shape[k, 8], shape[k, 9], shape[k, 10], shape[k, 11])
-    return imex_step(z, h, u, G, C, F, q)
+_rk4_inputs, _imex_inputs = _inputs(3), _inputs(6)
 
 
 @contracted
@@ -159,9 +143,9 @@ def advance(
                     noted = _noted(z, leak, t + nodes[0], noted, q)
                 due -= 1
                 if len(implicit) > 0:
-                    z = _imex(z, h, t, nodes, shape, step, gain, leak, q)
+                    z = imex_step(z, h, *_imex_inputs(t, nodes, shape, step, gain, leak, q), q)  # type: ignore[call-arg]
                 else:
-                    z = _rk4(z, h, t, nodes, shape, step, gain, leak, q)
+                    z = rk4_step(z, h, *_rk4_inputs(t, nodes, shape, step, gain, leak, q), q, False)  # type: ignore[call-arg]
         for m in range(states):
             store(y, g * states + m, z[m])
         for m in range(ACCOUNTS):

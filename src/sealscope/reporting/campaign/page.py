@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sealscope.campaigns.execution.store import RUN_BY_RUN
-from sealscope.campaigns.judging.judge import DetectorPod, Judgement, SizeRoc
+from sealscope.campaigns.judging.judge import AlarmShares, DetectorPod, Judgement, SizeRoc
 from sealscope.campaigns.judging.tables import PriorKnowledge
 from sealscope.campaigns.plans.detectors import DIAGNOSE, plan_detector
 from sealscope.campaigns.plans.model import HeldOutPlan, RecordedPlan, SimulatedPlan
@@ -19,7 +19,6 @@ from sealscope.campaigns.results import CampaignResult
 from sealscope.diagnosis.registry import detectors
 from sealscope.evaluation.binomial import Proportion
 from sealscope.evaluation.roc import Area
-from sealscope.evaluation.table import SummaryRow
 from sealscope.recordings.channels import Array
 from sealscope.reporting import template
 from sealscope.reporting.campaign.tables import cause_tables, page_tables, percent
@@ -51,14 +50,14 @@ def main_table(result: CampaignResult) -> tuple[list[str], list[list[str]]]:
     judgement = result.judgement
     sizes = sizes_of(judgement)
     rows = judgement.overall if math.isnan(sizes[0]) else judgement.table
-    by_detector: dict[str, dict[str, SummaryRow]] = defaultdict(dict)
+    by_detector: dict[str, dict[str, AlarmShares]] = defaultdict(dict)
     for row in rows:
         by_detector[row.detector][f"{row.leak_lpm}"] = row
     pods = {pod.detector: pod for pod in judgement.pods}
     areas = {roc.detector: _area(roc.area) for roc in judgement.rocs if math.isnan(roc.leak_lpm)}
     table = []
     for name, own in by_detector.items():
-        cells = [percent(own[f"{size}"].detection) if f"{size}" in own else "–" for size in sizes]
+        cells = [percent(own[f"{size}"].alarms) if f"{size}" in own else "–" for size in sizes]
         given = [_given(result.known.get(name))] if result.known else []
         alarms = percent(next(iter(own.values())).false_alarm)
         table.append([name, *given, alarms, *cells, areas.get(name, "–"), *_smallest(pods.get(name))])
@@ -95,13 +94,13 @@ def result_text(result: CampaignResult) -> str:
         if not rows:
             continue
         largest = max(rows, key=lambda row: row.leak_lpm)
-        finding = f"finds {percent(largest.detection)} of leaks of {largest.leak_lpm:g} {unit}"
+        finding = f"finds {percent(largest.alarms)} of leaks of {largest.leak_lpm:g} {unit}"
         a90 = math.inf
         if pod.curve is not None and pod.curve.a90 <= largest.leak_lpm:
             a90 = pod.curve.a90
             finding = f"finds 9 in 10 leaks of {a90:.2g} {unit}"
         text = f"{pod.detector} {finding} at {percent(largest.false_alarm)} false alarms."
-        said.append((a90, -largest.detection.value, text))
+        said.append((a90, -largest.alarms.value, text))
     said.sort(key=lambda item: item[:2])
     shown = [text for _, _, text in said[:_MOST_SAID]]
     more = len(said) - len(shown)

@@ -48,8 +48,8 @@ def page_tables(judgement: Judgement, unit: str, part: str = "") -> dict[str, Pa
     rows: dict[str, list[tuple[str, ...]]] = {
         "flows": [
             (
-                of.detector, f"{of.leak_lpm:g}" if of.leak_lpm else "no leak", str(of.errors.bias.n),
-                f"{of.errors.bias.value:+.2g}", f"{of.median_size.value:.2g}", percent(of.errors.coverage),
+                of.detector, f"{of.leak_lpm:g}" if of.leak_lpm else "no leak", str(of.errors.n),
+                f"{of.errors.bias.value:+.2g}", f"{of.errors.median_size.value:.2g}", percent(of.errors.coverage),
             )
             for of in judgement.flows
         ],

@@ -19,7 +19,7 @@ from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.simulation.batch.run import LaneSet, SetRun, sets_of, with_sizes
 from sealscope.simulation.experiment import LONGEST_STEP, PRESSURE_TOLERANCE, Experiment
-from sealscope.simulation.integrate import FINEST, FIRST_WINDOW
+from sealscope.simulation.integrate import FINEST, FIRST_WINDOW, trajectory
 from sealscope.simulation.sizing import settled
 from sealscope.units import LITRE_PER_MINUTE, parse_quantity
 
@@ -205,29 +205,16 @@ def _run(part: LaneSet, batch: Batch, error: float, threads: int, progress: Call
 
 
 def chosen_step(part: LaneSet, sizes: Array, error: float) -> float:
-    """Return the finest of the steps [s] that `integrate` chooses for some members over their first seconds.
+    """Return the finest of the steps [s] that `trajectory` chooses for some members over their first seconds.
 
     It is no longer than all members' numbers and leaks allow.
     """
-    from sealscope.simulation.integrate import RunInputs, integrate, oversampling
-
     steps = [allowed_step(part, sizes)]
     picked = np.unique(np.linspace(0, len(part.members) - 1, _SCOUTS).round().astype(int))
     for k in picked:
         experiment = with_sizes(part.members[k].experiment, float(sizes[k]))
-        rate = experiment.rate * oversampling(experiment)
-        run = integrate(
-            experiment.rig,
-            RunInputs(experiment, experiment.leaks),
-            min(experiment.duration, _SCOUTED),
-            rate,
-            x_0=experiment.x_0,
-            method=experiment.method,
-            error=error,
-            allow_unresolved=experiment.allow_unresolved,
-            effects=experiment.effects(),
-            load=experiment.load,
-        )
+        scouted = min(experiment.duration, _SCOUTED)
+        run = trajectory(experiment, experiment.leaks, error=error, duration=scouted)
         steps.append(run.step)
     return float(min(steps))
 

@@ -27,7 +27,7 @@ from sealscope.simulation.changes import (
     values_of,
 )
 from sealscope.simulation.commands import Command, Sine
-from sealscope.simulation.courses import numbers_under
+from sealscope.simulation.courses import numbers_under, state_under
 from sealscope.simulation.experiment import Experiment, choose_method, exact
 from sealscope.simulation.instruments import FILTER_REACH, anti_alias_taps
 from sealscope.simulation.integrate import (
@@ -45,6 +45,8 @@ if TYPE_CHECKING:
 
 #: Slope [1/s] of an abrupt opening.
 ABRUPT = 1e15
+#: What the pressure sensors of a batch cannot have.
+_ABSENT = ("stuck_rate", "drop_rate", "lag", "hum_harmonics")
 
 
 @dataclass(frozen=True)
@@ -88,29 +90,27 @@ class LaneSet:
 
 def refuse(experiment: Experiment, place: int) -> None:
     """Raise InputError for an experiment that cannot run side by side with others."""
-
-    def no(what: str) -> InputError:
-        return InputError(f"a run of a batch must have {what} (run {place}); simulate it by itself")
-
+    rig, leaks = experiment.rig, experiment.leaks
+    missing = []
     if experiment.controlled is not None:
-        raise no(f"a command, got a target for a controller ({experiment.command})")
-    if len(experiment.leaks) > 1:
-        raise no(f"at most one leak, got {len(experiment.leaks)}")
-    if experiment.leaks and not isinstance(experiment.leaks[0].opening, From | Growing):
-        raise no(f"a leak that opens abruptly or evenly, got {experiment.leaks[0].opening}")
-    if experiment.rig.motor.integrator == "euler":
-        raise no("motor.integrator = state, got euler")
+        missing.append(f"a command, got a target for a controller ({experiment.command})")
+    if len(leaks) > 1:
+        missing.append(f"at most one leak, got {len(leaks)}")
+    if leaks and not isinstance(leaks[0].opening, From | Growing):
+        missing.append(f"a leak that opens abruptly or evenly, got {leaks[0].opening}")
+    if rig.motor.integrator == "euler":
+        missing.append("motor.integrator = state, got euler")
     if any(fault.row.of_sensor for fault in experiment.faults):
-        raise no(f"no fault of a sensor, got {', '.join(str(fault) for fault in experiment.faults)}")
-    if experiment.rig.daq.jitter != 0:
-        raise no(f"daq.jitter = 0, got {experiment.rig.daq.jitter}")
-    if experiment.leaks and experiment.thins:
-        raise no("no leak while the oil's temperature changes")
-    for name in CHAMBERS:
-        sensor = getattr(experiment.rig.sensors, name)
-        for field in ("stuck_rate", "drop_rate", "lag", "hum_harmonics"):
-            if getattr(sensor, field) != 0:
-                raise no(f"sensors.{name}.{field} = 0, got {getattr(sensor, field)}")
+        missing.append(f"no fault of a sensor, got {', '.join(map(str, experiment.faults))}")
+    if leaks and experiment.thins:
+        missing.append("no leak while the oil's temperature changes")
+    absent = ["daq.jitter"]
+    absent += [
+        f"sensors.{name}.{own}" for name in CHAMBERS for own in ("stuck_rate", "drop_rate", "lag", "hum_harmonics")
+    ]
+    missing += [f"{name} = 0, got {rig[name]}" for name in absent if rig[name] != 0]
+    if missing:
+        raise InputError(f"a run of a batch must have {missing[0]} (run {place}); simulate it by itself")
 
 
 def _shape(command: Command) -> tuple[str, Command, float, float]:
@@ -249,19 +249,12 @@ def instrument_rows(members: Sequence[Member], first: int, last: int) -> Array:
     from sealscope.simulation.batch.signals import HUM, HUM_PHASE
 
     ends = np.array([first, last]) / members[0].experiment.rate
-    steady: dict[int, Array] = {}  # by rig, of runs whose instruments do not drift
-    rows = []
-    for experiment in (member.experiment for member in members):
-        own = None if experiment.drifts else steady.get(id(experiment.rig))
-        if own is None:
-            own = _channels(experiment.rig, experiment.readings(), ends, last - first)
-            if not experiment.drifts:
-                steady[id(experiment.rig)] = own
-        if own[:, HUM].any():
-            own = own.copy()
-            own[:, HUM_PHASE] = np.random.default_rng([experiment.seed, 1]).random(len(CHAMBERS))
-        rows.append(own)
-    return np.array(rows)
+    experiments = [member.experiment for member in members]
+    rows = np.array([_channels(own.rig, own.readings(), ends, last - first) for own in experiments])
+    for row, own in zip(rows, experiments, strict=True):
+        if row[:, HUM].any():
+            row[:, HUM_PHASE] = np.random.default_rng([own.seed, 1]).random(len(CHAMBERS))
+    return rows
 
 
 def _channels(rig: Rig, readings: Readings, ends: Array, samples: int) -> Array:
@@ -288,10 +281,6 @@ def _channels(rig: Rig, readings: Readings, ends: Array, samples: int) -> Array:
     return rows
 
 
-def _at_standstill(experiment: Experiment) -> float:
-    return 0.0 if experiment.load is None else experiment.load.at_standstill(experiment.x_0)
-
-
 #: Steps of a chunk, and so the arrays of the command's shape; the cells of a chunk never are cut.
 CHUNK_STEPS = 4096
 
@@ -309,7 +298,6 @@ class SetRun:
     def __init__(self, part: LaneSet, step: float, sizes: Array, measured: Array, bounds: Array | None) -> None:
         from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, nodes_of
         from sealscope.physics.solvers.limits import longest_step
-        from sealscope.physics.standstill import initial_state
         from sealscope.physics.vector.runs import ACCOUNTS, CHANNELS, LEAST
 
         members, common = part.members, part.experiment
@@ -333,10 +321,9 @@ class SetRun:
                     checked.add(what)
                     refuse_unresolved(numbers, self.h, self.method)
                     refuse_long(self.h, longest_step(numbers, G, C), f"the leak of run {member.place}")
-        self.state = in_lanes(
-            np.array([initial_state(e.rig, e.x_0, _at_standstill(e)) for e in (m.experiment for m in members)]),
-            self.width,
-        )
+        experiments = [member.experiment for member in members]
+        states = [state_under(own.rig, own.load, own.x_0) for own in experiments]
+        self.state = in_lanes(np.array(states), self.width)
         self.groups = len(self.state)
         self.drive = in_lanes(np.array([[m.gain, m.offset] for m in members]), self.width)
         self.leaks = in_lanes(leaks, self.width)
@@ -480,8 +467,9 @@ class SetRun:
 
         account = self.account[groups[0] : groups[1]]
         time = stop / (self.part.experiment.rate * self.factor)
-        lowest = account[:, LEAST]
-        if np.all(account[:, DIVERGED] == 0.0) and lowest.min() >= VACUUM and account[:, REACH].max() <= self._half:
+        half = 0.5 * float(min(member.numbers.L for member in self.part.members))
+        settled = np.all(account[:, DIVERGED] == 0.0) and account[:, LEAST].min() >= VACUUM
+        if settled and account[:, REACH].max() <= half:
             return
         accounts = out_of_lanes(account, account.shape[0] * self.width)
         for k, (reach, least, diverged) in enumerate(accounts[:, [REACH, LEAST, DIVERGED]]):
@@ -503,10 +491,6 @@ class SetRun:
                     f"pressures of run {member.place} must stay above vacuum ({VACUUM:g} Pa gauge: the model has no "
                     f"cavitation), got {least:.4g} Pa before t = {time:.4g} s; simulate it by itself for the place"
                 )
-
-    @property
-    def _half(self) -> float:
-        return 0.5 * float(min(member.numbers.L for member in self.part.members))
 
     def rms(self) -> Array:
         """RMS of d1..d4 and d3 d4 in each segment, (runs, 2, segments, 5)."""

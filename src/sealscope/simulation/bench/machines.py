@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from sealscope.simulation.experiment import Experiment
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
+T = TypeVar("T")
 #: Terms of a wandering drift.
 WANDER_TERMS = 6
 
@@ -166,18 +167,18 @@ def draw(
         values, drifting = _drawn(nuisance, seed, oil)
         overrides |= {name: float(base[name]) * value for name, value in values.items()} if nuisance.scales else values
         drifts += drifting
-    random = _random(seed, "duty")
-    command = command_or_target(given.duty.commands[int(random.integers(len(given.duty.commands)))])
-    closed = given.duty.closed[int(random.integers(len(given.duty.closed)))]
+    random, duty = _random(seed, "duty"), given.duty
+
+    def one_of(options: Sequence[T]) -> T:
+        return options[int(random.integers(len(options)))]
+
+    command, closed = command_or_target(one_of(duty.commands)), one_of(duty.closed)
     overrides |= {"line.closed_A": closed, "line.closed_B": closed}
     if closed > 0:
         overrides["line.orifices"] = "present"
-    amplitude = float(random.uniform(*given.duty.amplitude))
+    amplitude = float(random.uniform(*duty.amplitude))
     if amplitude != 1.0:
         command = replace(command, amplitude=command.amplitude * amplitude)  # type: ignore[type-var, union-attr]
-    load, controller = None, "pi"
-    if given.duty.loads:
-        load = parse_force(given.duty.loads[int(random.integers(len(given.duty.loads)))])
-    if given.duty.controllers:
-        controller = given.duty.controllers[int(random.integers(len(given.duty.controllers)))]
+    load = parse_force(one_of(duty.loads)) if duty.loads else None
+    controller = one_of(duty.controllers) if duty.controllers else "pi"
     return BenchMachine(given.name, seed, base, duration, overrides, tuple(drifts), command, closed, load, controller)

@@ -13,18 +13,12 @@ from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, Figure, FigureCurve, Number, Panel, Role, ThesisTable
 from sealscope.thesis.sheet import APPENDIX_C, COLUMNS, QUANTITIES, UNITS, DataSheet, mean_leaks
 
-AGREEMENT = (
-    *("chamber", "detail", "mean change with leak, simulated [%]", "mean change with leak, measured [%]"),
-    *("leak-free RMS, simulated / measured", "scatter of that ratio [factor]"),
-    *("tests with the same sign of change [of 41]", "correlation of the changes"),
-)
-
 
 def _difference(pairs: Array) -> Array:
     return np.asarray(100.0 * (pairs[:, 1] - pairs[:, 0]) / pairs[:, 0])
 
 
-def chamber_table(sheet: DataSheet, measured: DataSheet | None, chamber: str, item: str) -> ThesisTable:
+def _chamber_table(sheet: DataSheet, measured: DataSheet | None, chamber: str, item: Item) -> ThesisTable:
     """Tabulate one chamber as the thesis does: RMS without and with leak and the difference [%], with both sources."""
     heads = ["test", "mean leak [L/min]", "input", "closed [%]", "level"]
     columns: list[list[float] | list[None]] = []
@@ -35,11 +29,12 @@ def chamber_table(sheet: DataSheet, measured: DataSheet | None, chamber: str, it
             pairs = None if source is None else source.rms[chamber][name]
             values = (None,) * 3 if pairs is None else (pairs[:, 0], pairs[:, 1], _difference(pairs))
             columns += [[None] * len(APPENDIX_C) if of is None else of.tolist() for of in values]
-    rows = tuple(
+    rows = (
         (row.number, row.mean_leak_lpm, row.command, row.closed_pct, row.level, *(values[k] for values in columns))
         for k, row in enumerate(APPENDIX_C)
     )
-    return ThesisTable(item, f"Appendix C, RMS of the wavelet details of {chamber}", tuple(heads), rows)
+    tail, title = f"-p{chamber[-1].lower()}", f"Appendix C, RMS of the wavelet details of {chamber}"
+    return item.table(rows, "", heads, tail=tail, title=title)
 
 
 def agreement(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[Cell, ...]]:
@@ -62,10 +57,8 @@ def appendix(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate how simulation and sheet agree, and the thesis's two tables with both side by side."""
     table, sheet = simulated_sheet(context, "leak")
     notes = f"{table.notes} Means are geometric." + ("" if context.sheet else " No measured sheet was given.")
-    rows = tuple(agreement(sheet, context.sheet))
-    summary = ThesisTable(item.id, item.title, AGREEMENT, rows, resolved=table.resolved, notes=notes)
-    ids = {chamber: f"{item.id}-{chamber.lower().replace('_', '')}" for chamber in CHAMBERS}
-    return summary, *(chamber_table(sheet, context.sheet, chamber, name) for chamber, name in ids.items())
+    summary = item.table(agreement(sheet, context.sheet), notes, resolved=table.resolved)
+    return summary, *(_chamber_table(sheet, context.sheet, chamber, item) for chamber in CHAMBERS)
 
 
 def difference_figure(context: Context, item: Item) -> tuple[Figure, ...]:
@@ -95,20 +88,4 @@ def difference_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     heads = (f"RMS with - without leak, {name} [{UNITS[name]}]", f"change of the RMS of {name} [%]")
     drawn = zip(heads, (absolute, relative), strict=True)
     panels = tuple(Panel("mean leak [L/min]", head, (*curves, zero)) for head, curves in drawn)
-    return (Figure(item.id, item.title, panels, tuple(numbers), resolved=table.resolved, notes=table.notes),)
-
-
-def _items() -> list[Item]:
-    needs = ("appendix-c-leak", "appendix-c-no-leak")
-    title = "Appendix C, simulated beside measured"
-    items = [Item("appendix-c", 5, "table", title, appendix, uses_sheet=True, needs=needs[:1])]
-    for chamber, way in (("p_A", "down"), ("p_B", "up")):  # how each is said to move when a leak opens
-        for name in ("d3", "d4", "d3d4"):
-            inputs = {"chamber": chamber, "detail": name, "way": way}
-            title = f"Change of the RMS of {name} of {chamber} against the mean leak"
-            number = f"fig-5.{89 + len(items)}"
-            items.append(Item(number, 5, "figure", title, difference_figure, inputs, uses_sheet=True, needs=needs))
-    return items
-
-
-ITEMS: tuple[Item, ...] = tuple(_items())
+    return (item.figure(panels, numbers, table.resolved, table.notes),)

@@ -19,8 +19,8 @@ from sealscope.recordings.recording import Array, Recording
 from sealscope.thesis.engine.context import Context, first_table
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, ThesisTable
+from sealscope.thesis.engine.texts import note
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, QUANTITIES, UNITS, Condition, DataSheet, experiment_values
-from sealscope.thesis.texts import note
 from sealscope.units import PSI
 
 if TYPE_CHECKING:
@@ -149,9 +149,9 @@ def with_leak(half: float, quick: bool) -> Iterator[SimulatedTest]:
 
     The first test of each condition is proved by halving the step, except in a quick reproduction.
     """
+    from sealscope.simulation.integrate import sized_leaks
     from sealscope.simulation.leaks import From
     from sealscope.simulation.simulate import prove, simulate_with_truth
-    from sealscope.simulation.sizing import sized_leaks
 
     proved: set[tuple[str, float]] = set()
     for condition in APPENDIX_C:
@@ -213,14 +213,14 @@ _COLUMNS = (
 )
 
 
-def table_of(tests: list[SimulatedTest], item: str, title: str, notes: str = "") -> ThesisTable:
+def table_of(tests: list[SimulatedTest], item: Item, notes: str = "") -> ThesisTable:
     """Tabulate the tests; `sheet_of` reads the table back. It is resolved when every run that was proved is."""
     rows: list[tuple[Cell, ...]] = []
     for test in tests:
         of, rms = test.condition, (test.rms[chamber][name][k] for chamber, name, k, _ in _RMS_COLUMNS)
         rows.append((of.number, of.command, of.closed_pct, test.happened, test.mean_leak_lpm, *test.range_MPa, *rms))
     outcomes = [test.resolved for test in tests if test.resolved is not None]
-    return ThesisTable(item, title, _COLUMNS, tuple(rows), resolved=all(outcomes) if outcomes else None, notes=notes)
+    return item.table(rows, notes, _COLUMNS, resolved=all(outcomes) if outcomes else None)
 
 
 def column(table: ThesisTable, head: str) -> Array:
@@ -238,7 +238,6 @@ def sheet_of(table: ThesisTable) -> DataSheet:
 def runs_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate the 41 tests with their leak from half time on, with nothing happening there, or with a drift."""
     half, name = QUICK_HALF if context.quick else HALF, item.inputs["runs"]
-    _, simulate = _RUNS[name]
     proof = (
         "No run is proved (quick)." if context.quick else "One test of each condition is proved by halving the step."
     )
@@ -246,7 +245,7 @@ def runs_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     bounds = {part: f"{100 * low:g} to {100 * high:g} %" for part, (low, high) in parts.items()}
     of = note(f"runs-{name}", proof=proof, **bounds)
     notes = note("runs", rig=BENCH_RIG, half=half, quick=" (quick)" if context.quick else "", of=of)
-    return (table_of(list(simulate(half, context.quick)), item.id, item.title, notes),)
+    return (table_of(list(_RUNS[name](half, context.quick)), item, notes),)
 
 
 def simulated_sheet(context: Context, runs: str) -> tuple[ThesisTable, DataSheet]:
@@ -255,12 +254,5 @@ def simulated_sheet(context: Context, runs: str) -> tuple[ThesisTable, DataSheet
     return table, sheet_of(table)
 
 
-#: Title of each kind of runs, and what simulates it.
-_RUNS: dict[str, tuple[str, Callable[[float, bool], Iterator[SimulatedTest]]]] = {
-    "leak": ("The 41 tests of Appendix C simulated with their leak", with_leak),
-    "no-leak": ("The same 41 tests simulated with no leak", without_leak),
-    "drift": ("The same 41 tests simulated with no leak on a rig that drifts", with_drift),
-}
-ITEMS: tuple[Item, ...] = tuple(
-    Item(f"appendix-c-{name}", 5, "case", title, runs_table, {"runs": name}) for name, (title, _) in _RUNS.items()
-)
+#: What simulates each kind of runs.
+_RUNS = {"leak": with_leak, "no-leak": without_leak, "drift": with_drift}

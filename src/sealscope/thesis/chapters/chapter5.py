@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.errors import SimulationFailed
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
 from sealscope.thesis.chapters.appendix_c_runs import SETTLING, detail_rms, detail_series, pressure_range
 from sealscope.thesis.engine.context import Context, RunSpec, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Figure, FigureCurve, Number, Panel, Role
+from sealscope.thesis.engine.texts import note, texts_of
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, QUANTITIES, UNITS, Condition, experiment_values
-from sealscope.thesis.texts import note
 from sealscope.units import LITRE_PER_MINUTE
 
 Mask = NDArray[np.bool_]
@@ -41,8 +40,8 @@ class ShownTest:
     command: str
     level: str
     first: int
-    inputs: int = 0
-    half: float = 90.0
+    inputs: int
+    half: float
 
     @property
     def parts(self) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -70,21 +69,7 @@ class ShownTest:
 
 
 #: The ten tests by section.
-TESTS: dict[str, ShownTest] = {
-    test.section: test
-    for test in (
-        ShownTest("5.2a", "3 sin(4t)", "large", 1, inputs=2, half=60.0),
-        ShownTest("5.2b", "5 sin(2t)", "large", 11, inputs=2),
-        ShownTest("5.3a", "3 sin(4t)", "medium", 21, inputs=2),
-        ShownTest("5.3b", "8 sin(t)", "medium", 31, inputs=1),
-        ShownTest("5.4a", "3 sin(4t)", "small", 40),
-        ShownTest("5.4b", "8 sin(t)", "small", 48),
-        ShownTest("5.5a", "3 sin(4t)", "extra-small", 56),
-        ShownTest("5.5b", "7 sin(4t)", "extra-small", 64, inputs=2),
-        ShownTest("5.5c", "5 sin(2t)", "extra-small", 74),
-        ShownTest("5.5d", "8 sin(t)", "extra-small", 82),
-    )
-}
+TESTS: dict[str, ShownTest] = {row[0]: ShownTest(*row) for row in texts_of("cases.toml")["shown"]}
 
 
 def spec_of(test: ShownTest) -> RunSpec:
@@ -95,37 +80,18 @@ def spec_of(test: ShownTest) -> RunSpec:
     return RunSpec(condition.command, 2 * test.half, (leak,), BENCH_RIG, values, condition.number, prove=True)
 
 
-def recording_of(run: SimulatedRun, test: ShownTest) -> Recording:
-    """Return the run's recording; raise SimulationFailed with the run's own reason where it has none."""
-    if run.recording is None:
-        raise SimulationFailed(f"test {test.section}: {run.diverged}")
-    return run.recording
-
-
-def figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw one of Figs. 5.1 to 5.89, by the item's test, view, chamber and stretch of time."""
-    test, chamber = TESTS[item.inputs["test"]], item.inputs["chamber"]
-    run = context.run(spec_of(test))
-    view = FigureView(run, recording_of(run, test), test, (item.inputs["from_s"], item.inputs["to_s"]))
-    draw: dict[str, Callable[[], Drawn]] = {
-        "input": view.inputs,
-        "leak": view.leak,
-        "details": lambda: view.details(chamber),
-        "rms": lambda: view.windowed_rms(chamber),
-    }
-    panels, numbers = draw[item.inputs["view"]]()
-    notes = view.notes()
-    return (Figure(item.id, item.title, tuple(panels), tuple(numbers), resolved=run.resolved, notes=notes),)
-
-
 @dataclass(frozen=True, eq=False)
 class FigureView:
     """The panels and numbers of one view of a test, from its run over a stretch of time [s]."""
 
     run: SimulatedRun
-    recording: Recording
     test: ShownTest
     span: tuple[float, float]
+
+    @property
+    def recording(self) -> Recording:
+        """The run's recording."""
+        return self.run.recorded
 
     def notes(self) -> str:
         """Return which row of Appendix C was simulated, and how it was chosen."""
@@ -155,7 +121,7 @@ class FigureView:
         t, half = self.recording.t, self.test.half
         return ((t >= SETTLING) & (t < half), _WHEN[0]), (t >= half, _WHEN[1])
 
-    def inputs(self) -> Drawn:
+    def inputs(self, chamber: str) -> Drawn:
         """Draw command, motor speed and displacement."""
         recording = self.recording
         rpm, x = recording["omega"] / _RPM, recording["x"] * 1e3
@@ -171,7 +137,7 @@ class FigureView:
             numbers += [Number(f"RMS of speed {when}", speed, "rpm"), Number(f"drift of x {when}", drift, "mm/s")]
         return panels, numbers
 
-    def leak(self) -> Drawn:
+    def leak(self, chamber: str) -> Drawn:
         """Draw leak flow and chamber pressures."""
         recording = self.recording
         flow = self._curve(recording["q_leak"] / LITRE_PER_MINUTE, "flow meter, A to B positive", "leak")
@@ -183,9 +149,9 @@ class FigureView:
             Number("mean leak of the thesis's sheet", self.test.condition.mean_leak_lpm, "L/min"),
         ]
         for part, when in self._halves():
-            for chamber in CHAMBERS:
-                low, high = np.percentile(recording[chamber][part], [5.0, 95.0]) / 1e6
-                numbers.append(Number(f"5 to 95 % range of {chamber} {when}", float(high - low), "MPa"))
+            for c in CHAMBERS:
+                low, high = np.percentile(recording[c][part], [5.0, 95.0]) / 1e6
+                numbers.append(Number(f"5 to 95 % range of {c} {when}", float(high - low), "MPa"))
         return panels, numbers
 
     def details(self, chamber: str) -> Drawn:
@@ -214,6 +180,38 @@ class FigureView:
         return numbers
 
 
+#: View -> what it shows, and what draws it.
+_VIEWS: dict[str, tuple[str, Callable[[FigureView, str], Drawn]]] = {
+    "input": ("command, motor speed and piston displacement", FigureView.inputs),
+    "leak": ("leak flow and chamber pressures", FigureView.leak),
+    "details": ("wavelet details d1 to d4 and d3d4", FigureView.details),
+    "rms": ("windowed RMS of d3, d4 and d3d4", FigureView.windowed_rms),
+}
+
+
+def views() -> Iterator[tuple[str, str, dict[str, object]]]:
+    """Yield number, title and inputs of Figs. 5.1 to 5.89: of each test every view, whole and in close-up."""
+    for test in TESTS.values():
+        shown = [*[("input", "", False), ("input", "", True)][: test.inputs], ("leak", "", False), ("leak", "", True)]
+        for chamber in CHAMBERS:
+            shown += [("details", chamber, False), ("details", chamber, True), ("rms", chamber, False)]
+        for number, (view, chamber, closeup) in enumerate(shown, test.first):
+            start, stop = (test.half - 10.0, test.half + 10.0) if closeup else (0.0, 2 * test.half)
+            when = f"close-up {start:g} to {stop:g} s" if closeup else f"{stop:g} s"
+            content = _VIEWS[view][0] + (f" of {chamber}" if chamber else "")
+            title = f"Test {test.section}, {test.command}, {test.level} leak: {content}, {when}"
+            inputs = {"test": test.section, "view": view, "chamber": chamber, "from_s": start, "to_s": stop}
+            yield f"fig-5.{number}", title, inputs
+
+
+def figure(context: Context, item: Item) -> tuple[Figure, ...]:
+    """Draw one of Figs. 5.1 to 5.89, by the item's test, view, chamber and stretch of time."""
+    test = TESTS[item.inputs["test"]]
+    view = FigureView(context.run(spec_of(test)), test, (item.inputs["from_s"], item.inputs["to_s"]))
+    panels, numbers = _VIEWS[item.inputs["view"]][1](view, item.inputs["chamber"])
+    return (item.figure(panels, numbers, view.run.resolved, view.notes()),)
+
+
 def mean_slope(t: Array, y: Array, omega: float) -> float:
     """Return the slope of `y` over `t` beside a sine of `omega` [rad/s], by least squares on 1, t, sin and cos."""
     t_0 = t - t.mean()
@@ -240,7 +238,7 @@ class ShownMeasures:
 
     `rms`: as Appendix C; `speed`: RMS of the motor's speed [rad/s]; `drift`: of the piston's mean [mm/s]; `velocity`:
     RMS of the piston's [mm/s]; `range_MPa`: 5 to 95 % range of each chamber's true pressure; `step_s`: where a single
-    step fits the windowed RMS of d3 of each chamber best [s]; `onset_s`: the true onset [s].
+    step fits the windowed RMS of d3 of each chamber best [s].
     """
 
     test: ShownTest
@@ -250,7 +248,6 @@ class ShownMeasures:
     velocity: tuple[float, float]
     range_MPa: dict[str, tuple[float, float]]
     step_s: dict[str, float]
-    onset_s: float
 
 
 def best_step(t: Array, y: Array, least: int = 5) -> float:
@@ -273,7 +270,7 @@ def measure_test(context: Context, test: ShownTest, leak: bool = True) -> ShownM
 
     spec = spec_of(test)
     run = context.run(spec if leak else replace(spec, leaks=(), prove=False))
-    recording = recording_of(run, test)
+    recording = run.recorded
     t, period = recording.t, 2.0 * np.pi / test.omega
     # the last whole periods of the command in each half
     starts = [stop - np.floor((stop - start) / period) * period for start, stop in test.parts]
@@ -296,33 +293,4 @@ def measure_test(context: Context, test: ShownTest, leak: bool = True) -> ShownM
         velocity=pair(run.outputs["v"] * 1e3),
         range_MPa={chamber: pair(run.outputs[chamber] / 1e6, pressure_range) for chamber in CHAMBERS},
         step_s=steps,
-        onset_s=test.half,
     )
-
-
-_CONTENT = {
-    "input": "command, motor speed and piston displacement",
-    "leak": "leak flow and chamber pressures",
-    "details": "wavelet details d1 to d4 and d3d4",
-    "rms": "windowed RMS of d3, d4 and d3d4",
-}
-
-
-def _items(test: ShownTest) -> list[Item]:
-    """Return the figures of a test in their order: view, chamber, whole or close-up (ten seconds about the onset)."""
-    views = [*[("input", "", False), ("input", "", True)][: test.inputs], ("leak", "", False), ("leak", "", True)]
-    for chamber in CHAMBERS:
-        views += [("details", chamber, False), ("details", chamber, True), ("rms", chamber, False)]
-    items = []
-    for number, (view, chamber, closeup) in enumerate(views, test.first):
-        start, stop = (test.half - 10.0, test.half + 10.0) if closeup else (0.0, 2 * test.half)
-        when = f"close-up {start:g} to {stop:g} s" if closeup else f"{stop:g} s"
-        content = _CONTENT[view] + (f" of {chamber}" if chamber else "")
-        title = f"Test {test.section}, {test.command}, {test.level} leak: {content}, {when}"
-        inputs = {"test": test.section, "view": view, "chamber": chamber, "from_s": start, "to_s": stop}
-        items.append(Item(f"fig-5.{number}", 5, "figure", title, figure, inputs))
-    return items
-
-
-#: Figs. 5.1 to 5.89 in their order.
-ITEMS: tuple[Item, ...] = tuple(item for test in TESTS.values() for item in _items(test))

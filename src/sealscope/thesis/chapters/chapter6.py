@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -14,11 +15,10 @@ from sealscope.recordings.recording import Array
 from sealscope.thesis.engine.context import Context, first_table
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, Claim, Figure, FigureCurve, Panel, Role, ThesisTable
-from sealscope.thesis.texts import judged, note
+from sealscope.thesis.engine.texts import judged, note
 from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
-    from sealscope.control import Controller
     from sealscope.parameters import Rig
     from sealscope.simulation.integrate import Trajectory
 
@@ -37,18 +37,8 @@ AMPLITUDE, OMEGA = 0.04, 0.5 * math.pi
 STIFF_AT, STIFF_FORCE = 0.5, 500.0
 SMALL_AT, SMALL_SPEED = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0), 8e-3
 CONTROLLERS = ("pi", "flatness", "fault-tolerant", "fault-tolerant-flatness", "ideal")
-#: Columns of the tables, and what the numbers in them are.
-_ERROR, _STIFF, _FLOW = "rms error [mm]", "stiffness at 0.5 Hz [N/mm]", "made good [L/min]"
-COLUMNS = ("controller", "leak [L/min]", _ERROR, "bandwidth [Hz]", "energy a cycle [J]", _STIFF, _FLOW)
-OUTSIDE_COLUMNS = (
-    *("rod seal", "controller", "leak [L/min]", _ERROR, _STIFF, _FLOW),
-    "lower pressure, fifth cycle less third [kPa]",
-)
-VALVE_COLUMNS = (
-    *("source", "controller", "leak [L/min]", _ERROR, "bandwidth [Hz]", _STIFF),
-    *("electrical energy a cycle [J]", "hydraulic energy a cycle [J]"),
-    *("efficiency against a damper [%]", "efficiency from what the cylinder takes [%]"),
-)
+#: Columns of the tables that are drawn.
+_ERROR, _STIFF, _ENERGY = "rms error [mm]", "stiffness at 0.5 Hz [N/mm]", "electrical energy a cycle [J]"
 _ROLES: dict[tuple[str, ...], Role] = dict(
     zip(((name,) for name in CONTROLLERS), ("simulated", "25 %", "leak", "75 %", "reference"), strict=True)
 )
@@ -73,41 +63,6 @@ def conductance(lpm: float, rig: Rig) -> float:
     return lpm * LITRE_PER_MINUTE / (LOAD / rig.cylinder.A_A)
 
 
-def controller_of(name: str, rig: Rig, lpm: float) -> Controller:
-    """Return a controller by its name; `ideal` knows the leak."""
-    from sealscope.control import FaultTolerant, controller_named
-
-    if name == "ideal":
-        return FaultTolerant.of(rig, known=conductance(lpm, rig))
-    return controller_named(name, rig)
-
-
-def followed(
-    command: str,
-    duration: float,
-    controller: Controller | None,
-    lpm: float,
-    load: str,
-    rig: str = RIG,
-    values: Mapping[str, float | str] | None = None,
-) -> Trajectory:
-    """Run a rig whose friction and stiffness are off, under a load in words beside `LOAD`."""
-    from sealscope.simulation.experiment import Experiment
-    from sealscope.simulation.integrate import trajectory
-
-    leak = f"G = {conductance(lpm, _rig(rig))!r}" if lpm else None
-    experiment = Experiment.of(
-        rig=_rig(rig),
-        set={**OFF, "F_l": LOAD, **(values or {})},
-        command=command,
-        duration=duration,
-        controller=controller,
-        leak=leak,
-        load=load,
-    )
-    return trajectory(experiment, experiment.leaks)
-
-
 @cache
 def _rig(name: str = RIG) -> Rig:
     from sealscope.parameters import load_rig
@@ -122,12 +77,85 @@ def amplitude_at(t: Array, values: Array, f: float) -> complex:
     return complex(a[0], -a[1])
 
 
-def on_duty(
-    name: str, lpm: float, load: str = "0 N", rig: str = RIG, values: Mapping[str, float | str] | None = None
-) -> tuple[Trajectory, Array]:
-    """Return a run of five cycles of the duty, and which of its samples are of the last two."""
-    run = followed(DUTY, 5.0 * CYCLE, controller_of(name, _rig(rig), lpm), lpm, load, rig, values)
-    return run, np.asarray((run.t >= 3.0 * CYCLE) & (run.t < 5.0 * CYCLE))
+def drawn(run: Trajectory) -> Array:
+    """Return the flow [m^3/s] that a servo valve without overlap draws from its supply: that of its open edge."""
+    return np.asarray(np.where(run["x_s"] > 0.0, run["Q_A"], -run["Q_B"]))
+
+
+@dataclass(frozen=True)
+class ControlledRig:
+    """A rig whose friction and stiffness are off, with a leak of `lpm` [L/min], under the load.
+
+    `controller`: its name, "" for an open loop, `ideal` for one that knows the leak; `values`: other parameters.
+    """
+
+    controller: str
+    lpm: float
+    rig: str = RIG
+    values: tuple[tuple[str, float], ...] = ()
+
+    def run(self, command: str, duration: float, load: str = "0 N") -> Trajectory:
+        """Run a command under a load in words beside `LOAD`."""
+        from sealscope.control import FaultTolerant, controller_named
+        from sealscope.simulation.experiment import Experiment
+        from sealscope.simulation.integrate import trajectory
+
+        rig = _rig(self.rig)
+        size, controller = conductance(self.lpm, rig), None
+        if self.controller:
+            known = self.controller == "ideal"
+            controller = FaultTolerant.of(rig, known=size) if known else controller_named(self.controller, rig)
+        experiment = Experiment.of(
+            rig=rig,
+            set={**OFF, "F_l": LOAD, **dict(self.values)},
+            command=command,
+            duration=duration,
+            controller=controller,
+            leak=f"G = {size!r}" if self.lpm else None,
+            load=load,
+        )
+        return trajectory(experiment, experiment.leaks)
+
+    def on_duty(self, load: str = "0 N") -> tuple[Trajectory, Array]:
+        """Return a run of five cycles of the duty, and which of its samples are of the last two."""
+        run = self.run(DUTY, 5.0 * CYCLE, load)
+        return run, np.asarray((run.t >= 3.0 * CYCLE) & (run.t < 5.0 * CYCLE))
+
+    def stiffness(self) -> float:
+        """Return |F/x| [N/mm] in hold at `STIFF_AT`."""
+        run = self.run("position 0 mm sin(t)", 16.0, f"{STIFF_FORCE} N sin({2 * math.pi * STIFF_AT!r}t)")
+        late = run.t >= 8.0
+        return STIFF_FORCE / (1e3 * abs(amplitude_at(run.t[late], run["x"][late], STIFF_AT)))
+
+    def bandwidth(self) -> float:
+        """Return the frequency [Hz] from which on small targets are missed by -3 dB of themselves or more."""
+        terms = [f"{1e3 * SMALL_SPEED / (2 * math.pi * f):.6f} mm sin({2 * math.pi * f!r}t)" for f in SMALL_AT]
+        run = self.run(f"position {' + '.join(terms)}", 14.0)
+        late = run.t >= 8.0
+        X = [np.ones(int(late.sum()))]
+        for f in SMALL_AT:
+            X += [np.cos(2 * np.pi * f * run.t[late]), np.sin(2 * np.pi * f * run.t[late])]
+        a = np.linalg.lstsq(np.stack(X, axis=1), run["x"][late], rcond=None)[0]
+        target = SMALL_SPEED / (2 * np.pi * np.array(SMALL_AT))
+        missed = np.hypot(a[1::2], target - a[2::2]) / target
+        beyond = np.flatnonzero(missed > math.sqrt(0.5))
+        if beyond.size == 0 or beyond[0] == 0:
+            return math.inf if beyond.size == 0 else SMALL_AT[0]
+        k = int(beyond[0])
+        share = (math.sqrt(0.5) - missed[k - 1]) / (missed[k] - missed[k - 1])
+        return float(SMALL_AT[k - 1] * (SMALL_AT[k] / SMALL_AT[k - 1]) ** share)
+
+    def efficiencies(self) -> tuple[float, float]:
+        """Return two efficiencies on the duty against a damper alone.
+
+        The damper's work over the electrical energy, and over the hydraulic energy that the cylinder takes: what a
+        supply without losses would give to the valve at its pressure, or the pump to its ports.
+        """
+        run, late = replace(self, values=(("F_l", 0.0), ("d_load", DAMPER))).on_duty()
+        flow = drawn(run) if _rig(self.rig).valve.spool == "present" else run["Q_1"]
+        work = DAMPER * float(np.mean(run["v"][late] ** 2))
+        taken = flow * (run["p_1"] - run["p_2"])
+        return work / float(np.mean((run["V"] * run["i"])[late])), work / float(np.mean(taken[late]))
 
 
 def tracking(run: Trajectory, late: Array) -> tuple[float, float, float]:
@@ -137,64 +165,15 @@ def tracking(run: Trajectory, late: Array) -> tuple[float, float, float]:
     return 1e3 * float(np.sqrt(np.mean(error**2))), float(np.mean(run["V"][late] * run["i"][late])) * CYCLE, flow
 
 
-def drawn(run: Trajectory) -> Array:
-    """Return the flow [m^3/s] that a servo valve without overlap draws from its supply: that of its open edge."""
-    return np.asarray(np.where(run["x_s"] > 0.0, run["Q_A"], -run["Q_B"]))
-
-
-def energies(name: str, lpm: float, rig: str) -> tuple[float, float, float]:
-    """Return the hydraulic energy of a cycle [J] on the duty, and two efficiencies against a damper alone.
-
-    Hydraulic energy: what the pump gives, Q_1 (p_1 - p_2). Efficiency: the damper's work over the electrical energy,
-    and over the hydraulic energy that the cylinder takes: what a supply without losses would give to the valve at its
-    pressure, or the pump to its ports.
-    """
-    run, late = on_duty(name, lpm, rig=rig)
-    given = float(np.mean((run["Q_1"] * (run["p_1"] - run["p_2"]))[late])) * CYCLE
-    damped, late = on_duty(name, lpm, rig=rig, values={"F_l": 0.0, "d_load": DAMPER})
-    dp = damped["p_1"] - damped["p_2"]
-    taken = (drawn(damped) if _rig(rig).valve.spool == "present" else damped["Q_1"]) * dp
-    work = DAMPER * float(np.mean(damped["v"][late] ** 2))
-    electrical = float(np.mean((damped["V"] * damped["i"])[late]))
-    return given, work / electrical, work / float(np.mean(taken[late]))
-
-
-def stiffness(name: str, lpm: float, rig: str = RIG, values: Mapping[str, float | str] | None = None) -> float:
-    """Return |F/x| [N/mm] in hold at `STIFF_AT`."""
-    load = f"{STIFF_FORCE} N sin({2 * math.pi * STIFF_AT!r}t)"
-    run = followed("position 0 mm sin(t)", 16.0, controller_of(name, _rig(rig), lpm), lpm, load, rig, values)
-    late = run.t >= 8.0
-    return STIFF_FORCE / (1e3 * abs(amplitude_at(run.t[late], run["x"][late], STIFF_AT)))
-
-
-def bandwidth(name: str, lpm: float, rig: str = RIG) -> float:
-    """Return the frequency [Hz] from which on small targets are missed by -3 dB of themselves or more."""
-    terms = [f"{1e3 * SMALL_SPEED / (2 * math.pi * f):.6f} mm sin({2 * math.pi * f!r}t)" for f in SMALL_AT]
-    run = followed(f"position {' + '.join(terms)}", 14.0, controller_of(name, _rig(rig), lpm), lpm, "0 N", rig)
-    late = run.t >= 8.0
-    X = [np.ones(int(late.sum()))]
-    for f in SMALL_AT:
-        X += [np.cos(2 * np.pi * f * run.t[late]), np.sin(2 * np.pi * f * run.t[late])]
-    a = np.linalg.lstsq(np.stack(X, axis=1), run["x"][late], rcond=None)[0]
-    target = SMALL_SPEED / (2 * np.pi * np.array(SMALL_AT))
-    missed = np.hypot(a[1::2], target - a[2::2]) / target
-    beyond = np.flatnonzero(missed > math.sqrt(0.5))
-    if beyond.size == 0 or beyond[0] == 0:
-        return math.inf if beyond.size == 0 else SMALL_AT[0]
-    k = int(beyond[0])
-    share = (math.sqrt(0.5) - missed[k - 1]) / (missed[k] - missed[k - 1])
-    return float(SMALL_AT[k - 1] * (SMALL_AT[k] / SMALL_AT[k - 1]) ** share)
-
-
 def controllers_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...]:
     """Tabulate and draw error, bandwidth, energy and stiffness of each controller against the size of the leak."""
     rows: list[tuple[Cell, ...]] = []
-    for name in CONTROLLERS:
-        for lpm in _leaks(context):
-            error, energy, flow = tracking(*on_duty(name, lpm))
-            rows.append((name, lpm, error, bandwidth(name, lpm), energy, stiffness(name, lpm), flow))
+    for name, lpm in itertools.product(CONTROLLERS, _leaks(context)):
+        loop = ControlledRig(name, lpm)
+        error, energy, flow = tracking(*loop.on_duty())
+        rows.append((name, lpm, error, loop.bandwidth(), energy, loop.stiffness(), flow))
     notes = note("controllers", rig=RIG, load=LOAD, mm=1e3 * AMPLITUDE, f=1 / CYCLE)
-    table = ThesisTable(item.id, item.title, COLUMNS, tuple(rows), notes=notes)
+    table = item.table(rows, notes)
     return table, _against_the_leak(table, "Error and stiffness against the leak", _ROLES, (_ERROR, _STIFF))
 
 
@@ -229,19 +208,13 @@ def open_loop_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
         return 60e3 * (middle[1] - middle[0]) / CYCLE
 
     for lpm in _leaks(context):
-        opened = followed(f"{u} sin({OMEGA!r}t + {0.5 * math.pi!r})", 3.0 * CYCLE, None, lpm, "0 N")
+        opened = ControlledRig("", lpm).run(f"{u} sin({OMEGA!r}t + {0.5 * math.pi!r})", 3.0 * CYCLE)
         still = drift(opened, 1) if lpm == 0.0 else still
         late = opened.t >= CYCLE
         size = 1e3 * abs(amplitude_at(opened.t[late], opened["x"][late], 1 / CYCLE))
-        loops = (controller_of(name, _rig(), lpm) for name in ("pi", "fault-tolerant"))
-        closed = [drift(followed(DUTY, 4.0 * CYCLE, loop, lpm, "0 N"), 2) for loop in loops]
+        closed = [drift(ControlledRig(name, lpm).run(DUTY, 4.0 * CYCLE), 2) for name in ("pi", "fault-tolerant")]
         rows.append((lpm, size, drift(opened, 1), drift(opened, 1) - still, *closed))
-    heads = (
-        *("leak [L/min]", "open: amplitude [mm]", "open: drift [mm/min]", "open: drift by the leak [mm/min]"),
-        *("pi: drift [mm/min]", "fault-tolerant: drift [mm/min]"),
-    )
-    notes = note("open-loop", rig=RIG, load=LOAD, u=u)
-    return (ThesisTable(item.id, item.title, heads, tuple(rows), notes=notes),)
+    return (item.table(rows, note("open-loop", rig=RIG, load=LOAD, u=u)),)
 
 
 def _cycle_of(t: Array, k: int) -> Array:
@@ -250,32 +223,32 @@ def _cycle_of(t: Array, k: int) -> Array:
 
 def load_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate the error on the duty against the load, without a leak and with the middle one."""
-    cases = [(name, lpm) for name in ("pi", "flatness", "fault-tolerant") for lpm in (0.0, 0.05)]
+    loops = [ControlledRig(name, lpm) for name in ("pi", "flatness", "fault-tolerant") for lpm in (0.0, 0.05)]
     heads = ["load [N]"]
-    for name, lpm in cases:
-        heads += [f"{name}, {lpm:g} L/min: {what}" for what in (_ERROR, "energy a cycle [J]")]
+    for loop in loops:
+        heads += [f"{loop.controller}, {loop.lpm:g} L/min: {what}" for what in (_ERROR, "energy a cycle [J]")]
     rows = []
     for force in (0.0, 2000.0) if context.quick else (0.0, 500.0, 1000.0, 2000.0):
-        pairs = (tracking(*on_duty(name, lpm, f"{force - LOAD!r} N"))[:2] for name, lpm in cases)
+        pairs = (tracking(*loop.on_duty(f"{force - LOAD!r} N"))[:2] for loop in loops)
         rows.append((force, *itertools.chain.from_iterable(pairs)))
-    return (ThesisTable(item.id, item.title, tuple(heads), tuple(rows), notes=note("load")),)
+    return (item.table(rows, note("load"), heads),)
 
 
 def outside_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate tracking and stiffness where oil leaves the circuit past a rod seal of either side."""
-    healthy, late = on_duty("pi", 0.0)
+    healthy, late = ControlledRig("pi", 0.0).on_duty()
     pressure = {side: float(np.mean(healthy[f"p_{side}"][late])) for side in ("A", "B")}
     names, leaks = (CONTROLLERS[:1], (0.5,)) if context.quick else (CONTROLLERS[:4], LEAKS[1:])
     rows: list[tuple[Cell, ...]] = []
     for side, name, lpm in itertools.product(pressure, names, leaks):
-        values = {f"G_ext_{side}": lpm * LITRE_PER_MINUTE / pressure[side]}
-        run, late = on_duty(name, 0.0, values=values)
+        loop = ControlledRig(name, 0.0, values=((f"G_ext_{side}", lpm * LITRE_PER_MINUTE / pressure[side]),))
+        run, late = loop.on_duty()
         lower = np.minimum(run["p_A"], run["p_B"])
         third, fifth = (1e-3 * float(np.mean(lower[_cycle_of(run.t, k)])) for k in (2, 4))
         error, _, flow = tracking(run, late)
-        rows.append((side, name, lpm, error, stiffness(name, 0.0, values=values), flow, fifth - third))
+        rows.append((side, name, lpm, error, loop.stiffness(), flow, fifth - third))
     notes = note("outside", rig=RIG, load=LOAD, A=1e-6 * pressure["A"], B=1e-6 * pressure["B"])
-    return (ThesisTable(item.id, item.title, OUTSIDE_COLUMNS, tuple(rows), notes=notes),)
+    return (item.table(rows, notes),)
 
 
 def valve_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...]:
@@ -283,14 +256,15 @@ def valve_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...
     rigs = {"pump": RIG, "valve": VALVE_RIG}
     rows: list[tuple[Cell, ...]] = []
     for (source, rig), name, lpm in itertools.product(rigs.items(), VALVE_CONTROLLERS, _leaks(context)):
-        error, energy, _ = tracking(*on_duty(name, lpm, rig=rig))
-        given, efficiency, taken = energies(name, lpm, rig)
-        loop = bandwidth(name, lpm, rig), stiffness(name, lpm, rig)
-        rows.append((source, name, lpm, error, *loop, energy, given, 100 * efficiency, 100 * taken))
+        loop = ControlledRig(name, lpm, rig)
+        run, late = loop.on_duty()
+        error, energy, _ = tracking(run, late)
+        given = float(np.mean((run["Q_1"] * (run["p_1"] - run["p_2"]))[late])) * CYCLE  # by the pump
+        efficiencies = [100 * of for of in loop.efficiencies()]
+        rows.append((source, name, lpm, error, loop.bandwidth(), loop.stiffness(), energy, given, *efficiencies))
     notes = note("valve", rig=RIG, other=VALVE_RIG, mm=1e3 * AMPLITUDE, f=1 / CYCLE, load=LOAD, damper=DAMPER)
-    table = ThesisTable(item.id, item.title, VALVE_COLUMNS, tuple(rows), notes=notes)
-    shown = ("electrical energy a cycle [J]", _STIFF)
-    return table, _against_the_leak(table, "Energy and stiffness, pump and valve", _VALVE_ROLES, shown, log_y=True)
+    table, title = item.table(rows, notes), "Energy and stiffness, pump and valve"
+    return table, _against_the_leak(table, title, _VALVE_ROLES, (_ENERGY, _STIFF), log_y=True)
 
 
 def _rows(context: Context, item: str, names: int) -> dict[tuple[str, ...], dict[float, list[float]]]:
@@ -345,14 +319,3 @@ def _valves(context: Context) -> Claim:
     tests = [max(ends) > APART * min(ends) for ends in ((pump[0.0][k], valve[0.0][k]) for k in (5, 0))]
     worn = pump[largest], valve[largest]
     return judged("6.2.4", tests, pump=pump[0.0], valve=valve[0.0], largest=largest, worn=worn)
-
-
-_NEEDS = tuple(f"sec-6.2-{name}" for name in ("open-loop", "controllers", "load", "valve"))
-ITEMS: tuple[Item, ...] = (
-    Item("sec-6.2-open-loop", 6, "table", "The piston's drift with a leak: open loop and closed loop", open_loop_table),
-    Item("sec-6.2-controllers", 6, "table", "Controllers against the size of the leak", controllers_table),
-    Item("sec-6.2-load", 6, "table", "Tracking and energy against the load on the cylinder", load_table),
-    Item("sec-6.2-outside", 6, "table", "Controllers against oil that leaves past a rod seal", outside_table),
-    Item("sec-6.2-valve", 6, "table", "Pump-controlled against valve-controlled", valve_table),
-    Item("chapter-6-claims", 6, "claims", "What section 6.2 expects", judge_claims, needs=_NEEDS),
-)

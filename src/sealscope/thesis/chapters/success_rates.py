@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,8 +13,8 @@ from sealscope.thesis.chapters.appendix_c_runs import simulated_sheet
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, ThesisTable
+from sealscope.thesis.engine.texts import note, texts_of
 from sealscope.thesis.sheet import COLUMNS, DataSheet
-from sealscope.thesis.texts import note
 
 #: The direction in which each chamber's RMS is said to move when a leak opens, section 5.6.
 DIRECTION: Mapping[str, int] = {"p_A": -1, "p_B": 1}
@@ -34,7 +34,7 @@ class Rule:
     """
 
     name: str
-    details: tuple[tuple[str, str], ...]
+    details: Sequence[tuple[str, str]]
     printed: str = ""
 
     def fires(self, sheet: DataSheet) -> Fires:
@@ -43,18 +43,12 @@ class Rule:
         return np.asarray(np.all(moved, axis=0))
 
 
-def _rule(chamber: str, detail: str, printed: str = "") -> Rule:
-    return Rule(f"P_{chamber} {detail} {'down' if chamber == 'A' else 'up'}", ((f"p_{chamber}", detail),), printed)
+def _rules(name: str) -> tuple[Rule, ...]:
+    return tuple(Rule(*row) for row in texts_of("cases.toml")[name])
 
 
-#: The six cells of Table 5.1 and the cumulative one.
-CLAIMED: tuple[Rule, ...] = (
-    *(_rule("A", *cell) for cell in (("d3", "100"), ("d4", "64 (65 in the text)"), ("d3d4", "85"))),
-    *(_rule("B", *cell) for cell in (("d3", "48"), ("d4", "76"), ("d3d4", "76"))),
-    Rule("both d3d4", (("p_A", "d3d4"), ("p_B", "d3d4")), "65"),
-)
-#: The columns of Appendix C that Table 5.1 leaves out.
-UNCLAIMED: tuple[Rule, ...] = tuple(_rule(chamber, detail) for chamber in "AB" for detail in ("d1", "d2"))
+#: The six cells of Table 5.1 and the cumulative one; and the columns of Appendix C that the table leaves out.
+CLAIMED, UNCLAIMED = _rules("claimed"), _rules("unclaimed")
 
 
 def _counted(fires: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
@@ -154,30 +148,14 @@ def thresholds(measured: DataSheet | None, leak: DataSheet, drift: DataSheet) ->
 def table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate Table 5.1 with its controls, the sign tests of every column, and the rules with a threshold."""
     (leak_runs, leak), (_, still), (_, drift) = (simulated_sheet(context, of) for of in ("leak", "no-leak", "drift"))
-    measured = context.sheet
+    measured, resolved = context.sheet, leak_runs.resolved
     sheets = dict(zip(_SOURCES, (measured, leak, still, drift), strict=True))
     tests = [(name, *row) for name, sheet in sheets.items() if sheet is not None for row in column_tests(sheet)]
-    none = "" if measured else " No measured sheet was given."
-    tables = {
-        ("", item.title, RATES): (
-            counts(measured, leak, still, drift),
-            note("rates", none=none, runs=leak_runs.notes),
-        ),
-        ("-columns", "Sign tests of every column of Appendix C", TESTS): (
-            tests,
-            note("column-tests"),
-        ),
-        ("-thresholds", f"The rules of Table 5.1 set for {100 * FALSE_ALARMS:g} % false alarms", THRESHOLDS): (
-            thresholds(measured, leak, drift),
-            note("thresholds"),
-        ),
-    }
-    return tuple(
-        ThesisTable(f"{item.id}{tail}", title, heads, tuple(rows), resolved=leak_runs.resolved, notes=notes)
-        for (tail, title, heads), (rows, notes) in tables.items()
+    notes = note("rates", none="" if measured else " No measured sheet was given.", runs=leak_runs.notes)
+    of_columns, set_for = "Sign tests of every column of Appendix C", f"{100 * FALSE_ALARMS:g} % false alarms"
+    limits, title = thresholds(measured, leak, drift), f"The rules of Table 5.1 set for {set_for}"
+    return (
+        item.table(counts(measured, leak, still, drift), notes, RATES, resolved=resolved),
+        item.table(tests, note("column-tests"), TESTS, tail="-columns", title=of_columns, resolved=resolved),
+        item.table(limits, note("thresholds"), THRESHOLDS, tail="-thresholds", title=title, resolved=resolved),
     )
-
-
-_TITLE = "Success rates of Table 5.1, counted anew, with intervals and false alarms"
-_NEEDS = ("appendix-c-leak", "appendix-c-no-leak", "appendix-c-drift")
-ITEMS: tuple[Item, ...] = (Item("table-5.1", 5, "table", _TITLE, table, uses_sheet=True, needs=_NEEDS),)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from dataclasses import astuple, replace
 from typing import get_args
 
 from sealscope.thesis.claims import rig, sheet
@@ -16,13 +17,7 @@ from sealscope.thesis.engine.products import Claim, ThesisTable, Verdict
 def detection(context: Context, item: Item) -> tuple[Claim, ...]:
     """Judge the claims of the abstract and of chapters 1, 5 and 6, in the thesis's order."""
     evidence = gather(context)
-    claims = (
-        *sheet.levels(),
-        *sheet.claims(evidence),
-        *sheet.curves(evidence),
-        sheet.consistent(evidence),
-        *rig.claims(evidence),
-    )
+    claims = (*sheet.levels(), *sheet.claims(evidence), *sheet.curves(evidence), *rig.claims(evidence))
     return tuple(sorted(claims, key=_place))
 
 
@@ -36,34 +31,10 @@ def table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     claims = [product for name in item.needs for product in context.product(name) if isinstance(product, Claim)]
     claims.sort(key=_place)
     verdicts = Counter(claim.verdict for claim in claims)
-    rows = tuple((c.id, c.where, c.claim, c.sheet, c.simulation, c.verdict, c.why) for c in claims)
-    heads = ("id", "where", "claim", "what the sheet says", "what the simulation says", "verdict", "why")
+    rows = map(astuple, claims)
     missing = "" if context.sheet else " The data sheet was not given: claims that rest on it could not be tested."
     notes = f"Claims in our own words. A claim holds where every part of it does.{missing}"
-    counts = tuple((verdict, verdicts.get(verdict, 0)) for verdict in get_args(Verdict))
-    return (
-        ThesisTable(item.id, item.title, heads, rows, claims=tuple(claim.id for claim in claims), notes=notes),
-        ThesisTable(f"{item.id}-verdicts", "How many claims have each verdict", ("verdict", "claims"), counts),
-    )
-
-
-ITEMS: tuple[Item, ...] = (
-    Item(
-        "detection-claims",
-        6,
-        "claims",
-        "What the abstract and chapters 1, 5 and 6 claim",
-        detection,
-        uses_sheet=True,
-        needs=("appendix-c-leak", "appendix-c-no-leak", "appendix-c-drift"),
-    ),
-    Item(
-        "claims",
-        6,
-        "table",
-        "Every claim of the thesis and its verdict",
-        table,
-        uses_sheet=True,
-        needs=("chapter-3-claims", "chapter-4-claims", "detection-claims", "chapter-6-claims"),
-    ),
-)
+    counts = ((verdict, verdicts[verdict]) for verdict in get_args(Verdict))
+    title, heads = "How many claims have each verdict", ("verdict", "claims")
+    listed = replace(item.table(rows, notes), claims=tuple(claim.id for claim in claims))
+    return listed, item.table(counts, "", heads, tail="-verdicts", title=title)

@@ -19,8 +19,8 @@ from sealscope.thesis.chapters.chapter5 import TESTS, ShownMeasures, measure_tes
 from sealscope.thesis.chapters.success_rates import DIRECTION, Rule, column_tests
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.products import Claim, ThesisTable
+from sealscope.thesis.engine.texts import judged
 from sealscope.thesis.sheet import APPENDIX_C, DataSheet
-from sealscope.thesis.texts import judged
 
 if TYPE_CHECKING:
     from sealscope.campaigns.held_out.classifiers import MeasuredSamples

@@ -12,8 +12,8 @@ from sealscope.thesis.chapters.appendix_c_runs import column
 from sealscope.thesis.chapters.success_rates import CLAIMED
 from sealscope.thesis.claims.evidence import NO_SHEET, ClaimEvidence, counted_share, fired
 from sealscope.thesis.engine.products import Claim
+from sealscope.thesis.engine.texts import judged
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG
-from sealscope.thesis.texts import judged
 
 #: How near an estimated onset must come [s].
 _NEAR = 10.0
@@ -87,7 +87,7 @@ def _shown(evidence: ClaimEvidence) -> Iterator[Claim]:
     yield judged("5.7.3", [abs(_change(ranges[c])) > 5.0 for c in CHAMBERS], ranges=", ".join(texts))
     texts, parts = [], []
     for chamber in CHAMBERS:
-        errors = [abs(test.step_s[chamber] - test.onset_s) for test in tests.values()]
+        errors = [abs(test.step_s[chamber] - test.test.half) for test in tests.values()]
         near = [error <= _NEAR for error in errors]
         texts.append(
             f"{chamber}: {counted_share(near)}, median error {np.median(errors):.0f} s, worst {max(errors):.0f} s"

@@ -6,7 +6,6 @@ import itertools
 import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -31,8 +30,8 @@ from sealscope.thesis.claims.evidence import (
     moves_beyond_chance,
 )
 from sealscope.thesis.engine.products import Claim
+from sealscope.thesis.engine.texts import judged, texts_of
 from sealscope.thesis.sheet import APPENDIX_C, DataSheet, mean_leaks
-from sealscope.thesis.texts import judged
 
 _N = len(APPENDIX_C)
 _A_D3, _, _A_BOTH, _, _, _B_BOTH, _TOGETHER = CLAIMED
@@ -191,9 +190,19 @@ def _upward(sheet: DataSheet) -> Iterator[Finding]:
         yield f"{name} up in {up} (p = {p['p_B', name]:.2g})", [moves_beyond_chance(sheet, "p_B", name)]
 
 
+def _consistent(sheet: DataSheet) -> Iterator[Finding]:
+    for chamber, verb in (("p_A", "falls"), ("p_B", "rises")):
+        for name in SENSITIVE:
+            moves = sheet.log_change(chamber, name)[_SHOWN_ROWS] * DIRECTION[chamber] > 0
+            yield f"{name} of {chamber} {verb} in {int(moves.sum())}", [bool(np.all(moves))]
+
+
+#: Rows of the sheet that chapter 5 shows.
+_SHOWN_ROWS = sorted({test.condition.number - 1 for test in TESTS.values()})
 _SMALLEST = f"the {mean_leaks().min():g} L/min test: "
 _CORRELATION = "correlation of the change with the mean leak: "
 _CLAIMS: dict[str, SheetClaim] = {
+    "5.3.1": SheetClaim(_consistent, f"of the {len(_SHOWN_ROWS)} rows: ", ", "),
     "a.1": SheetClaim(_identified, values=_without_baseline),
     "a.2": SheetClaim(_abstract_85, _SMALLEST),
     "5.5.7": SheetClaim(_before_table, f"tests as the sentence says, of {_N}: ", ", "),
@@ -221,19 +230,6 @@ def claims(evidence: ClaimEvidence) -> Iterator[Claim]:
 
 #: What is said of a chamber's curves: that they fall, or only that they change.
 Statement = Literal["fall", "change"]
-
-#: Section, chamber, details named, and what is said of them.
-CURVES: tuple[tuple[str, str, tuple[str, ...], Statement], ...] = (
-    ("5.2a", "p_A", SENSITIVE, "change"),
-    ("5.2a", "p_B", ("d4", "d3d4"), "change"),
-    ("5.2b", "p_A", SENSITIVE, "fall"),
-    ("5.2b", "p_B", ("d3d4",), "change"),
-    ("5.3a", "p_A", SENSITIVE, "fall"),
-    ("5.3a", "p_B", SENSITIVE, "change"),
-    ("5.3b", "p_A", ("d3", "d3d4"), "change"),
-    ("5.3b", "p_B", ("d4", "d3d4"), "change"),
-    *((section, chamber, SENSITIVE, "change") for section in list(TESTS)[4:] for chamber in CHAMBERS),
-)
 
 
 def levels() -> Iterator[Claim]:
@@ -276,7 +272,7 @@ def _on_rows(
 
 def curves(evidence: ClaimEvidence) -> Iterator[Claim]:
     """Judge a claim for each chamber of each test."""
-    for number, (section, chamber, names, statement) in enumerate(CURVES, start=1):
+    for number, (section, chamber, names, statement) in enumerate(texts_of("cases.toml")["curves"], start=1):
         test, rms = TESTS[section], evidence.shown[section].rms[chamber]
         limits = (DIRECTION[chamber] * drift_threshold(evidence.drift, chamber, name) for name in names)
         parts: list[bool] = []
@@ -286,7 +282,7 @@ def curves(evidence: ClaimEvidence) -> Iterator[Claim]:
         beyond = [name for name, part in zip(names, parts, strict=False) if part]
         sides = {"beyond": beyond, "within": [name for name in names if name not in beyond]}
         first = test.first + test.inputs + 2 + (0 if chamber == "p_A" else 3)  # the details; their RMS two on
-        claim = judged(
+        yield judged(
             f"5.2.{number}",
             parts,
             "5.2",
@@ -302,22 +298,9 @@ def curves(evidence: ClaimEvidence) -> Iterator[Claim]:
             simulated=", ".join(f"{name} {100 * (rms[name][1] / rms[name][0] - 1):+.1f} %" for name in names),
             limits=", ".join(f"{in_percent(limit):+.1f} %" for limit in limits),
             beyond_or_within=" and ".join(f"{_and(of)} {side}" for side, of in sides.items() if of),
+            **({} if parts else {"why": NO_SHEET}),
         )
-        yield claim if parts else replace(claim, why=NO_SHEET)
 
 
 def _and(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
-
-
-def consistent(evidence: ClaimEvidence) -> Claim:
-    """Judge whether the ten shown tests go the way that section 5.6 says all do."""
-    rows = sorted({evidence.shown[section].test.condition.number - 1 for section in TESTS})
-
-    def test(sheet: DataSheet) -> Iterator[Finding]:
-        for chamber, verb in (("p_A", "falls"), ("p_B", "rises")):
-            for name in SENSITIVE:
-                moves = sheet.log_change(chamber, name)[rows] * DIRECTION[chamber] > 0
-                yield f"{name} of {chamber} {verb} in {int(moves.sum())}", [bool(np.all(moves))]
-
-    return SheetClaim(test, f"of the {len(rows)} rows: ", ", ").judge(evidence, "5.3.1")

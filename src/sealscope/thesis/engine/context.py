@@ -63,6 +63,13 @@ class SimulatedRun:
     proof: Mapping[str, float] = field(default_factory=dict)
     diverged: str = ""
 
+    @property
+    def recorded(self) -> Recording:
+        """The recording; raises SimulationFailed with the reason where there is none."""
+        if self.recording is None:
+            raise SimulationFailed(self.diverged)
+        return self.recording
+
 
 def simulated_run(spec: RunSpec) -> SimulatedRun:
     """Simulate a run, with its halving test where it is asked for."""

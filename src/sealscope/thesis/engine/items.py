@@ -1,31 +1,20 @@
-"""The list of cases, figures, tables and claims under the thesis's own numbers, and how each is made."""
+"""The list of cases, figures, tables and claims under the thesis's own numbers (`items.toml`), and how each is made."""
 
 from __future__ import annotations
 
 import importlib
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from fnmatch import fnmatchcase
+from functools import cache
 from typing import Any, Literal
 
 from sealscope.calls import nearest
 from sealscope.errors import InputError
 from sealscope.thesis.engine.context import Context, Products
-
-#: Modules that list `ITEMS`, in the order of the thesis.
-MODULES = (
-    "chapters.chapter3",
-    "chapters.chapter4.figures",
-    "chapters.chapter4.claims",
-    "chapters.chapter5",
-    "chapters.appendix_c_runs",
-    "chapters.appendix_c",
-    "identification",
-    "chapters.success_rates",
-    "claims.detection",
-    "chapters.chapter6",
-)
+from sealscope.thesis.engine.products import Cell, Figure, Number, Panel, ThesisTable
+from sealscope.thesis.engine.texts import texts_of
 
 
 @dataclass(frozen=True)
@@ -34,7 +23,8 @@ class Item:
 
     `id`: the thesis's own number, such as "fig-4.22"; `make`: the function that makes its products; `inputs`: what the
     maker reads, by name; `uses_sheet`: it shows the thesis's data sheet where that is given, `needs_sheet`: it cannot
-    be made without; `needs`: ids of the items whose products the maker asks for.
+    be made without; `needs`: ids of the items whose products the maker asks for; `claims` that it bears on; `columns`
+    of its table.
     """
 
     id: str
@@ -46,12 +36,58 @@ class Item:
     needs_sheet: bool = False
     uses_sheet: bool = False
     needs: tuple[str, ...] = ()
+    claims: tuple[str, ...] = ()
+    columns: tuple[str, ...] = ()
+
+    def figure(
+        self, panels: Iterable[Panel], numbers: Iterable[Number] = (), resolved: bool | None = None, notes: str = ""
+    ) -> Figure:
+        """Return the item's figure of these panels."""
+        return Figure(self.id, self.title, tuple(panels), tuple(numbers), self.claims, resolved, notes)
+
+    def table(
+        self,
+        rows: Iterable[tuple[Cell, ...]],
+        notes: str = "",
+        columns: Iterable[str] = (),
+        *,
+        tail: str = "",
+        title: str = "",
+        resolved: bool | None = None,
+    ) -> ThesisTable:
+        """Return the item's table of these rows; `tail`, `title`, `columns` of a further one beside it."""
+        heads = tuple(columns) or self.columns
+        return ThesisTable(
+            self.id + tail, title or self.title, heads, tuple(rows), self.claims, resolved=resolved, notes=notes
+        )
 
 
+_FIELDS = {of.name for of in fields(Item)}
+
+
+@cache
 def collect() -> tuple[Item, ...]:
-    """Collect the items of all modules, by chapter, in the modules' order within a chapter."""
-    modules = [importlib.import_module(f"sealscope.thesis.{name}") for name in MODULES]
-    return tuple(sorted((item for module in modules for item in module.ITEMS), key=lambda item: item.chapter))
+    """Return the items of `items.toml`, in its order."""
+    return tuple(
+        item for chapter, rows in texts_of("items.toml").items() for name, row in rows.items()
+        for item in _items(name, int(chapter), row)
+    )  # fmt: skip
+
+
+def _items(name: str, chapter: int, row: Mapping[str, Any]) -> Iterator[Item]:
+    """Yield the item of a row, or each that the function named by `each` gives as id, title and inputs."""
+    given: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in row.items()}
+    known: dict[str, Any] = {key: given.pop(key) for key in row if key in _FIELDS}
+    known["make"] = _function(known["make"])
+    known["claims"] = tuple(f"claim-{claim}" for claim in known.get("claims", ()))
+    each = _function(given["each"])() if "each" in given else [(name, known.pop("title"), given)]
+    for id, title, inputs in each:
+        yield Item(**{"kind": "figure", "chapter": chapter, **known, "id": id, "title": title, "inputs": inputs})
+
+
+def _function(name: str) -> Any:
+    module, _, function = name.rpartition(".")
+    return getattr(importlib.import_module(f"sealscope.thesis.{module}"), function)
 
 
 def select_items(items: Sequence[Item], patterns: Sequence[str]) -> tuple[Item, ...]:

@@ -122,12 +122,10 @@ def verdict_of(tests: Iterable[bool | None]) -> Verdict:
     `holds` where every test passed, `does not hold` where none did, `holds in part` between; tests that could not be
     made (None) do not count, and without any other the claim `cannot be tested`.
     """
-    results = [bool(test) for test in tests if test is not None]
-    if not results:
-        return "cannot be tested"
-    if all(results):
-        return "holds"
-    return "holds in part" if any(results) else "does not hold"
+    results = {bool(test) for test in tests if test is not None}
+    if len(results) == 1:
+        return "holds" if True in results else "does not hold"
+    return "holds in part" if results else "cannot be tested"
 
 
 def thinned(x: Array, y: Array, most: int = 4000) -> tuple[Array, Array]:

@@ -1,9 +1,7 @@
-"""Leakage from both chamber pressures and the command, without a position: the response or the ring, judged.
+"""Leakage from both chamber pressures and the command, without a position: the whole response, judged.
 
-The response is the hypothesis of the machine with the laws of the rig (`response`); where no parameters of it simulate
-the recording, the ring alone is asked (`ring_down`), which knows no laws but a damped oscillation's. The questions are
-those of `inference.decision`: did the conductance step within the recording, beside what else may have stepped, and is
-its level above that of healthy recordings?
+The questions are those of `inference.decision`: did the conductance step within the recording, beside what else may
+have stepped, and is its level above that of healthy recordings?
 """
 
 from __future__ import annotations
@@ -15,11 +13,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.diagnosis.beliefs import beliefs
-from sealscope.diagnosis.inference.causes import StepHypothesis, probabilities
-from sealscope.diagnosis.inference.causes import stepped as stepped_cause
 from sealscope.diagnosis.inference.decision import WITHIN, Question, asked, is_leak, questions
 from sealscope.diagnosis.inference.onset import StepTest, course, two_sided
-from sealscope.diagnosis.inference.pressures import response, ring_down
+from sealscope.diagnosis.inference.other_steps.causes import StepHypothesis, probabilities
+from sealscope.diagnosis.inference.other_steps.causes import stepped as stepped_cause
+from sealscope.diagnosis.inference.pressures import response
 from sealscope.diagnosis.inference.pressures.evidence import BELIEVED, PressureEvidence, flow_scale, unusable
 from sealscope.diagnosis.inference.scatter import Rise, student
 from sealscope.diagnosis.learnt import Healthy, Lesson, lessons_of
@@ -55,31 +53,30 @@ class PressureResponse:
         return unusable(recording, self.rig)
 
     def reading(self, recording: Recording) -> PressureEvidence | None:
-        """Return what a recording says of the conductance, by the response or the ring; None where it says nothing."""
-        own = response.evidence(recording, self.rig)
-        return ring_down.evidence(recording, self.rig) if own is None else own
+        """Return what a recording says of the conductance; None where it says nothing."""
+        return response.evidence(recording, self.rig)
 
     def learn(self, recording: Recording) -> Lesson | None:
-        """Return what a healthy recording teaches: the level of the conductance, and by which provider."""
+        """Return what a healthy recording teaches: the level of the conductance."""
         own = self.reading(recording)
-        return None if own is None else {"by": own.by, "level": own.level[0]}
+        return None if own is None else {"level": own.level[0]}
 
     def examine(self, recording: Recording, baseline: Sequence[Healthy], false_alarm_probability: float) -> Evidence:
         """Return the evidence of a step of the conductance, and of its rise against the baseline."""
         own = self.reading(recording)
         if own is None:
             return Evidence("cannot tell", "no response to the command that a pump-driven piston would give")
-        levels = [lesson["level"] for lesson in lessons_of(self, baseline) if lesson["by"] == own.by]
+        levels = [lesson["level"] for lesson in lessons_of(self, baseline)]
         whole = 1.0 if recording.bridged is None else float(np.mean(~recording.bridged))
         return replace(judge(own, false_alarm_probability, levels), share=whole)
 
 
 def hypotheses(own: PressureEvidence) -> tuple[StepHypothesis, ...]:
-    """Return tests of all that may have stepped, the most likely first; the ring tells no leak from friction."""
+    """Return tests of all that may have stepped, the most likely first."""
     if own.test is None:
         return ()
     tests: dict[str, StepTest | None] = {"G": own.test}
-    tests |= {name: two_sided(information) for name, information in own.others.items()} or {"F_v": own.test}
+    tests |= {name: two_sided(information) for name, information in own.others.items()}
     tested = (StepHypothesis(name, CAUSES[name], test) for name, test in tests.items() if test is not None)
     return tuple(sorted(tested, key=lambda each: -each.score))
 
@@ -108,7 +105,7 @@ def judge(own: PressureEvidence, probability: float, levels: Sequence[float] = (
 
 
 def _rise(own: PressureEvidence, levels: Sequence[float]) -> Rise:
-    """Return how far the level of g is above those of healthy recordings by the same provider."""
+    """Return how far the level of g is above those of healthy recordings."""
     total, count = sum(levels), len(levels)
     apart = [level - (total - level) / (count - 1) for level in levels] if count > 1 else [0.0]
     return student(own.level[0] - total / count, apart, BELIEVED["conductance"]["level"])

@@ -1,4 +1,4 @@
-"""What the providers of evidence from pressures and command share: blocks, lines of the mains, and their result."""
+"""Evidence from pressures and command: blocks, lines of the mains, and what blocks say of the conductance."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import FEWEST, Information, StepTest, step_test
+from sealscope.recordings.quality import mostly_clipped
 from sealscope.recordings.recording import Array, Recording
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 BELIEVED = beliefs("inference.pressures")
-Provider = Literal["response", "ring"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,8 +29,6 @@ class PressureEvidence:
 
     Parameters
     ----------
-    by : {"response", "ring"}
-        The provider.
     information : Information
         What K blocks say of g, all nuisance parameters eliminated.
     pressure : array of float, shape (K,)
@@ -43,7 +41,6 @@ class PressureEvidence:
         What they say of other parameters that may have stepped, by name.
     """
 
-    by: Provider
     information: Information
     pressure: Array
     pump: float
@@ -51,14 +48,14 @@ class PressureEvidence:
     others: Mapping[str, Information] = field(default_factory=dict)
 
     @staticmethod
-    def of(by: Provider, recording: Recording, rig: Rig, said: Mapping[str, Information]) -> PressureEvidence:
+    def of(recording: Recording, rig: Rig, said: Mapping[str, Information]) -> PressureEvidence:
         """Return it from what the blocks of a recording say of parameters, `said["G"]` of g."""
         edges, dp = block_edges(recording), np.abs(recording["p_A"] - recording["p_B"])
         pressure = np.add.reduceat(dp, edges[:-1]) / np.diff(edges)
         speed = rig.motor.omega_per_volt * float(np.mean(np.abs(recording["u"])))
         others = {name: own for name, own in said.items() if name != "G"}
         pump = speed * rig.pump.q_b / (2.0 * np.pi)
-        return PressureEvidence(by, said["G"], pressure, pump, states_flow(rig), others)
+        return PressureEvidence(said["G"], pressure, pump, states_flow(rig), others)
 
     @cached_property
     def test(self) -> StepTest | None:
@@ -74,7 +71,7 @@ class PressureEvidence:
     @property
     def orifice(self) -> float:
         """Mean flow over g times `pressure` of an orifice; that of a worn seal is 1."""
-        return float(BELIEVED["conductance"][f"orifice_{self.by}"])
+        return float(BELIEVED["conductance"]["orifice"])
 
     def flow(self, step: float, deviation: float) -> tuple[float, tuple[float, float]]:
         """Return the mean flow [L/min] of a step of g [m^3/(s Pa)] with its `deviation`, and the 95 % interval.
@@ -127,6 +124,8 @@ def unusable(recording: Recording, rig: Rig) -> str | None:
     for name in ("u", "p_A", "p_B"):
         if not np.all(np.isfinite(recording[name])) or not np.ptp(recording[name]) > 0.0:
             return f"{name} is constant or has missing samples"
+        if name != "u" and mostly_clipped(recording[name]):
+            return f"{name} is mostly cut off at an end of its range"
     return None
 
 

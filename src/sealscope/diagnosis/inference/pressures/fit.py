@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from sealscope.diagnosis.beliefs import beliefs as believed_of
@@ -122,35 +121,28 @@ def descend(model: Model, look: Look, belief: Normal, steps: int, variance: floa
 
 
 class Block(NamedTuple):
-    """A block's sums about its own parameters `theta` (p,), `kinds` (p,) of those of the beliefs.
+    """A block's sums about its own parameters `theta` (p,).
 
     `gram` (1 + p, 1 + p) of residual and Jacobian over so many `samples`; `scores` (s, 1 + p): in each of s pieces the
     products of the column of the parameter in question with them, which show how far the residual is from white.
     """
 
     theta: Array
-    kinds: NDArray[np.int64]
     gram: Array
     samples: float
     scores: Array
 
-    @property
-    def squares(self) -> float:
-        """Squares of the residual [Pa^2]."""
-        return float(self.gram[0, 0])
-
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """All K blocks of a recording together: the parameters' `mean` (P,) and `covariance` (P, P) about `theta` (P,).
+    """All K blocks of a recording together: deviations' `mean` (K p,) and `covariance` (K p, K p) about `theta` (K, p).
 
-    In units, a block's after another's; `kinds` (P,); `strain` (P, P): precision of what is believed of them;
-    `variance` of the residual [Pa^2].
+    In units, a block's after another's; `strain` (K p, K p): precision of what is believed of them; `variance` of the
+    residual [Pa^2].
     """
 
     beliefs: Beliefs
     theta: Array
-    kinds: NDArray[np.int64]
     mean: Array
     covariance: Array
     strain: Array
@@ -159,9 +151,9 @@ class Joint:
     @staticmethod
     def of(blocks: Sequence[Block], beliefs: Beliefs, seconds: float, asked: int) -> Joint:
         """Return it for blocks of so many seconds; the noise has its long-run variance in the score of `asked`."""
-        theta, kinds = (np.concatenate([getattr(block, name) for block in blocks]) for name in ("theta", "kinds"))
-        strain = strain_of([block.kinds for block in blocks], beliefs, seconds)
-        pull = strain @ ((theta - beliefs.centre[kinds]) / beliefs.unit[kinds])
+        theta = np.array([block.theta for block in blocks])
+        strain = _strain(len(blocks), beliefs, seconds)
+        pull = strain @ ((theta - beliefs.centre) / beliefs.unit).ravel()
         normal = block_diag(*(block.gram[1:, 1:] for block in blocks))
         vector = np.concatenate([block.gram[0, 1:] for block in blocks])
         white, inflation = _noise(blocks, np.zeros(theta.size), asked)[0], 1.0
@@ -170,45 +162,34 @@ class Joint:
             mean = cho_solve(factor, vector / (white * inflation) - pull, check_finite=False)
             white, inflation = _noise(blocks, mean, asked)
         covariance = cho_solve(factor, np.eye(theta.size), check_finite=False)
-        return Joint(beliefs, theta, kinds, mean, covariance, strain, white)
-
-    @property
-    def parameters(self) -> Array:
-        """The likeliest parameters (P,)."""
-        return np.asarray(self.theta + self.mean * self.beliefs.unit[self.kinds])
+        return Joint(beliefs, theta, mean, covariance, strain, white)
 
     def information(self, parameter: int, time: Array, reach: float) -> Information:
-        """Return what the blocks at `time` (K,) [s] say of a parameter that all have, all others eliminated.
+        """Return what the blocks at `time` (K,) [s] say of a parameter, all others eliminated.
 
         What is believed of the parameter itself, which guided the fit, is taken out; that it wanders evenly or as a
         random walk, by `reach` over all blocks, is stated beside.
         """
-        own = np.flatnonzero(self.kinds == parameter)
-        inverse = np.linalg.inv(self.covariance[np.ix_(own, own)])
-        believed, unit = self.strain[np.ix_(own, own)], self.beliefs.unit[parameter]
-        at, precision = self.theta[own] / unit, inverse - believed
+        own = slice(parameter, None, self.theta.shape[1])
+        inverse = np.linalg.inv(self.covariance[own, own])
+        believed, unit = self.strain[own, own], self.beliefs.unit[parameter]
+        at, precision = self.theta[:, parameter] / unit, inverse - believed
         off = at - self.beliefs.centre[parameter] / unit
         vector = inverse @ self.mean[own] + believed @ off + precision @ at
         precision = 0.5 * (precision + precision.T) / unit**2
         return Information(time, precision, vector / unit, slope=reach, walk=reach)
 
 
-def strain_of(kinds: Sequence[NDArray[np.int64]], beliefs: Beliefs, seconds: float) -> Array:
-    """Return the precision (P, P), in units, of what is believed of the parameters that blocks have."""
-    kind, block = np.concatenate(kinds), np.repeat(np.arange(len(kinds)), [own.size for own in kinds])
-    strain, wander = np.zeros((kind.size, kind.size)), beliefs.spread(seconds)
-    for each, (variance, normal) in enumerate(zip(wander, np.diag(beliefs.normal.precision), strict=True)):
-        places = np.flatnonzero(kind == each)
-        steps = np.diff(np.eye(places.size), axis=0)
-        walk = steps.T @ (steps / (variance * np.diff(block[places]))[:, None])
-        strain[np.ix_(places, places)] = walk + normal / places.size**2
-    return strain
+def _strain(count: int, beliefs: Beliefs, seconds: float) -> Array:
+    """Return the precision (K p, K p), in units, of what is believed of the parameters of K blocks."""
+    steps = np.diff(np.eye(count), axis=0)
+    walk = np.kron(steps.T @ steps, np.diag(1.0 / beliefs.spread(seconds)))
+    return np.asarray(walk + np.kron(np.full((count, count), 1.0 / count**2), beliefs.normal.precision))
 
 
 def _noise(blocks: Sequence[Block], off: Array, asked: int) -> tuple[float, float]:
     """Return the variance [Pa^2] left at deviations (P,), and the long-run variance of the scores over it."""
-    ends = np.cumsum([block.theta.size for block in blocks])
-    moved = [np.append(1.0, -own) for own in np.split(off, ends[:-1])]
+    moved = [np.append(1.0, -own) for own in off.reshape(len(blocks), -1)]
     pairs = list(zip(blocks, moved, strict=True))
     squares = sum(float(own @ block.gram @ own) for block, own in pairs)
     variance = max(squares, 1.0) / sum(block.samples for block in blocks)

@@ -7,9 +7,9 @@ a call of the kernel are one Jacobian: the path, and the path with each paramete
 states are carried from block to block. An iterated Kalman filter leads from block to block (`Follower`), live and over
 a recording alike; over a recording all blocks are then taken together (`fit.Joint`).
 
-The ring of `ring_down` is in this response, and so is what it does not see: the ramp, the breakaway, and how far the
-pressure falls while sliding. Both providers read the same pressures under the same factorisation, p(pressures |
-command): they are two hypotheses of the machine, this one with the laws of the rig, and are never added.
+A leak damps the ring after each reversal by G/C, and takes from the ramp, the breakaway and the fall of the pressure
+while sliding. Factorisation: this is p(pressures | command); a balance that reads position and angle takes p_A and p_B
+as given, so that both might be added.
 
 Source: B. M. Bell and F. W. Cathey, IEEE Trans. Autom. Control 38 (1993) 294 (iterated filter as Gauss-Newton steps).
 """
@@ -328,7 +328,7 @@ class Stretch:
         rows = look.rows - (look.rows @ self.apart.T) @ self._among @ self.apart
         first = np.arange(0, self.dp.size, round(self.machine.rate))
         scores = np.add.reduceat(rows[1 + G] * rows, first, axis=1).T
-        return Block(look.theta, np.arange(len(PARAMETERS)), look.gram, self.samples, scores)
+        return Block(look.theta, look.gram, self.samples, scores)
 
 
 def first_fit(stretch: Stretch, total: Array, noise: float) -> Look:
@@ -503,4 +503,4 @@ def evidence(recording: Recording, rig: Rig) -> PressureEvidence | None:
     reach = np.sqrt(recording.duration / BELIEVED["blocks"]["wander"]) * own.beliefs.wander
     reach[G] = wander_of_conductance(recording.duration)
     said = {name: own.information(k, time, float(reach[k])) for k, name in enumerate(PARAMETERS)}
-    return PressureEvidence.of("response", recording, rig, said)
+    return PressureEvidence.of(recording, rig, said)

@@ -6,7 +6,10 @@ A case is run with the thesis's own method and step ("literal") and converged; t
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import product
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -20,6 +23,8 @@ SOLVERS: tuple[Solver, ...] = ("converged", "literal")
 SOLVER_TEXT: dict[Solver, str] = {"converged": "converged", "literal": "RK4 1e-4 s"}
 #: The solvers in the legend of a figure, in the order of drawing.
 LABELS: dict[Solver, str] = {"literal": "RK4, 1e-4 s", "converged": "converged"}
+#: The runs of one case by solver.
+Runs = dict[Solver, SimulatedRun]
 #: Step [s] of the thesis's own Runge-Kutta method (section 4.1.1).
 THESIS_STEP = 1e-4
 #: Duration [s] of a run, and the whole periods of both commands in it that numbers are taken from.
@@ -40,26 +45,12 @@ COMMAND, PERIOD = "5 sin(2t)", math.pi
 _DRIFT_DURATION, _DRIFT_RATE = 60.0, 100.0
 
 
-@dataclass(frozen=True)
-class ThesisCase:
-    """A row of Table 4.2 or 4.3: `name` such as "4.3-f", `closed_pct` [%] of both throttles, None without them."""
-
-    name: str
-    command: str
-    closed_pct: float | None
-
-    @property
-    def title(self) -> str:
-        """Command and throttles in words."""
-        return f"{self.command}, " + ("no orifice" if self.closed_pct is None else f"{self.closed_pct:g} % closed")
-
-
-_THROTTLED = [(closed, command) for closed in CLOSINGS for command in COMMANDS]
-CASES: dict[str, ThesisCase] = {
-    **{f"4.2-{of}": ThesisCase(f"4.2-{of}", command, None) for of, command in zip("abc", COMMANDS, strict=True)},
+#: The rows of Tables 4.2 and 4.3: command, and how far both throttles are closed [%], None without them.
+CASES: dict[str, tuple[str, float | None]] = {
+    **{f"4.2-{letter}": (command, None) for letter, command in zip("abc", COMMANDS, strict=True)},
     **{
-        f"4.3-{of}": ThesisCase(f"4.3-{of}", command, closed)
-        for of, (closed, command) in zip("abcdefghi", _THROTTLED, strict=True)
+        f"4.3-{letter}": (command, closed)
+        for letter, (closed, command) in zip("abcdefghi", product(CLOSINGS, COMMANDS), strict=True)
     },
 }
 
@@ -122,47 +113,38 @@ def readings(quick: bool) -> tuple[Reading, ...]:
     return (OURS, AS_PRINTED) if quick else READINGS
 
 
-def spec(command: str, closed_pct: float | None, reading: Reading = OURS, solver: Solver = "converged") -> RunSpec:
-    """Return the run of a command with throttles closed by `closed_pct` [%] (None: absent)."""
-    return _solved(RunSpec(command, DURATION, values=reading.values(closed_pct), prove=True), solver)
-
-
-def drift_spec(reading: Reading, closed_pct: float | None, solver: Solver, **changed: str | float) -> RunSpec:
-    """Return a long run of section 4.3's command for the drift of the piston; `changed` parameters by bare name."""
-    values = {**dict(reading.values(closed_pct)), "daq.sample_rate": _DRIFT_RATE, **changed}
-    return _solved(RunSpec(COMMAND, _DRIFT_DURATION, values=tuple(values.items()), prove=True), solver)
-
-
-def _solved(run: RunSpec, solver: Solver) -> RunSpec:
+def spec(
+    command: str,
+    closed_pct: float | None,
+    reading: Reading = OURS,
+    solver: Solver = "converged",
+    duration: float = DURATION,
+    changed: Mapping[str, str | float] = MappingProxyType({}),
+) -> RunSpec:
+    """Return the run of a command with throttles closed by `closed_pct` [%] (None: absent); `changed` parameters."""
+    values = {**dict(reading.values(closed_pct)), **changed}
+    run = RunSpec(command, duration, values=tuple(values.items()), prove=True)
     return replace(run, method="rk4", step=THESIS_STEP) if solver == "literal" else run
 
 
-@dataclass(frozen=True, eq=False)
-class SolverPair:
-    """One case run with both solvers."""
-
-    literal: SimulatedRun
-    converged: SimulatedRun
-
-    @property
-    def resolved(self) -> bool:
-        """Whether both passed the halving test."""
-        return bool(self.literal.resolved and self.converged.resolved)
-
-    def of(self, solver: Solver) -> SimulatedRun:
-        """Return the run with that solver."""
-        return self.literal if solver == "literal" else self.converged
-
-    def runs(self) -> list[tuple[Solver, str, SimulatedRun]]:
-        """Return solver, label and run of those that did not diverge."""
-        return [(solver, label, self.of(solver)) for solver, label in LABELS.items() if not self.of(solver).diverged]
+def drift_spec(reading: Reading, closed_pct: float | None, solver: Solver, **changed: str | float) -> RunSpec:
+    """Return a long run of section 4.3's command for the drift of the piston."""
+    return spec(COMMAND, closed_pct, reading, solver, _DRIFT_DURATION, {"daq.sample_rate": _DRIFT_RATE, **changed})
 
 
-def run_pair(context: Context, command: str, closed_pct: float | None, reading: Reading = OURS) -> SolverPair:
+def both_runs(context: Context, command: str, closed_pct: float | None, reading: Reading = OURS) -> Runs:
     """Run a command as the thesis ran it, and converged."""
-    return SolverPair(
-        context.run(spec(command, closed_pct, reading, "literal")), context.run(spec(command, closed_pct, reading))
-    )
+    return {solver: context.run(spec(command, closed_pct, reading, solver)) for solver in LABELS}
+
+
+def resolved(runs: Runs) -> bool:
+    """Return whether all of the runs passed the halving test."""
+    return all(run.resolved for run in runs.values())
+
+
+def finished(runs: Runs) -> list[tuple[Solver, str, SimulatedRun]]:
+    """Return solver, label and run of those that did not diverge."""
+    return [(solver, LABELS[solver], run) for solver, run in runs.items() if not run.diverged]
 
 
 def steady(run: SimulatedRun) -> np.ndarray:
@@ -200,13 +182,6 @@ def numbers_of(run: SimulatedRun) -> dict[str, float]:
         "largest drop": max(float(np.abs(drop).max()) for drop in drops.values()),
         "flows differ": float(np.sqrt(np.mean((of["Q_A"] - of["Q_B"]) ** 2) / np.mean(of["Q_A"] ** 2))),
     }
-
-
-def throttled(
-    context: Context, reading: Reading, closed_pct: float | None, solver: Solver, command: str = COMMAND
-) -> dict[str, float]:
-    """Return the numbers of a command under a reading, with throttles closed by `closed_pct` [%] (None: absent)."""
-    return numbers_of(context.run(spec(command, closed_pct, reading, solver)))
 
 
 def piston_drift(run: SimulatedRun) -> float:

@@ -27,13 +27,12 @@ from sealscope.thesis.chapters.chapter4.cases import (
     Solver,
     spec,
     steady_output,
-    throttled,
 )
 from sealscope.thesis.chapters.chapter4.friction import falls_up_to, jumps_at_threshold, thesis_rig
 from sealscope.thesis.engine.context import Context, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, Claim, ThesisTable
-from sealscope.thesis.texts import judged, note
+from sealscope.thesis.engine.texts import judged, note
 
 #: Share of the drift without orifices that a change of drift must reach to count.
 DRIFT_SHARE = 0.01
@@ -93,28 +92,26 @@ def _without_orifices(context: Context) -> Iterator[Claim]:
 
 def _step_and_gains(context: Context) -> Iterator[Claim]:
     """Judge what is said of the method, its step, and the gains of the speed loop."""
-    runs = [(case, context.run(spec(case.command, case.closed_pct, solver="literal"))) for case in cases.CASES.values()]
+    runs = {of: context.run(spec(*of, solver="literal")) for of in cases.CASES.values()}
 
     def worst(throttles: bool) -> str:
-        proofs = [run.proof for case, run in runs if (case.closed_pct is not None) == throttles]
+        proofs = [run.proof for (_, closed), run in runs.items() if (closed is not None) == throttles]
         moved = [proof[name] for proof in proofs for name in PRESSURES if name in proof]
         return f"{max(moved):.3g} Pa rms" if moved else "diverged"
 
-    tests = [run.resolved for _, run in runs]
-    passed = sum(test is True for test in tests)
-    yield judged("4.1", tests, plain=worst(False), throttled=worst(True), passed=passed, cases=len(tests))
-    base = spec(COMMANDS[0], None, solver="literal")
-    gains = (("motor.k_p", 50000.0), ("motor.K_i", 100.0))
-    texts, tests = [], []
+    tests = [run.resolved is True for run in runs.values()]
+    yield judged("4.1", tests, plain=worst(False), throttled=worst(True), passed=sum(tests), cases=len(tests))
+    gains, texts, tests = {"motor.k_p": 50000.0, "motor.K_i": 100.0}, [], []
     for name, limits in (
-        ("with the drive's voltage and current limits", ()),
-        ("without limits", (("motor.V_max", 1e5), ("motor.i_max", 1e5))),
+        ("with the drive's voltage and current limits", {}),
+        ("without limits", {"motor.V_max": 1e5, "motor.i_max": 1e5}),
     ):
-        run = context.run(replace(base, values=(*base.values, *gains, *limits)))
+        run = context.run(spec(COMMANDS[0], None, solver="literal", changed={**gains, **limits}))
         moved = f"halving the step moves the speed by {run.proof.get('omega', math.nan):.3g} rad/s rms"
         texts.append(f"{name}: {run.diverged or moved}")
         tests.append(run.resolved is True)
-    yield judged("4.3", tests, runs="; ".join(texts), own=context.run(base).proof.get("omega", math.nan))
+    own = runs[COMMANDS[0], None].proof.get("omega", math.nan)
+    yield judged("4.3", tests, runs="; ".join(texts), own=own)
 
 
 def _printed(context: Context) -> Iterator[Claim]:
@@ -137,13 +134,8 @@ def _printed(context: Context) -> Iterator[Claim]:
     yield judged("4.20", tests, jumps="; ".join(texts), falls=falls_up_to(F_pr))
     texts, free = [], {}
     for metering, name in (("literal", "as printed"), ("meter-out", "with the areas of side B swapped")):
-        closed: dict[str, float | int | str] = {
-            "orifices": "present",
-            "closed_A": 0.5,
-            "closed_B": 0.5,
-            "metering": metering,
-        }
-        A_in, A_out, B_in, B_out = throttle_coefficients(rig.with_overrides(closed))
+        half = rig.with_overrides({"orifices": "present", "closed_A": 0.5, "closed_B": 0.5, "metering": metering})
+        A_in, A_out, B_in, B_out = throttle_coefficients(half)
         free[metering] = (A_in > A_out, B_in > B_out)
         A, B = ("free to the cylinder" if side else "throttled to the cylinder" for side in free[metering])
         texts.append(f"{name}: side A {A}, side B {B}")
@@ -197,13 +189,15 @@ def _orifices(context: Context) -> Iterator[Claim]:
     """Judge what is said of the orifices under several commands and closings."""
     limit = cases.visible_pressure()
 
-    def under(*runs: tuple[str, float]) -> dict[Solver, dict[Reading, Rows]]:
+    def under(*of: tuple[str, float]) -> dict[Solver, dict[Reading, Rows]]:
         """Return the numbers of each command and closing, under every reading and solver."""
-
-        def rows(reading: Reading, solver: Solver) -> Rows:
-            return [throttled(context, reading, closed, solver, command) for command, closed in runs]
-
-        return {solver: {r: rows(r, solver) for r in cases.readings(context.quick)} for solver in SOLVERS}
+        return {
+            solver: {
+                reading: [cases.numbers_of(context.run(spec(*case, reading, solver))) for case in of]
+                for reading in cases.readings(context.quick)
+            }
+            for solver in SOLVERS
+        }
 
     def both(rows: Rows) -> list[float]:
         return _changes(rows, "peak") + _changes(rows, "range")
@@ -222,16 +216,17 @@ def _orifices(context: Context) -> Iterator[Claim]:
     def drops(rows: Rows) -> list[float]:
         return [row["largest drop"] for row in rows]
 
+    def most_unlike(every: list[Rows]) -> str:
+        return f"rms of Q_A - Q_B over rms of Q_A at most {100 * max(rows[1][flows] for rows in every):.2f} %"
+
     opened = under((COMMANDS[0], 0.0), (COMMANDS[0], 25.0))
     commands = under(*((command, 50.0) for command in COMMANDS))
     seven, five = (under(*((command, closed) for closed in CLOSINGS)) for command in (COMMANDS[2], COMMAND))
+    p_1, p_2, flows = "mean of p_1 - p_A", "mean of p_2 - p_B", "flows differ"
     text = _ranges("25 % against open, peaks and ranges", both)
     yield _over(8, opened, lambda rows: (abs(change) < limit for change in both(rows)), text)
     yield _over(10, opened, lambda rows: (abs(change) > limit for change in _changes(rows, "peak")), text)
-    p_1, p_2, flows = "mean of p_1 - p_A", "mean of p_2 - p_B", "flows differ"
-    most = "rms of Q_A - Q_B over rms of Q_A at most {:.2f} %"
-    text = lambda every: most.format(100 * max(rows[1][flows] for rows in every))  # noqa: E731
-    yield _over(9, opened, lambda rows: [rows[1][flows] < 0.05], text)
+    yield _over(9, opened, lambda rows: [rows[1][flows] < 0.05], most_unlike)
     text = _ranges(p_1, lambda rows: [rows[1][p_1]])
     yield _over(11, opened, lambda rows: (rows[1][p_1] < 0, rows[1][p_1] < -limit), text)
     text = _ranges(p_2, lambda rows: [rows[1][p_2]])
@@ -246,6 +241,8 @@ def _orifices(context: Context) -> Iterator[Claim]:
 
 
 def _drift(context: Context) -> Iterator[Claim]:
+    """Judge what is said of the piston's drift."""
+
     def drift(reading: Reading, closed: float | None, solver: Solver) -> float:
         return cases.piston_drift(context.run(cases.drift_spec(reading, closed, solver)))
 
@@ -260,60 +257,42 @@ def _drift(context: Context) -> Iterator[Claim]:
     }
 
     def gained(rows: list[list[float]]) -> str:
-        return ", ".join(
-            f"{closed:g} % closed {_range((row[k] - without for row in rows), 'mm', 1e3)}"
-            for k, closed in enumerate(CLOSINGS)
-        )
+        parts = (_range([row[k] - without for row in rows], "mm", 1e3) for k in range(len(CLOSINGS)))
+        return ", ".join(f"{closed:g} % closed {part}" for closed, part in zip(CLOSINGS, parts, strict=True))
 
-    yield _over(
-        18,
-        moved,
-        lambda row: (abs(drift - without) > least for drift in row),
-        lambda rows: f"drift over 60 s without orifices {without * 1e3:.3f} mm, in addition at {gained(rows)}",
-    )
-    yield _over(
-        19,
-        moved,
-        lambda row: (abs(row[1]) - abs(row[0]) > least, abs(row[2]) - abs(row[1]) > least),
-        lambda rows: f"drift over 60 s beyond that without orifices, at {gained(rows)}",
-    )
+    heads = {
+        18: f"drift over 60 s without orifices {without * 1e3:.3f} mm, in addition at",
+        19: "drift over 60 s beyond that without orifices, at",
+    }
+    tests: dict[int, Callable[[list[float]], Iterable[bool]]] = {
+        18: lambda row: (abs(drift - without) > least for drift in row),
+        19: lambda row: (abs(row[1]) - abs(row[0]) > least, abs(row[2]) - abs(row[1]) > least),
+    }
+    for number, test in tests.items():
+        yield _over(number, moved, test, lambda rows, head=heads[number]: f"{head} {gained(rows)}")  # type: ignore[misc]
 
 
-def claims(context: Context, item: Item) -> tuple[ThesisTable | Claim, ...]:
-    """Make the table of all readings, closings and solvers, and judge the claims of chapter 4."""
-    judgements = (
-        *_without_orifices(context),
-        *_step_and_gains(context),
-        *_printed(context),
-        *_orifices(context),
-        *_drift(context),
-    )
-    ordered = sorted(judgements, key=lambda claim: int(claim.id.rpartition(".")[2]))
-    rows: list[tuple[Cell, ...]] = []
-    for reading, solver, closed in itertools.product(cases.readings(context.quick), SOLVERS, (0.0, *CLOSINGS)):
-        run = context.run(spec(COMMAND, closed, reading, solver))
-        numbers = cases.numbers_of(run)
-        values = (numbers[name] * factor for name, factor in _SHOWN.items())
-        tested = {True: "passed", False: "not passed", None: "not made"}[run.resolved]
-        cells = (value if math.isfinite(value) else None for value in values)
-        rows.append((reading.title, closed, cases.SOLVER_TEXT[solver], *cells, tested))
-    ids, notes = tuple(claim.id for claim in ordered), note("readings", window=cases.WINDOW)
-    return (ThesisTable(item.id, item.title, _COLUMNS, tuple(rows), ids, None, notes), *ordered)
-
-
-_COLUMNS = (
-    *("reading", "closed [%]", "solver", *(f"range of {name} [MPa]" for name in PRESSURES), "least pressure [MPa]"),
-    *("mean of p_1 - p_A [kPa]", "mean of p_2 - p_B [kPa]", "largest drop [kPa]", "Q_A unlike Q_B [%]", "halving test"),
-)
-
-
-#: The numbers of a row of that table, and the factor to its unit.
+#: Numbers of a row of the table of readings, and the factor to their units.
 _SHOWN: dict[str, float] = {
     **{f"range of {name}": 1e-6 for name in PRESSURES},
     "least pressure": 1e-6,
     **dict.fromkeys(("mean of p_1 - p_A", "mean of p_2 - p_B", "largest drop"), 1e-3),
     "flows differ": 100.0,
 }
-ITEMS: tuple[Item, ...] = (
-    Item("chapter-4-claims", 4, "claims", f"Chapter 4 under every reading of its equations, {COMMAND}", claims),
-)
+_TESTED = {True: "passed", False: "not passed", None: "not made"}
+
+
+def claims(context: Context, item: Item) -> tuple[ThesisTable | Claim, ...]:
+    """Make the table of all readings, closings and solvers, and judge the claims of chapter 4."""
+    parts = (_without_orifices, _step_and_gains, _printed, _orifices, _drift)
+    judgements = [claim for part in parts for claim in part(context)]
+    judgements.sort(key=lambda claim: int(claim.id.rpartition(".")[2]))
+    rows: list[tuple[Cell, ...]] = []
+    for reading, solver, closed in itertools.product(cases.readings(context.quick), SOLVERS, (0.0, *CLOSINGS)):
+        run = context.run(spec(COMMAND, closed, reading, solver))
+        numbers = cases.numbers_of(run)
+        values = (numbers[name] * factor for name, factor in _SHOWN.items())
+        cells = (value if math.isfinite(value) else None for value in values)
+        rows.append((reading.title, closed, cases.SOLVER_TEXT[solver], *cells, _TESTED[run.resolved]))
+    table = item.table(rows, note("readings", window=cases.WINDOW))
+    return (replace(table, claims=tuple(claim.id for claim in judgements)), *judgements)

@@ -11,7 +11,7 @@ from sealscope.recordings.recording import Array
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Figure, FigureCurve, Number, Panel
-from sealscope.thesis.texts import note
+from sealscope.thesis.engine.texts import note
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -72,7 +72,7 @@ def friction_models(context: Context, item: Item) -> tuple[Figure, ...]:
         Number("breakaway force", peak, "N"),
         Number("threshold velocity", f.v_th, "m/s"),
     )
-    return (Figure(item.id, item.title, panels, numbers, ("claim-4.20",), None, note("friction-models")),)
+    return (item.figure(panels, numbers, notes=note("friction-models")),)
 
 
 def stribeck_curve(context: Context, item: Item) -> tuple[Figure, ...]:
@@ -106,4 +106,4 @@ def stribeck_curve(context: Context, item: Item) -> tuple[Figure, ...]:
         ),
         Number("friction falls up to", falls_up_to(f.F_pr), "m/s"),
     )
-    return (Figure(item.id, item.title, panels, numbers, ("claim-4.20",), None, note("stribeck")),)
+    return (item.figure(panels, numbers, notes=note("stribeck")),)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.live.balance import FOLLOWS
+from sealscope.diagnosis.live.balance import FOLLOWS
 from sealscope.errors import InputError
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
 from sealscope.storage.plain_state import recall, saved

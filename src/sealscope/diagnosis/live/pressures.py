@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sealscope.diagnosis.beliefs import beliefs
-from sealscope.diagnosis.inference.live.balance import FOLLOWS, BlockConductance, NotJudged, Shown
 from sealscope.diagnosis.inference.pressures.evidence import BELIEVED, flow_scale, states_flow, unusable
 from sealscope.diagnosis.inference.pressures.response import LAWS, Follower, G, Machine, beliefs_of
+from sealscope.diagnosis.live.balance import FOLLOWS, BlockConductance, NotJudged, Shown
 from sealscope.errors import InputError
 from sealscope.recordings.motion import moves
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
@@ -27,8 +27,8 @@ from sealscope.units import LITRE_PER_MINUTE
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-_BELIEVED = beliefs("inference.live")["response"]
-_SETTLING, _RESUMING, _PAUSE = _BELIEVED["settling"], _BELIEVED["resuming"], beliefs("inference.live")["watch"]["pause"]
+_BELIEVED = beliefs("live")["response"]
+_SETTLING, _RESUMING, _PAUSE = _BELIEVED["settling"], _BELIEVED["resuming"], beliefs("live")["watch"]["pause"]
 _SLOWEST, _READ = BELIEVED["blocks"]["slowest"], ("u", "p_A", "p_B")
 
 
@@ -41,9 +41,9 @@ class PressureEstimator:
     end of an interval is wider; `inside`: share of what shows that is surely inside.
     """
 
-    by, levels, cause = "pressures", False, "leak inside or outside"
-    size_error, orifice = flow_scale(), BELIEVED["conductance"]["orifice_ring"]
-    inside: float = beliefs("inference.live")["watch"]["inside"]
+    method, levels, cause = "pressures", False, "leak inside or outside"
+    size_error, orifice = flow_scale(), BELIEVED["conductance"]["orifice"]
+    inside: float = beliefs("live")["watch"]["inside"]
     block_seconds: float = _BELIEVED["seconds"]
     states_flow = staticmethod(states_flow)
 
@@ -107,7 +107,7 @@ class PressureEstimator:
         apart = self._resume(self._follower, begin - self._next, block.rate)
         self._next = end
         own = self._follower.take(block.only(_READ))
-        variance, follower = own.squares / max(own.samples, 1.0), self._follower
+        variance, follower = float(own.gram[0, 0]) / max(own.samples, 1.0), self._follower
         settling, self._settling = self._settling > 0, max(self._settling - 1, 0)
         described = bool(np.isfinite(follower.theta).all()) and follower.excess < _BELIEVED["described"]
         ratio = float(np.clip(max(variance, 1.0) / follower.variance, 0.1, 10.0)) if math.isfinite(variance) else 1.0

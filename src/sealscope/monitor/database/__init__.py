@@ -5,4 +5,4 @@ from sealscope.errors import MissingExtra
 try:
     import sqlalchemy  # noqa: F401 (asked for before what needs it)
 except ImportError:
-    raise MissingExtra("the monitor's memory needs SQLAlchemy: pip install 'sealscope[serve]'") from None
+    raise MissingExtra("the monitor's database needs SQLAlchemy: pip install 'sealscope[serve]'") from None

@@ -8,8 +8,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from sealscope.monitor.memory.store import MonitorStore
-from sealscope.monitor.memory.tables import FIGURES
+from sealscope.monitor.database.store import MonitorStore
+from sealscope.monitor.database.tables import FIGURES
 from sealscope.storage.atomic import atomic_write
 
 ALARM_COLUMNS = (

@@ -20,11 +20,11 @@ from sqlalchemy import bindparam, func, select
 from sqlalchemy.exc import DataError, DBAPIError, IntegrityError, ProgrammingError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 
+from sealscope.diagnosis.live.estimates import BlockEstimate
 from sealscope.errors import InputError
 from sealscope.monitor.alarms import Alarm
-from sealscope.monitor.memory import tables
-from sealscope.monitor.memory.postgresql import engine_options, limit_answers
-from sealscope.monitor.stream.estimates import BlockEstimate
+from sealscope.monitor.database import tables
+from sealscope.monitor.database.postgresql import engine_options, limit_answers
 from sealscope.recordings.recording import Recording
 
 #: Identities of blocks that are kept for each actuator: more than a day of messages of 1 s.

@@ -13,14 +13,16 @@ import numpy as np
 
 from sealscope.calls import checked_call
 from sealscope.diagnosis.beliefs import beliefs
-from sealscope.diagnosis.inference.live.balance import LEARNED, BlockConductance, LiveBalance, NotJudged, Shown
-from sealscope.diagnosis.inference.live.sequential import RECENT, Rise, StepDetector, probability_of
+from sealscope.diagnosis.live.balance import LEARNED, BlockConductance, LiveBalance, NotJudged, Shown
+from sealscope.diagnosis.live.estimates import BaselineLearning, BlockEstimate, WatchBaseline, WatchedLeak, within
+from sealscope.diagnosis.live.joining import SampleJoiner
+from sealscope.diagnosis.live.pressures import PressureEstimator
+from sealscope.diagnosis.live.sequential import RECENT, Rise, StepDetector, probability_of
+from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.errors import InputError
-from sealscope.monitor.stream.estimates import BaselineLearning, BlockEstimate, WatchBaseline, WatchedLeak, within
-from sealscope.monitor.stream.joining import SampleJoiner
-from sealscope.monitor.stream.pressures import PressureEstimator
 from sealscope.recordings.recording import Recording
 from sealscope.storage.plain_state import part_of, recall, restored, saved
+from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -29,9 +31,9 @@ if TYPE_CHECKING:
 STATE_VERSION = 10
 #: Blocks of one mean that is compared with the baseline, and of the mean that is the leak after an alarm.
 GROUP, _RECENT = 16, 8
-_BELIEVED = beliefs("inference.live")["watch"]
+_BELIEVED = beliefs("live")["watch"]
 #: Ways of watching, each a stream of conductances.
-_KINDS: dict[str, type[LiveBalance | PressureEstimator]] = {of.by: of for of in (LiveBalance, PressureEstimator)}
+_KINDS: dict[str, type[LiveBalance | PressureEstimator]] = {of.method: of for of in (LiveBalance, PressureEstimator)}
 
 
 class Watch:
@@ -50,6 +52,8 @@ class Watch:
     ----------
     leak : WatchedLeak or None
         The leak that the tests show.
+    evidence : Evidence
+        The same, or the 95 % bound of a leak that they do not show.
     baseline : WatchBaseline or None
         What the machine is compared with, None while it is learned.
     blocks, baseline_version : int
@@ -93,7 +97,7 @@ class Watch:
         return probability_of(self.false_alarms_per_1000_h, hours, seconds, "false_alarms_per_1000_h")
 
     @property
-    def by(self) -> str:
+    def method(self) -> str:
         """Way of watching, "volumes" where the position is recorded, else "pressures"."""
         return "volumes" if "x" in self._samples.names or not self._samples.names else "pressures"
 
@@ -106,6 +110,38 @@ class Watch:
     def block_seconds(self) -> float:
         """About how long a block is [s]."""
         return LiveBalance.block_seconds if self._estimator is None else self._estimator.block_seconds
+
+    @property
+    def evidence(self) -> Evidence:
+        """What is said now: the leak that the tests show, else the 95 % bound of one that they do not."""
+        leak, own = self.leak, self._estimator
+        if leak is not None:
+            return Evidence(
+                "leak",
+                leak.reason,
+                score=leak.score,
+                threshold=leak.threshold,
+                onset_s=leak.onset_s,
+                onset_interval_s=leak.onset_interval_s,
+                leak_lpm=leak.leak_lpm,
+                leak_interval_lpm=leak.leak_interval_lpm,
+                cause=None if leak.cause == PressureEstimator.cause else leak.cause,  # type: ignore[arg-type]
+            )
+        bound = self._detector.bound() if own is not None and len(self._last) else math.inf
+        if own is None or not math.isfinite(bound):
+            why = f": {', '.join(self.counters)}" if self.counters else ""
+            return Evidence("cannot tell", f"waits for the first blocks{why}")
+        flow, _, motion = self._last[-1, 3:].tolist()
+        bound, pump = own.orifice * bound * flow, math.exp(motion) / LITRE_PER_MINUTE
+        limit = f"{bound:.2g} L/min" if own.litres else f"{100.0 * bound / pump:.2g} % of the pump's flow"
+        enough = bound <= beliefs("inference")["worth"]["share"] * pump
+        return Evidence(
+            "no leak" if enough else "cannot tell",
+            f"no leak above {limit} (95 %)" if enough else f"a leak of up to {limit} would not show (95 %)",
+            score=max(2.0 * self._detector.log_e(), 0.0),
+            threshold=-2.0 * math.log(self._probability("step", self.block_seconds)),
+            bound_lpm=bound if own.litres else None,
+        )
 
     def update(self, samples: Recording, *, follows: bool = True) -> list[BlockEstimate]:
         """Take the next samples; results do not depend on how they are cut.
@@ -133,7 +169,9 @@ class Watch:
             if self._estimator is not None:
                 self._estimator.interrupt()
         for t, channels in self._samples.runs(samples):
-            if self._estimator is None or self._estimator.by != self.by:  # a position came with the second piece
+            if (
+                self._estimator is None or self._estimator.method != self.method
+            ):  # a position came with the second piece
                 self._estimator = self._estimator_by()
             with np.errstate(all="ignore"):  # a block whose sums overflow says nothing
                 every = self._estimator.take(t, channels, self._samples.rate)
@@ -145,7 +183,7 @@ class Watch:
                     yield self.judged(shown), self.leak
 
     def _estimator_by(self) -> LiveBalance | PressureEstimator:
-        return _KINDS[self.by](self._rig, self._samples.names, self._litres.get(self.by, False))
+        return _KINDS[self.method](self._rig, self._samples.names, self._litres.get(self.method, False))
 
     def continue_from(self, blocks: int, baseline_version: int) -> None:
         """Count blocks and baselines on from those of a watch before, whose settings or state were of another kind."""
@@ -310,7 +348,7 @@ class Watch:
 
     def state(self) -> dict[str, Any]:
         """Return all that the watch knows as plain values that JSON holds, its ``"version"`` that of the format."""
-        own = self._estimator if self._estimator is not None and self._estimator.by == self.by else None
+        own = self._estimator if self._estimator is not None and self._estimator.method == self.method else None
         return {
             "version": STATE_VERSION,
             "rig": json.dumps(self._rig.model_dump()),

@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass, field
 
 from sealscope.diagnosis.beliefs import beliefs
-from sealscope.diagnosis.inference.live.sequential import Rise
+from sealscope.diagnosis.live.sequential import Rise
 
 Interval = tuple[float, float]
 Duty = tuple[float, float]
@@ -122,7 +122,7 @@ class WatchBaseline:
 
 def within(duty: Duty, low: Duty, high: Duty) -> bool:
     """Return whether a duty lies between two others, give or take; a leak may take more of the pressure."""
-    believed = beliefs("inference.live")["watch"]
+    believed = beliefs("live")["watch"]
     margin = believed["margin"]
     below = (low[0] - believed["damped"], low[1] - margin)
     return all(least <= own <= most + margin for own, least, most in zip(duty, below, high, strict=True))

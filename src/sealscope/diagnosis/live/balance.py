@@ -18,9 +18,9 @@ from sealscope.compiled import kernel
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.balance import BlockStream
 from sealscope.diagnosis.inference.blocks import Blocks, Columns
-from sealscope.diagnosis.inference.live.known import STANDSTILL, Known, add, begin, known_shapes, motion, says, take
 from sealscope.diagnosis.inference.terms import Equation, equations
 from sealscope.diagnosis.inference.weak_form import stride_samples
+from sealscope.diagnosis.live.known import STANDSTILL, Known, add, begin, known_shapes, motion, says, take
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 from sealscope.storage.plain_state import array_of, part_of, recall, saved
@@ -29,7 +29,7 @@ from sealscope.units import LITRE_PER_MINUTE
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-_BELIEVED = beliefs("inference.live")["block"]
+_BELIEVED = beliefs("live")["block"]
 #: About how long a block is [s], and blocks before anything is said.
 BLOCK_SECONDS: float = _BELIEVED["seconds"]
 LEARNED: int = _BELIEVED["learned"]
@@ -98,7 +98,7 @@ class LiveBalance:
     allow no balance.
     """
 
-    by, levels, cause, inside, orifice = "volumes", True, "piston or pump leak", 1.0, 1.0
+    method, levels, inside, orifice = "volumes", True, 1.0, 1.0
     block_seconds, begun = BLOCK_SECONDS, True
 
     def __init__(self, rig: Rig, names: Sequence[str], litres: bool | None = None) -> None:
@@ -109,7 +109,7 @@ class LiveBalance:
         read = {"x", "p_A", "p_B", *(name for each in self._balances for term in each.terms for name in term.needs)}
         read |= {next(name for name in ("theta", "omega", "u") if name in names)}
         self.names = tuple(name for name in names if name in read)
-        self.size_error = size_error(rig)
+        self.size_error, self.cause = size_error(rig), "piston leak" if _valved(rig) else "piston or pump leak"
         self.litres = self.states_flow(rig) if litres is None else litres
         self._places, self._known = [], []
         for columns in map(Columns, self._balances):

@@ -33,11 +33,11 @@ from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 from sealscope.storage.plain_state import recall, saved
 
-_BELIEVED = beliefs("inference.live")["step"]
+_BELIEVED = beliefs("live")["step"]
 WALKS = np.array(_BELIEVED["walks"])[:, None]
 SIZES = np.array(_BELIEVED["sizes"])
 PARTS = np.array(_BELIEVED["parts"])
-JUMP, MEMORY = beliefs("inference.live")["coefficients"]["jump"], _BELIEVED["memory"]
+JUMP, MEMORY = beliefs("live")["coefficients"]["jump"], _BELIEVED["memory"]
 #: Onsets are all kept for `RECENT` blocks, then `RECENT / 4` of every doubling of age, up to `HORIZON` blocks.
 RECENT, HORIZON = 32, 4096
 #: What is kept of each onset and walk, and of each onset.

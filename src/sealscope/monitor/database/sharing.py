@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from sqlalchemy import Connection, delete, func, select, text, update
 from sqlalchemy.exc import IntegrityError
 
-from sealscope.monitor.memory.store import MonitorStore
+from sealscope.monitor.database.store import MonitorStore
 from sealscope.monitor.settings import ShareSettings
 
 _log = logging.getLogger(__name__)

@@ -1,1 +1,0 @@
-"""The volume balance of one running actuator: blocks in, estimates and alarms out, its state as plain data."""

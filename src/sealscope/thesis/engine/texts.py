@@ -1,0 +1,35 @@
+"""The thesis's texts with numbers put in: notes (`notes.toml`), claims and verdicts (`claims.toml`)."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+from sealscope.thesis.engine.products import Claim, verdict_of
+
+
+@cache
+def texts_of(name: str) -> dict[str, Any]:
+    """Return what a TOML file of this package holds."""
+    return tomllib.loads(files("sealscope.thesis").joinpath(name).read_text(encoding="utf-8"))
+
+
+def note(name: str, **values: Any) -> str:
+    """Return the note of that name with `values` put in."""
+    return str(texts_of("notes.toml")[name]).format(**values)
+
+
+def judged(id: str, tests: Iterable[bool | None], kind: str = "", /, **values: Any) -> Claim:
+    """Judge the claim `claim-id` by the tests of its parts; its texts, with `values` put in, are those of `kind` or id.
+
+    `sheet`, `simulation` and `why` among the values take the place of the texts of that name.
+    """
+    texts = texts_of("claims.toml")
+    text = dict(texts[kind or id])
+    text.setdefault("sheet", next(of for prefix, of in texts["sheet"].items() if id.startswith(prefix)))
+    given = {name: values[name] for name in ("sheet", "simulation", "why") if name in values}
+    filled = {name: of.format(**values) for name, of in text.items() if name not in given}
+    return Claim(id=f"claim-{id}", verdict=verdict_of(tests), **filled, **given)
