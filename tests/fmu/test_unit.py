@@ -302,7 +302,7 @@ def test_a_master_in_c_runs_the_unit(kind, given, value, span, steps, outputs, f
 
 @pytest.mark.long
 @pytest.mark.skipif(not compiler()[1], reason="other systems need the compiler of pip install 'sealscope[fmu]'")
-@pytest.mark.parametrize("write", [partial(ss.write_fmu, step=5e-4), partial(ss.write_sensor_fmu, sensor="command")])
+@pytest.mark.parametrize("write", [partial(ss.write_fmu, step=5e-4), ss.write_sensor_fmu])
 def test_units_are_built_for_other_systems(write, folder):
     import zipfile
 

@@ -14,7 +14,8 @@ uncertain by theirs and by the walk of a healthy machine, w times a block's nois
 
     variance of the rise = v/n + v_0/N + w d sigma^2,    sigma^2 = v_0/(1 + w (N + 1)/6)
 
-(N blocks of such a walk scatter by w (N + 1)/6 beside their noise). The flow is G times the mean of abs(p_A - p_B).
+(N blocks of such a walk scatter by w (N + 1)/6 beside their noise). The flow is G times the mean of abs(p_A - p_B) as
+recorded; the live balance takes the sensors' noise off it, a few per cent.
 """
 
 from __future__ import annotations

@@ -8,6 +8,7 @@ import shutil
 import struct
 import subprocess
 import tempfile
+import tomllib
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -15,24 +16,8 @@ from pathlib import Path
 from sealscope.errors import InputError, MissingExtra
 from sealscope.storage.atomic import atomic_write
 
-#: Browsers that print without a window, the first that is there prints.
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
-#: Where such browsers stand on machines that have them and do not name them in the path: macOS, Windows.
-_PLACES = (
-    "/Applications/Google Chrome.app/Contents/MacOS/Google Chrome",
-    "/Applications/Microsoft Edge.app/Contents/MacOS/Microsoft Edge",
-    r"C:\Program Files (x86)\Microsoft\Edge\Application\msedge.exe",
-    r"C:\Program Files\Microsoft\Edge\Application\msedge.exe",
-    r"C:\Program Files\Google\Chrome\Application\chrome.exe",
-)
-_OPTIONS = (
-    "--headless",
-    "--disable-gpu",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-)
+_TABLE = tomllib.loads(Path(__file__).with_name("browsers.toml").read_text(encoding="utf-8"))
+BROWSERS, _PLACES, _OPTIONS = (tuple(_TABLE[name]) for name in ("names", "places", "options"))
 #: Longest time that a browser may take [s].
 _LONGEST = 120.0
 
