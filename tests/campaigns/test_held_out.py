@@ -197,6 +197,7 @@ def test_the_interval_of_clustered_samples():
     assert 0.91 <= held / 400 <= 0.98
 
 
+@pytest.mark.slow
 def test_appendix_c_with_whole_tests_held_out(sheet_folder, tmp_path, monkeypatch, capsys):
     """The plain logistic baseline without a baseline of the test's own: AUC 0.955, accuracy 0.87, true positives 0.83,
     false positives 0.10."""

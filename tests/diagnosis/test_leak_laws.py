@@ -96,7 +96,7 @@ def test_pressures_that_hardly_vary_leave_the_size_as_it_is() -> None:
     """A laminar leak passes for an orifice whose zero is off: its flow is counted about that zero."""
     leak = "0.1 L/min from 30 s"
     result = simulate_with_truth(
-        Experiment.of(rig="single-rod-eha", command="2 sin(6t)", duration=60.0, leak=leak, seed=1)
+        Experiment.of(rig="single-rod-eha", command="2 sin(6t)", load="0 N", duration=60.0, leak=leak, seed=1)
     )
     evidence = VolumeBalance(load_rig("single-rod-eha")).examine(result.recording, [], 0.01)
     assert evidence.verdict == "leak"

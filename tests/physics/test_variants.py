@@ -209,7 +209,13 @@ def examples(default: int, slow: int):
     )
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+#: Compiled of its own, and long.
+LONG = "lines, losses and an opposing cylinder"
+
+
+@pytest.mark.parametrize(
+    "variant", [pytest.param(name, marks=pytest.mark.slow) if name == LONG else name for name in VARIANTS]
+)
 @examples(3, 8)
 def test_nothing_is_lost(drive, variant, count):
     """Oil to 1e-9 of what the pump moves, energy to 1e-6 of what is turned over."""

@@ -6,16 +6,18 @@ import contextlib
 import re
 import shutil
 import struct
+import sys
 import zlib
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from sealscope.diagnosis.verdict.evidence import LeakCourse
 from sealscope.errors import InputError, MissingExtra
-from sealscope.reporting import printing, render_page, write_page
+from sealscope.reporting import printing, write_page
 from sealscope.reporting.page import render_card
 
 PAGE = "<!DOCTYPE html><title>t</title><h1>Leak</h1>"
@@ -68,9 +70,22 @@ def test_a_card_says_what_a_reader_must_know(recording, make_diagnosis) -> None:
     assert "d3 fell in both chambers" in unsure and 'class="still"' not in unsure
 
 
-def test_weasyprint_gets_drawings_with_styles_of_their_own(recording, make_diagnosis) -> None:
+def test_weasyprint_gets_drawings_with_styles_of_their_own(tmp_path, monkeypatch, recording, make_diagnosis) -> None:
     """It applies no sheet of the page within a drawing, and knows no variables there: all would be black."""
-    page = printing._styles_in_place(render_page(recording, make_diagnosis()))
+    pages: list[str] = []
+
+    class HTML:
+        def __init__(self, string: str) -> None:
+            pages.append(string)
+
+        def write_pdf(self, target: Path) -> None:
+            target.write_bytes(b"")
+
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    monkeypatch.setitem(sys.modules, "weasyprint", SimpleNamespace(HTML=HTML))
+    with pytest.raises(InputError, match="to its end"):
+        write_page(tmp_path / "page.pdf", recording, make_diagnosis())
+    (page,) = pages
     drawings = re.findall(r"<svg\b.*?</svg>", page, re.DOTALL)
     assert drawings
     for drawing in drawings:
@@ -82,7 +97,7 @@ def test_weasyprint_gets_drawings_with_styles_of_their_own(recording, make_diagn
 @pytest.mark.slow
 def test_weasyprint_prints_a_page_in_colour(tmp_path: Path, monkeypatch, recording, make_diagnosis) -> None:
     pytest.importorskip("weasyprint", reason="the extra `pdf` is not installed")
-    monkeypatch.setattr(printing, "_browser", lambda: None)
+    monkeypatch.setattr("shutil.which", lambda name: None)
     streams: list[bytes] = []
     for rig in (None, "thesis"):
         page = write_page(tmp_path / "page.pdf", recording, make_diagnosis(), rig=rig)
@@ -95,7 +110,7 @@ def test_weasyprint_prints_a_page_in_colour(tmp_path: Path, monkeypatch, recordi
 
 
 def test_without_a_browser_no_card_is_drawn(tmp_path: Path, monkeypatch, recording, make_diagnosis) -> None:
-    monkeypatch.setattr(printing, "_browser", lambda: None)
+    monkeypatch.setattr("shutil.which", lambda name: None)
     with pytest.raises(MissingExtra, match=r"^a picture needs Chromium, got none: install it, or write \.html .*\.png"):
         write_page(tmp_path / "card.png", recording, make_diagnosis())
     assert list(tmp_path.iterdir()) == []
@@ -177,8 +192,8 @@ def test_a_browser_on_a_full_disk(kind: str, tmp_path: Path, recording, make_dia
 
 
 def test_without_a_printer_the_error_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(printing, "_browser", lambda: None)
-    monkeypatch.setitem(__import__("sys").modules, "weasyprint", None)
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    monkeypatch.setitem(sys.modules, "weasyprint", None)
     with pytest.raises(MissingExtra, match=r"a PDF needs Chromium or WeasyPrint, got neither.*page\.pdf"):
         printing.print_page(PAGE, tmp_path / "page.pdf")
     assert list(tmp_path.iterdir()) == []

@@ -17,6 +17,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 from sealscope.monitor.mqtt_client import KEEP_ALIVE_S, check_mqtt, check_running, client_of, published
@@ -184,13 +185,13 @@ class _Connection:
             with suppress(UnicodeDecodeError):
                 topic = message.topic
             if self._host is None or not topic.startswith(f"{NAMESPACE}/"):
-                block = decoded(message.payload, self._names.get(topic), done)
+                block = decoded(message.payload, self._names.get(topic))
             else:
-                block = self._host.taken(topic, message.payload, done)
+                block = self._host.taken(topic, message.payload)
         except RefusedMessage as error:  # it would be no better a second time: it is kept, and acknowledged
             self._service.hand(RefusedMessage(error.reason, f"{topic[:100]}: {error}", message.payload, done))
         else:
-            done() if block is None else self._service.hand(block)
+            done() if block is None else self._service.hand(replace(block, done=done))
 
     def _pass_on(self) -> None:
         """Publish the alarms of new events, and the states that have changed, each retained."""

@@ -65,11 +65,9 @@ class RefusedMessage(InputError):  # noqa: N818 (says what happened)
     called when that is stored.
     """
 
-    def __init__(
-        self, reason: str, message: object, contents: bytes = b"", done: Callable[[], None] | None = None
-    ) -> None:
+    def __init__(self, reason: str, message: object, contents: bytes = b"", done: Callable[[], None] = nothing) -> None:
         super().__init__(message)
-        self.reason, self.done = reason, done or nothing
+        self.reason, self.done = reason, done
         self.size, self.beginning = len(contents), contents[:_BEGINNING]
         self.bytes = len(self.beginning)
 
@@ -130,7 +128,7 @@ class SourceBlock:
 
 
 @refusing()
-def decoded(payload: bytes, actuator: str | None = None, done: Callable[[], None] = nothing) -> SourceBlock:
+def decoded(payload: bytes, actuator: str | None = None) -> SourceBlock:
     """Return the block of a message, JSON where it begins with ``{``, else CBOR.
 
     Its mapping has ``t``, the clock of the first sample [s], ``rate`` [Hz], and for each channel a list of numbers,
@@ -169,7 +167,7 @@ def decoded(payload: bytes, actuator: str | None = None, done: Callable[[], None
     for array in (clock, *channels.values()):  # a Recording takes what is read-only without a copy
         array.setflags(write=False)
     samples = Recording(clock, channels, {channel: CHANNEL_UNITS[channel] for channel in channels}, rate)
-    return SourceBlock(name, _identity(values.get("id")) or digest_of(payload), samples, done=done)
+    return SourceBlock(name, _identity(values.get("id")) or digest_of(payload), samples)
 
 
 def bytes_of(samples: Recording) -> int:

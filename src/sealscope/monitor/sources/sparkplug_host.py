@@ -21,7 +21,7 @@ from sealscope.diagnosis.live.joining import CHANNELS
 from sealscope.monitor import sparkplug as spb
 from sealscope.monitor.settings import ActuatorSettings
 from sealscope.monitor.sources import source_block as blocks
-from sealscope.monitor.sources.source_block import RefusedMessage, SourceBlock, digest_of, in_si, nothing, refusing
+from sealscope.monitor.sources.source_block import RefusedMessage, SourceBlock, digest_of, in_si, refusing
 from sealscope.recordings.channels import SLOW
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
 
@@ -141,7 +141,7 @@ class SparkplugHost:
             self._publish(spb.topic_of(group, "NCMD", node), spb.encoded(request))
 
     @refusing()
-    def taken(self, topic: str, data: bytes, done: Callable[[], None] = nothing) -> SourceBlock | None:
+    def taken(self, topic: str, data: bytes) -> SourceBlock | None:
         """Take a message; return the block that it brings, None where it brings none.
 
         Raises RefusedMessage where it is not what its topic says, or nothing of it can be used.
@@ -197,7 +197,7 @@ class SparkplugHost:
         samples = self._samples(actuator, birth, [metric for metric in known if metric is not None], payload.timestamp)
         if samples is None:
             return None
-        return SourceBlock(actuator.name, digest_of(topic.encode() + b"\0" + data), samples, done=done)
+        return SourceBlock(actuator.name, digest_of(topic.encode() + b"\0" + data), samples)
 
     def _samples(
         self, actuator: ActuatorSettings, birth: _Birth, metrics: list[spb.SparkplugMetric], sent: int | None
