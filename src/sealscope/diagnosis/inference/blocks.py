@@ -123,11 +123,13 @@ class Columns:
         self.names = tuple(term.name for term in equation.terms)
         self.left = len(self.names)
         self.nuisance = tuple(k for k, term in enumerate(equation.terms) if term.nuisance)
+        self.compared = tuple(k for k, term in enumerate(equation.terms) if term.nuisance or term.compared)
         self.leak = self.names.index(LEAK)
         believed = beliefs("inference")["drift"]
         self.drift = np.array([believed[term.drift] if term.nuisance else 0.0 for term in equation.terms])
         differs = beliefs("inference")["between"]
-        self.between = np.array([differs[term.drift] if term.nuisance else 0.0 for term in equation.terms])
+        self.between = np.zeros(len(equation.terms))
+        self.between[list(self.compared)] = [differs[equation.terms[k].drift] for k in self.compared]
         levels = beliefs("inference")["level"]
         self.levels = np.array([levels.get(term.drift, np.inf) for term in equation.terms])
         self.motion = tuple(k for k in self.nuisance if equation.terms[k].drift in ("motion", "edge"))

@@ -213,7 +213,7 @@ def _level(sums: Array, columns: Sequence[Columns]) -> tuple[float, float]:
     """Return the leak's coefficient in healthy recordings by their sums (E, m, m), at least zero, and its error."""
     precision, vector = 0.0, 0.0
     for e, column in enumerate(columns):
-        others = [k for k in column.nuisance if k != column.leak and np.isfinite(column.between[k])]
+        others = [k for k in column.compared if k != column.leak and np.isfinite(column.between[k])]
         along = sums[e][others, column.leak]
         solved = solve(sums[e][np.ix_(others, others)], np.column_stack([along, sums[e][others, column.left]]))
         precision += float(sums[e][column.leak, column.leak] - along @ solved[:, 0])
@@ -259,7 +259,7 @@ def _about_own(sums: Array, columns: Sequence[Columns]) -> Array:
     """Return a recording's sums (E, m, m) with the coefficients set aside that nothing ties to another recording's."""
     reduced = sums.copy()
     for e, column in enumerate(columns):
-        untied = [k for k in column.nuisance if k != column.leak and not np.isfinite(column.between[k])]
+        untied = [k for k in column.compared if k != column.leak and not np.isfinite(column.between[k])]
         cross = sums[e][:, untied]
         reduced[e] -= cross @ solve(sums[e][np.ix_(untied, untied)], cross.T)
         reduced[e][untied] = reduced[e][:, untied] = 0.0
@@ -273,7 +273,7 @@ def _rise(own: Array, reference: Array, columns: Sequence[Columns]) -> float:
     """
     precision, vector = 0.0, 0.0
     for e, column in enumerate(columns):
-        chosen = [k for k in column.nuisance if k == column.leak or np.isfinite(column.between[k])]
+        chosen = [k for k in column.compared if k == column.leak or np.isfinite(column.between[k])]
         coefficients = solve(reference[e][np.ix_(chosen, chosen)], reference[e][chosen, column.left])
         residual = own[e][:, column.left] - own[e][:, chosen] @ coefficients
         others = [k for k in chosen if k != column.leak]

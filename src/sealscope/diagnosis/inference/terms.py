@@ -188,8 +188,9 @@ class Term(NamedTuple):
 
     `increments` gives f dg over each sampling interval, shape (n - 1,); `unit` is that of its coefficient; `cause` is
     what a step of the coefficient means; `nuisance`: the coefficient is unknown in any machine and drifts as `drift`
-    allows (a table of `priors.toml`), else it is zero unless that cause is present; `needs`: channels; `driven`: by a
-    "pressure" or by its "root", so that a zero of the sensors acts on the flow.
+    allows (a table of `priors.toml`), else it is zero unless that cause is present; `compared`: or unless recordings,
+    whose duties differ, are compared; `needs`: channels; `driven`: by a "pressure" or by its "root", so that a zero of
+    the sensors acts on the flow.
     """
 
     name: str
@@ -199,6 +200,7 @@ class Term(NamedTuple):
     cause: Cause
     drift: str = ""
     nuisance: bool = True
+    compared: bool = False
     needs: tuple[str, ...] = ()
     driven: str = ""
 
@@ -379,6 +381,8 @@ _SPEED_LOSS = Term(
     lambda s: _middle(np.abs(s.speed)) * s.step("x"),
     "sensor fault",
     "speed",
+    nuisance=False,
+    compared=True,
     needs=("x",),
 )
 _BIAS = Term(BIAS, "dt", "m^3/s", lambda s: s.dt, "sensor fault", "bias")

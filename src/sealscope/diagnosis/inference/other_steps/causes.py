@@ -69,6 +69,8 @@ def hypotheses(
     for index, term in enumerate(balances[0].terms):
         if term.drift == "motion" and index in columns[0].motion and term.name.startswith("motion"):
             continue  # area and displacement change together, as a scale
+        if term.compared:
+            continue
         if AIR in columns[0].names and term.cause == "air in the oil" and term.nuisance:
             continue  # free air changes them together
         if lost and term.name == BIAS:
