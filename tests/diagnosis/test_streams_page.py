@@ -37,15 +37,3 @@ def test_a_machine_without_a_position_is_watched_too(capsys: pytest.CaptureFixtu
     assert said is not None
     assert float(said[1]) <= 0.015 <= float(said[2])
     assert abs(int(said[3]) - 600) <= 15
-
-
-def test_the_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    code = EXAMPLES[2]
-    exec(compile(code, PAGE.name, "exec"), {"__name__": "page"})
-    first, last = capsys.readouterr().out.splitlines()
-    when = re.fullmatch(r"(\d+) s: a leak", first)
-    assert when is not None and 90 < int(when[1]) < 120
-    size, low, high = map(float, re.findall(r"\d\.\d{4}", last))
-    assert low <= 0.0042 <= high
-    assert size == pytest.approx(0.0042, rel=0.05)
-    assert float(last.split()[-2]) == pytest.approx(90.0, abs=0.5)
