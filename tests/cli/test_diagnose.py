@@ -26,7 +26,7 @@ KEYS = {
     "quality": list,
     "cause": str | None,
     "next_check": str,
-    "passage": dict | None,
+    "total_leakage": dict | None,
     "chance": float | None,
     "odds": str | None,
     "summary": str,

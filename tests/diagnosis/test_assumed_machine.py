@@ -118,10 +118,10 @@ def test_who_states_the_machine() -> None:
 def test_no_leak_passes_a_share_of_the_pumps_flow() -> None:
     result = diagnose(machine(1))
     assert result.verdict == "no leak"
-    assert result.passage is not None and result.passage.lpm is None
+    assert result.total_leakage is not None and result.total_leakage.lpm is None
     pump = 4.9e-6 / (2.0 * np.pi) * 12.0 * 2.0 / np.pi
-    own = 2.4e-13 * result.passage.pressure / pump
-    assert result.passage.pump_share == pytest.approx(own, rel=0.2)
+    own = 2.4e-13 * result.total_leakage.pressure / pump
+    assert result.total_leakage.pump_share == pytest.approx(own, rel=0.2)
     text = " ".join(short_text(result).split())
     assert "% of the pump's flow at 0.11 MPa; the smallest step that would have been found" in text
     assert "L/min" not in text

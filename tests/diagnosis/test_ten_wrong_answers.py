@@ -2,7 +2,7 @@
 
 A machine of the volume balance leaks from 30 s on. Its log in each dialect must give the same leak and onset as its own
 channels. The parts are tested where they live: dialects in `tests/recordings`, the size of the machine in
-`test_assumed_machine.py`, a leak from the first sample in `test_passage.py`.
+`test_assumed_machine.py`, a leak from the first sample in `test_total_leakage.py`.
 """
 
 from __future__ import annotations

@@ -68,7 +68,7 @@ def test_a_sound_machine_is_sound(detector: VolumeBalance, tight: Recording) -> 
     assert result.verdict == "no leak"
     assert result.leak_lpm is None and result.onset_s is None
     assert result.bound_lpm is not None and result.bound_lpm < 3e-4
-    assert result.passage is not None and result.passage.lpm is not None
+    assert result.total_leakage is not None and result.total_leakage.lpm is not None
 
 
 SIGNS: dict[str, Callable[[Recording], Recording]] = {
@@ -129,8 +129,8 @@ def test_a_leak_worth_finding_is_two_percent_of_the_pumps_flow_however_long_the_
     """Blocks shorter than a cycle of 21 s hold a part of its flow: far less would have shown, and 2 % was denied."""
     loaded = machine(3, speed=lambda t: 12.0 * np.sin(omega * t), load=3e5, G_pump=lambda t: 2.4e-13 * (1 + t / 1200))
     evidence = detector.examine(loaded, (), P)
-    assert evidence.passage is not None
-    assert 1e-4 < (evidence.passage.findable_share or 1.0) < 0.005
+    assert evidence.total_leakage is not None
+    assert 1e-4 < (evidence.total_leakage.findable_share or 1.0) < 0.005
     assert evidence.verdict == "no leak"
 
 

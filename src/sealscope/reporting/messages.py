@@ -119,7 +119,7 @@ def _why_no_flow(diagnosis: Diagnosis) -> str:
     """Return why a leak has no L/min, and what would state it."""
     ratio, machine = diagnosis.measured_ratio, diagnosis.machine
     if "leak_lpm" not in diagnosis.refuses:
-        small = diagnosis.passage is not None and diagnosis.passage.lpm is not None
+        small = diagnosis.total_leakage is not None and diagnosis.total_leakage.lpm is not None
         return say(f"how_much.{'too_small' if small else 'channels'}")
     if machine is not None and not machine.stated:
         return say(f"how_much.{'machine' if ratio is None else 'machine_or_area'}")
@@ -184,7 +184,7 @@ def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
 
     `basis`: with what L/min rests on.
     """
-    own = diagnosis.passage
+    own = diagnosis.total_leakage
     if own is None:
         return None
     pressure, findable = f"{number(own.pressure / 1e6, 2)} MPa", f"{number(own.findable_lpm, 2)} L/min"
@@ -208,7 +208,7 @@ def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
 
 def leakage_in_short(diagnosis: Diagnosis) -> str | None:
     """Return the leakage of pump and piston in a few words; None where it is not known or there is a leak."""
-    own = diagnosis.passage
+    own = diagnosis.total_leakage
     if own is None or diagnosis.verdict == "leak":
         return None
     if own.lpm is None or own.interval_lpm is None:
@@ -219,7 +219,9 @@ def leakage_in_short(diagnosis: Diagnosis) -> str | None:
 
 def states_flow(diagnosis: Diagnosis) -> bool:
     """Return whether the diagnosis states any L/min."""
-    return diagnosis.leak_lpm is not None or (diagnosis.passage is not None and diagnosis.passage.lpm is not None)
+    return diagnosis.leak_lpm is not None or (
+        diagnosis.total_leakage is not None and diagnosis.total_leakage.lpm is not None
+    )
 
 
 def _percent(share: float | None) -> str:

@@ -33,8 +33,8 @@ from sealscope.diagnosis.verdict.evidence import (
     Cause,
     Evidence,
     LeakCourse,
-    Passage,
     RelativeLeak,
+    TotalLeakage,
 )
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.oil import oil_temperature
@@ -426,10 +426,11 @@ def _with_figures(
     """Return the evidence with scores, thresholds, course, total, bound and the reason in words."""
     size = balance.size
     bound = bound_of(balance, against)
+    findable = None if evidence.verdict == "leak" else _findable(balance, questions)
     stated = size.stated and evidence.verdict != "leak" and np.isfinite(bound)
     evidence = replace(
         asked(evidence, questions, judging, "leakage"),
-        passage=_passage(balance, balance.level, None if evidence.verdict == "leak" else _findable(balance, questions)),
+        total_leakage=_total_leakage(balance, balance.level, findable),
         ratio=None if size.ratio is None else size.ratio.value,
         ratio_interval=None if size.ratio is None else (size.ratio.low, size.ratio.high),
         bound_lpm=bound * size.scale / LITRE_PER_MINUTE if stated else None,
@@ -446,7 +447,7 @@ def _findable(balance: RecordedBalance, questions: Sequence[Question]) -> float 
     return balance.test.findable(share) * balance.mean(0)
 
 
-def _passage(balance: RecordedBalance, level: Interval, findable: float | None) -> Passage:
+def _total_leakage(balance: RecordedBalance, level: Interval, findable: float | None) -> TotalLeakage:
     size, pressure, pump = balance.size, balance.mean(0), balance.mean(2)
     healthy = balance.rig.pump.G_healthy
     flow = pressure * size.scale / LITRE_PER_MINUTE
@@ -456,7 +457,7 @@ def _passage(balance: RecordedBalance, level: Interval, findable: float | None) 
         end * flow * (wide if (end > 0.0) == upper else 1.0 / wide)
         for end, upper in zip(level[1:], (False, True), strict=True)
     )
-    return Passage(
+    return TotalLeakage(
         lpm=level.value * flow if stated else None,
         interval_lpm=(low, high) if stated else None,
         pressure=pressure,
@@ -477,12 +478,12 @@ def _leak_course(balance: RecordedBalance, evidence: Evidence) -> LeakCourse:
     return LeakCourse(time, value * unit, (value - half) * unit, (value + half) * unit, whole=whole)
 
 
-def _level_text(passage: Passage | None) -> str:
+def _level_text(total: TotalLeakage | None) -> str:
     """Return what passes in all beside what a healthy machine passes, in words."""
-    if passage is None or passage.lpm is None or passage.healthy_lpm is None:
+    if total is None or total.lpm is None or total.healthy_lpm is None:
         return "pump and piston together pass more than a healthy machine"
     return (
-        f"pump and piston together pass {passage.lpm:.3g} L/min, a healthy machine at most {passage.healthy_lpm:.2g} "
+        f"pump and piston together pass {total.lpm:.3g} L/min, a healthy machine at most {total.healthy_lpm:.2g} "
         "L/min by the rig's file (pump.G_healthy)"
     )
 
@@ -495,7 +496,7 @@ def _reason(balance: RecordedBalance, evidence: Evidence, bound: float, question
         text = {
             WITHIN: "leakage steps up within the recording, beyond the drift of this machine",
             AGAINST: "leakage is above that of the healthy recordings by more than they scatter",
-            LEVEL: _level_text(evidence.passage),
+            LEVEL: _level_text(evidence.total_leakage),
         }[question]
         if "leak_lpm" in evidence.refuses:
             text += f"; {NO_RIG}"

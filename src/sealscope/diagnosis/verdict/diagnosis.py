@@ -175,7 +175,7 @@ class Diagnosis(Evidence):
     @property
     def known_healthy(self) -> bool:
         """Whether leak-free recordings or the rig show that the level is that of a healthy machine."""
-        by_rig = self.passage is not None and self.passage.healthy
+        by_rig = self.total_leakage is not None and self.total_leakage.healthy
         return self.verdict == "no leak" and (self.baselines > 0 or by_rig)
 
     def as_dict(self) -> dict[str, Any]:
@@ -183,9 +183,9 @@ class Diagnosis(Evidence):
 
         A number that is not finite becomes null.
         """
-        ratio, passage = self.measured_ratio or (None, None), self.passage and dict(vars(self.passage))
-        if passage:
-            passage["pressure_Pa"] = passage.pop("pressure")
+        ratio, total = self.measured_ratio or (None, None), self.total_leakage and dict(vars(self.total_leakage))
+        if total:
+            total["pressure_Pa"] = total.pop("pressure")
         methods = [
             {"name": own.detector, "score": own.score, "threshold": own.threshold, "verdict": own.verdict}
             | {"reason": own.reason, "chance": own.stated_chance, "odds": own.odds}
@@ -210,7 +210,7 @@ class Diagnosis(Evidence):
                 "quality": [{name: getattr(own, name) for name in names} for own in self.quality],
                 "cause": self.cause,
                 "next_check": self.next_check,
-                "passage": passage,
+                "total_leakage": total,
                 "chance": self.stated_chance,
                 "odds": self.odds,
                 "summary": self.summary,

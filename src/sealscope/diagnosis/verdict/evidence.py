@@ -47,7 +47,7 @@ class LeakCourse:
 
 
 @dataclass(frozen=True)
-class Passage:
+class TotalLeakage:
     """What pump and piston together pass over a whole recording, a leak included that was there from the start.
 
     `lpm`: mean flow, and its 95 % interval [L/min], None where the machine's size is not known; `pressure`: mean size
@@ -111,7 +111,7 @@ class Evidence:
         The leak over the recording, where the detector follows it.
     refuses : frozenset of {"onset_s", "leak_lpm"}
         Figures that the detector has a reason not to state, as opposed to those it cannot compute.
-    passage : Passage, optional
+    total_leakage : TotalLeakage, optional
         What pump and piston pass together, where the detector measures it.
     share : float
         Share of the recording, 0 to 1, that the verdict rests on.
@@ -142,7 +142,7 @@ class Evidence:
     cause: Cause | None = None
     course: LeakCourse | None = field(default=None, compare=False, repr=False)
     refuses: frozenset[Figure] = frozenset()
-    passage: Passage | None = None
+    total_leakage: TotalLeakage | None = None
     share: float = 1.0
     detector: str = ""
     usable: bool = True

@@ -21,7 +21,7 @@ from sealscope.diagnosis.inference.pressures import response
 from sealscope.diagnosis.inference.pressures.evidence import BELIEVED, PressureEvidence, flow_scale, unusable
 from sealscope.diagnosis.inference.scatter import Rise, student
 from sealscope.diagnosis.learnt import Healthy, Lesson, lessons_of
-from sealscope.diagnosis.verdict.evidence import LEAKS, NO_RIG, RAREST, Cause, Evidence, LeakCourse, Passage
+from sealscope.diagnosis.verdict.evidence import LEAKS, NO_RIG, RAREST, Cause, Evidence, LeakCourse, TotalLeakage
 from sealscope.recordings.recording import Recording
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -150,11 +150,11 @@ def _with_figures(
         reason += f"; what stepped is rather {evidence.cause}"
     share = next((each.probability for each in possible if each.name == WITHIN), None)
     step = None if own.test is None or share is None else own.test.findable(share) * pressure
-    passage = Passage(  # what passes in all is not known from pressures
+    total_leakage = TotalLeakage(  # what passes in all is not known from pressures
         lpm=None,
         interval_lpm=None,
         pressure=pressure,
         findable_lpm=None if step is None or not own.stated else step / LITRE_PER_MINUTE,
         findable_share=None if step is None or not own.pump > 0.0 else step / own.pump,
     )
-    return replace(evidence, reason=reason, bound_lpm=lpm if own.stated else None, passage=passage)
+    return replace(evidence, reason=reason, bound_lpm=lpm if own.stated else None, total_leakage=total_leakage)

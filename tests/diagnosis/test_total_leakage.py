@@ -45,14 +45,14 @@ def test_a_leak_from_the_first_sample_is_stated(law: str) -> None:
         lost = C * float(np.mean(np.sqrt(dp)) / np.mean(dp))
     evidence = VolumeBalance(rig(None)).examine(worn, [], P)
     assert evidence.verdict == "no leak"
-    passage = evidence.passage
-    assert passage is not None
-    low, high = passage.interval_lpm
+    total_leakage = evidence.total_leakage
+    assert total_leakage is not None
+    low, high = total_leakage.interval_lpm
     assert low <= flow(worn, PUMP + lost) <= high
-    assert high - low < 0.2 * passage.lpm
-    assert passage.pressure == pytest.approx(np.mean(np.abs(worn["p_A"] - worn["p_B"])), rel=0.05)
-    assert passage.healthy_lpm is None
-    assert not passage.healthy
+    assert high - low < 0.2 * total_leakage.lpm
+    assert total_leakage.pressure == pytest.approx(np.mean(np.abs(worn["p_A"] - worn["p_B"])), rel=0.05)
+    assert total_leakage.healthy_lpm is None
+    assert not total_leakage.healthy
     assert evidence.course is not None
     assert evidence.course.whole
     if law == "laminar":
@@ -65,7 +65,7 @@ def test_a_leak_from_the_first_sample_is_stated(law: str) -> None:
 def test_the_smallest_step_is_found_and_half_of_it_is_not() -> None:
     detector = VolumeBalance(rig(None))
     for seed in (1, 2, 3):
-        smallest = detector.examine(machine(seed), [], P).passage
+        smallest = detector.examine(machine(seed), [], P).total_leakage
         assert smallest is not None
         assert smallest.findable_lpm is not None
         G = smallest.findable_lpm / LPM / smallest.pressure
@@ -80,7 +80,7 @@ def test_against_what_a_healthy_machine_passes() -> None:
     assert evidence.verdict == "leak"
     assert evidence.onset_s is None
     assert evidence.leak_lpm == pytest.approx(flow(worn, WORN + PUMP), rel=0.1)
-    assert known.examine(worn, [], P).passage.lpm == pytest.approx(flow(worn, WORN + PUMP), rel=0.05)
+    assert known.examine(worn, [], P).total_leakage.lpm == pytest.approx(flow(worn, WORN + PUMP), rel=0.05)
     assert known.examine(unworn, [], P).verdict == "no leak"
 
 
@@ -92,7 +92,7 @@ def test_only_what_is_known_to_be_healthy_becomes_a_baseline() -> None:
     assert advice in known.next_check
     assert advice in diagnose(unworn, [machine(2), machine(3)]).next_check
     for diagnosis in (unknown, known):
-        tree = diagnosis.as_dict()["passage"]
+        tree = diagnosis.as_dict()["total_leakage"]
         assert set(tree) == {
             "lpm", "interval_lpm", "pressure_Pa", "findable_lpm", "healthy_lpm", "pump_share", "findable_share"
         }  # fmt: skip
@@ -116,9 +116,9 @@ def test_a_single_rod_s_total_is_stated_from_the_first_sample(command: str, load
     difference = simulated.truth.outputs["p_A"] - simulated.truth.outputs["p_B"]
     true = own.pump.G_pump * float(np.abs(difference).mean()) * LPM + simulated.truth.mean_leak_lpm
     diagnosis = diagnose(simulated.recording, rig=own)
-    assert diagnosis.passage is not None
-    assert diagnosis.passage.lpm == pytest.approx(true, rel=0.05)
-    low, high = diagnosis.passage.interval_lpm or pytest.fail("no interval")
+    assert diagnosis.total_leakage is not None
+    assert diagnosis.total_leakage.lpm == pytest.approx(true, rel=0.05)
+    low, high = diagnosis.total_leakage.interval_lpm or pytest.fail("no interval")
     assert low <= true <= high
     worn = true / LPM / float(np.abs(difference).mean()) > own.pump.G_healthy
     assert diagnosis.verdict == ("leak" if worn else "no leak")
