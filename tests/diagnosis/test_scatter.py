@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from scipy.stats import binom, kstest
+from scipy.stats import binom, kstest, norm
 
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.blocks import Blocks, Columns
-from sealscope.diagnosis.inference.scatter import RecordingSums, Rise, rise
+from sealscope.diagnosis.inference.scatter import Among, RecordingSums, Rise, rise
 from sealscope.diagnosis.inference.terms import LEAK, Equation, Term
 
 PRESSURE, FLOW = 1e5, 1e-5
@@ -207,3 +207,32 @@ def test_recordings_of_any_size_have_a_rise_and_a_threshold(scale: float) -> Non
     with np.errstate(all="ignore"):
         made = rise(scaled[-1], scaled[:-1], (COLUMNS,))
     assert 0.0 <= made.chance <= 1.0 and made.threshold(0.01) > 0.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_others_let_expect_is_that_of_dense_algebra(seed: int) -> None:
+    """A Gaussian process of an unknown mean, written out, integrated over sigma on a fine grid."""
+    random = np.random.default_rng(seed)
+    n, usual, freedom = 6, 0.7, 2.0
+    root = random.standard_normal((n + 1, n + 1))
+    covariance, values, ones = root @ root.T, random.standard_normal(n + 1), np.ones(n)
+    logs, centres, deviations = [], [], []
+    for variance in np.geomspace(1e-4, 1e6, 4000):
+        inverse = np.linalg.inv(covariance[:n, :n] + variance * np.eye(n))
+        precision, cross = ones @ inverse @ ones, covariance[:n, n]
+        mean = (ones @ inverse @ values[:n]) / precision
+        residual, missing = values[:n] - mean, 1.0 - ones @ inverse @ cross
+        centres.append(mean + cross @ inverse @ residual)
+        spread = variance + covariance[n, n] - cross @ inverse @ cross + missing**2 / precision
+        deviations.append(np.sqrt(spread))
+        logs.append(0.5 * (np.linalg.slogdet(inverse)[1] - np.log(precision) - residual @ inverse @ residual))
+        logs[-1] -= 0.5 * freedom * (np.log(variance) + usual**2 / variance)
+    weights = np.exp(np.array(logs) - max(logs))
+    weights /= weights.sum()
+    result = Among(covariance[None], np.zeros(1)).rise(values[n], values[:n], usual, freedom)
+    assert result.value == pytest.approx(values[n] - weights @ centres, abs=0.02)
+    chance = weights @ norm.sf((values[n] - np.array(centres)) / deviations)
+    assert result.chance == pytest.approx(chance, rel=0.02)
+    assert result._replace(value=4.0 + result.value).chance == pytest.approx(
+        weights @ norm.sf((4.0 + values[n] - np.array(centres)) / deviations), rel=0.05
+    )
