@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import sealscope as ss
 from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
@@ -216,3 +217,24 @@ def test_on_the_simulated_rig(detector: VolumeBalance, leaky: Recording, healthy
     assert result.onset_s == pytest.approx(60.0, abs=1.5)
     assert result.leak_lpm == pytest.approx(0.0042, rel=0.05)
     assert detector.examine(healthy, [], P).verdict == "no leak"
+
+
+def test_what_a_pump_loses_over_speed_is_no_leak_and_hides_none() -> None:
+    """6 % of the flow at the judged duty's speed, more than the healthy duties lost: it hid 0.03 L/min."""
+    rig = load_rig("thesis")
+
+    def run(command: str, seed: int, leak: str | None = None) -> Recording:
+        recording = ss.simulate(command=command, duration=20.0, seed=seed, leak=leak)
+        v = np.gradient(recording["x"].reshape(-1, 20).mean(axis=1)) * recording.rate / 20
+        v = np.interp(np.arange(len(recording)), 20 * np.arange(len(v)) + 9.5, v)
+        more = 1.0 * np.abs(v) * v * rig.cylinder.A_A * 2.0 * np.pi / rig.pump.q_b
+        turned = {"omega": recording["omega"] + more, "theta": recording["theta"] + np.cumsum(more) / recording.rate}
+        return replace(recording, channels={**recording.channels, **turned})
+
+    commands = ("3 sin(4t)", "4 sin(4t)", "3 sin(2t)", "4 sin(2t)", "3 sin(3t)", "4 sin(3t)")
+    healthy = [run(command, seed) for seed, command in enumerate(commands)]
+    assert ss.diagnose(run("7 sin(4t)", 9), healthy, rig=rig).verdict == "no leak"
+    worn = ss.diagnose(run("7 sin(4t)", 9, "0.03 L/min"), healthy, rig=rig)
+    assert worn.verdict == "leak"
+    low, high = worn.leak_interval_lpm or pytest.fail("no interval")
+    assert low < 0.03 < high
