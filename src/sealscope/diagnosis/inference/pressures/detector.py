@@ -65,7 +65,8 @@ class PressureResponse:
         """Return the evidence of a step of the conductance, and of its rise against the baseline."""
         own = self.reading(recording)
         if own is None:
-            return Evidence("cannot tell", "no response to the command that a pump-driven piston would give")
+            why = "no response to the command that a pump-driven piston would give"
+            return Evidence("cannot tell", why, usable=False)
         levels = [lesson["level"] for lesson in lessons_of(self, baseline)]
         whole = 1.0 if recording.bridged is None else float(np.mean(~recording.bridged))
         return replace(judge(own, false_alarm_probability, levels), share=whole)
