@@ -7,8 +7,6 @@ of white noise, is that of the sixth differences over 924, the sum of their squa
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 
 from sealscope.diagnosis.inference.weak_form import stride_samples
@@ -39,18 +37,10 @@ def distribution(pressure: Array, rate: float) -> Array:
     if piece > 1:
         differences = np.diff(pressure, _ORDER)
         differences = differences[np.isfinite(differences)]
-        noise = float(differences @ differences) / max(len(differences), 1) / _ENERGY
+        noise = float((differences**2).sum()) / max(len(differences), 1) / _ENERGY  # the same bits in any thread
         variance = np.nansum(deviation**2, axis=(1, 2), keepdims=True) / (pieces * (piece - 1))
         deviation *= np.sqrt(1.0 - noise / np.maximum(variance, max(noise, np.finfo(float).tiny)))
     values = (mean + deviation).ravel()
     values = np.sort(values[np.isfinite(values)])
-    return np.asarray(values @ _shares(len(values)))
-
-
-@lru_cache(maxsize=64)
-def _shares(count: int) -> Array:
-    """Return the shares by which sorted values make the means of `PARTS` equal parts of them, as a matrix."""
-    ends = np.linspace(0.0, count, PARTS + 1)
-    index = np.arange(count)[:, None]
-    within = np.minimum(index + 1, ends[1:]) - np.maximum(index, ends[:-1])
-    return np.asarray(np.maximum(within, 0.0) * PARTS / max(count, 1))
+    ends, sums = np.linspace(0.0, len(values), PARTS + 1), np.concatenate([[0.0], np.cumsum(values)])
+    return np.asarray(np.diff(np.interp(ends, np.arange(len(sums)), sums)) * (PARTS / max(len(values), 1)))
