@@ -52,8 +52,6 @@ class Watch:
     ----------
     leak : WatchedLeak or None
         The leak that the tests show.
-    evidence : Evidence
-        The same, or the 95 % bound of a leak that they do not show.
     baseline : WatchBaseline or None
         What the machine is compared with, None while it is learned.
     blocks, baseline_version : int
@@ -113,7 +111,7 @@ class Watch:
 
     @property
     def evidence(self) -> Evidence:
-        """What is said now: the leak that the tests show, else the 95 % bound of one that they do not."""
+        """Verdict of now, with the leak that the tests show, else with the 95 % bound of one that they do not."""
         leak, own = self.leak, self._estimator
         if leak is not None:
             return Evidence(
