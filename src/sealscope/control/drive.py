@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
@@ -62,12 +63,12 @@ def check_numbers(what: str, positive: dict[str, float], not_negative: dict[str,
             raise InputError(f"{name} of {what} must be >= 0, got {value}")
 
 
-class _Invertible:
+class _Invertible(ABC):
     """What turns a flow into a voltage by its block of numbers."""
 
+    @abstractmethod
     def block(self, rate: float, dead: float = 0.0) -> Array:
         """Return the numbers of the inverse, called at `rate` [Hz], as `drive_voltage` takes them."""
-        raise NotImplementedError
 
     def inverse(self, rate: float) -> Callable[[float, float], float]:
         """Return the voltage [V] as a function of its flow [m^3/s] and p_A - p_B [Pa], called at `rate` [Hz]."""

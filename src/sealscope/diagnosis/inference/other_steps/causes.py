@@ -1,8 +1,8 @@
 """What else stepped? The same likelihood ratio for the coefficient of every term of the balance; causes compete.
 
 Each hypothesis says that one coefficient stepped once, at an onset that nobody knows; they differ in their term alone,
-so that twice the logarithms of their likelihood ratios compare as they are. A cause's probability sums those of its
-terms, all equally likely beforehand; hypotheses that the channels cannot tell apart share it.
+so that twice the logarithms of their likelihood ratios compare as they are. A cause is as likely as its best term,
+times its odds beforehand; causes that the channels cannot tell apart share what is left.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def hypotheses(
         if term.drift == "motion" and index in columns[0].motion and term.name.startswith("motion"):
             continue  # area and displacement change together, as a scale
         if term.compared:
-            continue
+            continue  # it is zero within a recording
         if AIR in columns[0].names and term.cause == "air in the oil" and term.nuisance:
             continue  # free air changes them together
         if lost and term.name == BIAS:
