@@ -1,17 +1,23 @@
 """Is it more than in the baseline? A recording's leakage against the scatter between healthy recordings.
 
 The sums of the baseline's recordings, the zero of the flow of each set aside, are added up and give the coefficients of
-all terms; what a recording's own rows leave of them along the leak's column is its rise. The rise of each healthy
-recording against the others measures how recordings differ; whatever the model does not describe is in it, once. With
-r_j the rise of recording j of n against the n - 1 others, y_j = r_j (n - 1)/n; for the judged one y is its rise.
+all terms; what a recording's own rows leave of them along the leak's column is its rise, its other coefficients free
+within what recordings of a machine differ by. The rise of each healthy recording against the others measures how
+recordings differ; whatever the model does not describe is in it, once. With r_j the rise of recording j of n against
+the n - 1 others, y_j = r_j (n - 1)/n; for the judged one y is its rise.
 
-All y are normal about a mean near that of the sums, with the variance sigma^2 of each by itself and a covariance
-between them of which there are several candidates (`Among`). sigma^2 has a scaled inverse chi square prior (s_0, nu_0):
-the rise, y beyond what the others let expect, follows a mixture over both; with no covariance it is Student's with
-nu_0 + n - 1 degrees of freedom. Recordings of one session, by their dates, share oil and set-up: a deviation tau of
-sessions, half-normal beforehand, of leakage in proportion to its level, for it goes with the inverse of the oil's
-viscosity. Recordings without a date are of one session. Where the oil's temperature T is known of all, what it makes of
-the level is taken off, and only that factor's error remains. What is believed stands in `priors.toml`.
+How far the other coefficients differ is believed to within a factor only: a machine held at one temperature repeats
+them to a thousandth, another's change by a tenth from run to run. A narrow belief makes every rise precise where it is
+true and scatter where it is not, so y is formed by several widths, each weighted by what is believed of it and the
+evidence of the healthy ones, p(y_1 .. y_n).
+
+All y of a width are normal about an unknown mean, with the variance sigma^2 of each by itself and a covariance between
+them of which there are several candidates (`Among`). sigma^2 has a scaled inverse chi square prior (s_0, nu_0): the
+rise, y beyond what the others let expect, follows a mixture over all of these. Recordings of one session, by their
+dates, share oil and set-up: a deviation tau of sessions, half-normal beforehand, of leakage in proportion to its level,
+for it goes with the inverse of the oil's viscosity. Recordings without a date are of one session. Where the oil's
+temperature T is known of all, what it makes of the level is taken off, and only that factor's error remains. What is
+believed stands in `priors.toml`.
 
 Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sections 3.2, 5.4 and 5.7; C. E. Rasmussen and C. K.
 I. Williams, Gaussian Processes for Machine Learning (2006), section 2.7 (an unknown mean).
@@ -19,7 +25,6 @@ I. Williams, Gaussian Processes for Machine Learning (2006), section 2.7 (an unk
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -32,6 +37,8 @@ from sealscope.recordings.recording import Array
 
 #: Nodes of a deviation, and the largest one between sessions over what is believed; most recordings that are compared.
 NODES, WIDEST, MOST = 32, 3.0, 60
+#: Widths of what recordings differ by that are weighed, and how far from what is believed [deviations].
+SCALES, FARTHEST = 11, 2.5
 
 
 class Mixture(NamedTuple):
@@ -116,22 +123,29 @@ class RecordingSums(NamedTuple):
 
 
 def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[Columns]) -> Rise:
-    """Return how far the leak's coefficient of a recording is beyond that of healthy recordings of the same machine."""
+    """Return how far the leak's coefficient of a recording is beyond that of healthy recordings of the same machine.
+
+    All are of `columns`, one of each equation.
+    """
     everything, count = np.sum([own.sums for own in baseline], axis=0), len(baseline)
     believed, by_flow = beliefs("inference")["scatter"], judged.flow / judged.pressure if judged.pressure > 0.0 else 0.0
-    beyond = np.array([_rise(own.sums, everything - own.sums, columns) for own in baseline] if count > 1 else [0.0])
+    decades = np.linspace(-FARTHEST, FARTHEST, SCALES)
+    widths = believed["between"] ** decades
+    beyond = np.zeros((SCALES, count))
+    if count > 1:
+        beyond = np.array([_rises(own.sums, everything - own.sums, columns, widths) for own in baseline]).T
     *by_oil, warmer, oil = _of_oil([*baseline, judged], *_level(everything, columns))
-    value, deviations = _rise(judged.sums, everything, columns) - warmer, beyond * ((count - 1) / count) - by_oil
+    values = _rises(judged.sums, everything, columns, widths) - warmer
     starts, pause = [own.start_s for own in (*baseline, judged)], 3600.0 * beliefs("inference")["oil"]["shift"]
     sessions = np.array(sessions_of(starts, pause))
     usual, apart = believed["leak"] * by_flow, float(np.hypot(oil, believed["session"] * by_flow))
-    if len(set(sessions)) == 1:
-        return student(value, deviations * (count / max(count - 1, 1)), usual)
     nodes = WIDEST * ((np.arange(NODES) + 0.5) / NODES) ** 2  # closer near zero
-    alike = np.equal.outer(sessions, sessions)
     believed_of = 0.5 * np.log(nodes) - 0.5 * nodes**2
+    if len(set(sessions)) == 1:
+        nodes, believed_of = np.zeros(1), np.zeros(1)
+    alike = np.equal.outer(sessions, sessions)
     among = Among(((apart * nodes) ** 2)[:, None, None] * alike, believed_of)
-    return among.rise(value, deviations - deviations.mean(), usual, believed["freedom"])
+    return among.rise(values, beyond * ((count - 1) / count) - by_oil, usual, believed["freedom"], -0.5 * decades**2)
 
 
 class Among:
@@ -155,36 +169,37 @@ class Among:
         self._ones = basis.sum(axis=1)[:, None]
         self._own, self._logarithms = candidates[:, n, n, None], logarithms[:, None]
 
-    def rise(self, value: float, known: Array, usual: float, freedom: float) -> Rise:
-        """Return by how much a `value` is beyond what those `known` (n,) let expect.
+    def rise(self, values: Array, known: Array, usual: float, freedom: float, logarithms: Array | float = 0.0) -> Rise:
+        """Return by how much a value is beyond what those known let expect.
 
-        `usual`, `freedom`: what is believed of the deviation sigma.
+        `values` (s,) and `known` (s, n): the same quantity, estimated in s ways of which `logarithms` (s,) are
+        believed; the evidence of those known weighs the ways. `usual`, `freedom`: what is believed of sigma.
         """
-        others, count = known[self._chosen], len(self._chosen)
-        spread = float(np.sum((others - others.mean()) ** 2))
-        squares = freedom * usual**2 + spread
-        least = math.sqrt(max(0.1 * freedom * usual**2, 1e-9 * squares) / (freedom + count))
-        most = 100.0 * math.sqrt(squares)
-        if not most < LARGEST:  # numbers that cannot be computed with bound nothing
-            return Rise(value, np.inf, freedom)
-        variance = np.geomspace(max(least, 1.0 / LARGEST), max(most, 10.0 / LARGEST), NODES) ** 2
-        weight = 1.0 / (variance[:, None] + self._eigen)  # (g, nodes, n)
+        others, count = known[:, self._chosen], len(self._chosen)
+        squares = freedom * usual**2 + np.sum((others - others.mean(axis=1, keepdims=True)) ** 2, axis=1)
+        if not 1e4 * squares.max() < LARGEST:  # numbers that cannot be computed with bound nothing
+            return Rise(float(values.mean()), np.inf, freedom)
+        least = np.sqrt(np.maximum(0.1 * freedom * usual**2, 1e-9 * squares) / (freedom + count))
+        most = np.maximum(100.0 * np.sqrt(squares), 10.0 / LARGEST)
+        variance = np.geomspace(np.maximum(least, 1.0 / LARGEST), most, NODES, axis=1)[:, None] ** 2  # (s, 1, nodes)
+        weight = 1.0 / (variance[..., None] + self._eigen)  # (s, g, nodes, n)
         of_ones, cross = weight * self._ones, self._cross
-        precision = (of_ones * self._ones).sum(axis=2)
-        rotated = np.einsum("gij,i->gj", self._basis, others)[:, None]
-        mean = (of_ones * rotated).sum(axis=2) / precision
+        precision = (of_ones * self._ones).sum(axis=-1)
+        rotated = np.einsum("gij,si->sgj", self._basis, others)[:, :, None]
+        mean = (of_ones * rotated).sum(axis=-1) / precision
         left = weight * (rotated - mean[..., None] * self._ones)
-        logarithm = 0.5 * (np.log(weight).sum(axis=2) - np.log(precision) - (left * rotated).sum(axis=2))
+        logarithm = 0.5 * (np.log(weight).sum(axis=-1) - np.log(precision) - (left * rotated).sum(axis=-1))
         logarithm += self._logarithms - 0.5 * freedom * (np.log(variance) + usual**2 / variance)
+        logarithm += np.reshape(logarithms, (-1, 1, 1)) + np.log(np.log(variance[..., 1:2] / variance[..., :1]))
         weights = np.exp(logarithm - logarithm.max())
         weights /= weights.sum()
-        centres = mean + (left * cross).sum(axis=2)
-        missing = 1.0 - (of_ones * cross).sum(axis=2)
-        variances = variance + self._own - (weight * cross**2).sum(axis=2) + missing**2 / precision
+        centres = mean + (left * cross).sum(axis=-1) - values[:, None, None]
+        missing = 1.0 - (of_ones * cross).sum(axis=-1)
+        variances = variance + self._own - (weight * cross**2).sum(axis=-1) + missing**2 / precision
         middle = float((weights * centres).sum())
         parts = Mixture(weights.ravel(), np.sqrt(variances).ravel(), (centres - middle).ravel())
         total = float((weights * (variances + (centres - middle) ** 2)).sum())
-        return Rise(value - middle, float(np.sqrt(total)), np.inf, parts)
+        return Rise(-middle, float(np.sqrt(total)), np.inf, parts)
 
 
 def sessions_of(starts: Sequence[float | None], pause: float) -> list[int]:
@@ -266,12 +281,13 @@ def _about_own(sums: Array, columns: Sequence[Columns]) -> Array:
     return reduced
 
 
-def _rise(own: Array, reference: Array, columns: Sequence[Columns]) -> float:
-    """Return the rise of the leak's coefficient in one recording's sums (E, m, m) beyond those of others.
+def _rises(own: Array, reference: Array, columns: Sequence[Columns], widths: Array) -> Array:
+    """Return the rise (s,) of the leak's coefficient in one recording's sums (E, m, m) beyond those of others.
 
-    The recording's other coefficients differ from theirs by what is believed of recordings of one machine.
+    The recording's other coefficients differ from theirs by what is believed of recordings of one machine, over all
+    `widths` (s,).
     """
-    precision, vector = 0.0, 0.0
+    precision, vector = np.zeros((2, len(widths)))
     for e, column in enumerate(columns):
         chosen = [k for k in column.compared if k == column.leak or np.isfinite(column.between[k])]
         coefficients = solve(reference[e][np.ix_(chosen, chosen)], reference[e][chosen, column.left])
@@ -280,10 +296,11 @@ def _rise(own: Array, reference: Array, columns: Sequence[Columns]) -> float:
         size = np.abs(coefficients[[chosen.index(k) for k in others]])
         with np.errstate(divide="ignore", over="ignore"):
             belief = 1.0 / (size * column.between[others]) ** 2
-        matrix = own[e][np.ix_(others, others)]
-        matrix = matrix + np.diag(np.minimum(belief, 1e9 * np.diag(matrix)))
-        along = own[e][others, column.leak]
-        solved = solve(matrix, np.column_stack([along, residual[others]]))
-        precision += float(own[e][column.leak, column.leak] - along @ solved[:, 0])
-        vector += float(residual[column.leak] - along @ solved[:, 1])
-    return vector / precision if precision > 0.0 else 0.0
+        matrix, along = own[e][np.ix_(others, others)], own[e][others, column.leak]
+        right = np.column_stack([along, residual[others]])
+        for s, width in enumerate(widths):
+            tied = matrix + np.diag(np.minimum(belief / width**2, 1e9 * np.diag(matrix)))
+            solved = solve(tied, right)
+            precision[s] += float(own[e][column.leak, column.leak] - along @ solved[:, 0])
+            vector[s] += float(residual[column.leak] - along @ solved[:, 1])
+    return np.where(precision > 0.0, vector / np.where(precision > 0.0, precision, 1.0), 0.0)

@@ -87,5 +87,5 @@ def rises(
     stated = []
     for own, others, w in zip(values[0] / weight, values[1:].T / weight[:, None], weight, strict=True):
         scatter = float(np.hypot(belief["scatter"], belief["error"] / w))
-        stated.append(among.rise(own, others, scatter, belief["freedom"]))
+        stated.append(among.rise(own[None], others[None], scatter, belief["freedom"]))
     return stated, weight
