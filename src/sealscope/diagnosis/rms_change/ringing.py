@@ -7,7 +7,7 @@ machine's own: E_j = (1 + g)^2 E_own,j + E_1. So the change g of the machine's a
 
 with E_1 of the same block or recording: noise that changes by any amount drops out, and where it drowns the machine
 the weight w is small. Of d1 y is the log RMS itself. What the duty explains is eliminated: g follows `blocks.DUTY`
-by exponents that are believed within a width (`priors.toml`).
+by exponents that are believed within a width (`priors.toml`); where it does not repeat, g walks further.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ def information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
     believed = np.array([float(exponents[name]) for name in explaining])
     time = blocks.edges[:-1] + 0.5 * blocks.seconds
     over_all = float(np.sqrt(len(time) * blocks.seconds / walks["time"]))
-    stated = []
+    machine, stated = "duty" if blocks.cycle is None else "machine", []
     for name, y, w, variance in zip(blocks.names, left.T, weight.T, error, strict=True):
-        drift = walks["noise" if name.startswith("d1 ") else "machine"] * over_all
+        drift = walks["noise" if name.startswith("d1 ") else machine] * over_all
         precision, vector = w**2 / variance, w * y / variance
         along = precision[:, None] * duty
         gain = along @ np.linalg.inv(duty.T @ along + np.diag(believed**-2))
