@@ -7,15 +7,20 @@ of white noise, is that of the sixth differences over 924, the sum of their squa
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
 
+from sealscope.compiled import kernel
 from sealscope.diagnosis.inference.weak_form import stride_samples
 from sealscope.recordings.recording import Array
 
 #: Equal parts of a block's distribution whose means are kept, and the time over which the pressure is averaged [s].
 PARTS, SMOOTHED = 9, 0.025
-#: Order of the differences that leave noise alone, and the sum of their squared coefficients.
-_ORDER, _ENERGY = 6, 924.0
+#: Sum of the squared coefficients of the sixth differences, which leave noise alone.
+_ENERGY = 924.0
+_TINY = float(np.finfo(float).tiny)
 
 
 def distribution(pressure: Array, rate: float) -> Array:
@@ -29,18 +34,39 @@ def distribution(pressure: Array, rate: float) -> Array:
         Sampling rate [Hz].
     """
     piece, stride = max(1, round(SMOOTHED * rate)), min(stride_samples(rate), max(len(pressure), 1))
-    pieces = stride // piece
-    strides = pressure[: len(pressure) // stride * stride].reshape(-1, stride)[:, : pieces * piece]
-    parts = strides.reshape(-1, pieces, piece)
-    mean = parts.mean(axis=2, keepdims=True)
-    deviation = parts - mean
-    if piece > 1:
-        differences = np.diff(pressure, _ORDER)
-        differences = differences[np.isfinite(differences)]
-        noise = float((differences**2).sum()) / max(len(differences), 1) / _ENERGY  # the same bits in any thread
-        variance = np.nansum(deviation**2, axis=(1, 2), keepdims=True) / (pieces * (piece - 1))
-        deviation *= np.sqrt(1.0 - noise / np.maximum(variance, max(noise, np.finfo(float).tiny)))
-    values = (mean + deviation).ravel()
-    values = np.sort(values[np.isfinite(values)])
+    values = np.sort(_without_noise(np.ascontiguousarray(pressure), stride, piece))
     ends, sums = np.linspace(0.0, len(values), PARTS + 1), np.concatenate([[0.0], np.cumsum(values)])
     return np.asarray(np.diff(np.interp(ends, np.arange(len(sums)), sums)) * (PARTS / max(len(values), 1)))
+
+
+@kernel
+def _without_noise(pressure: Any, stride: int, piece: int) -> Any:
+    """Return the known samples of whole strides without their noise."""
+    square, differences = 0.0, 0
+    for i in range(len(pressure) - 6 if piece > 1 else 0):
+        difference = pressure[i] + pressure[i + 6] - 6.0 * (pressure[i + 1] + pressure[i + 5])
+        difference += 15.0 * (pressure[i + 2] + pressure[i + 4]) - 20.0 * pressure[i + 3]
+        if math.isfinite(difference):
+            square += difference**2
+            differences += 1
+    noise, pieces, count = square / max(differences, 1) / _ENERGY, stride // piece, 0
+    values, means = np.empty(len(pressure)), np.empty(pieces)
+    for begin in range(0, len(pressure) - stride + 1, stride):
+        variance = 0.0
+        for j in range(pieces):
+            first = begin + j * piece
+            means[j] = 0.0
+            for k in range(first, first + piece):
+                means[j] += pressure[k] / piece
+            if math.isfinite(means[j]):
+                for k in range(first, first + piece):
+                    variance += (pressure[k] - means[j]) ** 2
+        share = 1.0
+        if piece > 1:
+            share = math.sqrt(1.0 - noise / max(variance / (pieces * (piece - 1)), noise, _TINY))
+        for j in range(pieces):
+            if math.isfinite(means[j]):
+                for k in range(begin + j * piece, begin + (j + 1) * piece):
+                    values[count] = means[j] + share * (pressure[k] - means[j])
+                    count += 1
+    return values[:count]
