@@ -20,6 +20,7 @@ import json
 import os
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cbor2
@@ -157,7 +158,7 @@ def served(
                 done[0] += 1
                 waits.append(time.perf_counter() - due)
 
-            service.hand(decoded(payload, name, stored))  # type: ignore[attr-defined]
+            service.hand(replace(decoded(payload, name), done=stored))  # type: ignore[attr-defined]
 
         def wait_for_blocks(number: int) -> None:
             while done[0] < number:
@@ -168,7 +169,8 @@ def served(
         for k in range(rounds):
             for n, name in enumerate(names):
                 due = clock + k + n / count if paced else time.perf_counter()
-                time.sleep(max(0.0, due - time.perf_counter()))
+                if (early := due - time.perf_counter()) > 0.0:
+                    time.sleep(early)
                 send(name, payloads[learned + k], due)  # a service that falls behind makes the sender late, too
         wait_for_blocks(rounds * count)
         total = rounds * count

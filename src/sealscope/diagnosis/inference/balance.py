@@ -204,15 +204,15 @@ class BlockStream:
         signals = Signals(cut, self._rate, self._zeros or {}, self._zero)
         inner = slice(start - begin, stop - 1 - begin)
         whole = np.ones((end - first) * self._strides, dtype=bool)
-        cut_rows = []
-        for balance in self._balances:
-            columns = [*(term.increments(signals) for term in balance.terms), balance.left(signals)]
+        cut_rows, lefts = [], [balance.left(signals) for balance in self._balances]
+        for balance, left in zip(self._balances, lefts, strict=True):
+            columns = [*(term.increments(signals) for term in balance.terms), left]
             made = rows([column[inner] for column in columns], self._rate)
             whole &= made.whole
             cut_rows.append(made.values)
         within = slice(start - begin, start - begin + (end - first) * length)
         pressure = (cut["p_A"] - cut["p_B"])[within].reshape(-1, length)
-        rate = np.abs(self._balances[0].left(signals)[within].reshape(-1, length)) * self._rate
+        rate = np.abs(lefts[0][within].reshape(-1, length)) * self._rate
         known = np.isfinite(rate)
         flow = np.where(known, rate, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
         parts = np.array([distribution(own, self._rate) for own in pressure])

@@ -76,10 +76,15 @@ class Signals:
             self._means[name] = _middle(self._channels[name])
         return self._means[name]
 
-    @cached_property
-    def dt(self) -> Array:
+    @property
+    def dt(self) -> float:
+        """Sampling interval [s]."""
+        return 1.0 / self.rate
+
+    @property
+    def time_step(self) -> Array:
         """Sampling interval [s] of each increment, shape (n - 1,)."""
-        return np.full(len(next(iter(self._channels.values()))) - 1, 1.0 / self.rate)
+        return np.full(len(next(iter(self._channels.values()))) - 1, self.dt)
 
     @cached_property
     def pressure_difference(self) -> Array:
@@ -104,7 +109,7 @@ class Signals:
         """Speed of the piston [m/s] at each sample, by a central difference."""
         half = max(1, round(HALF_DIFFERENCE * self.rate))
         x = self._channels["x"]
-        padded = np.concatenate([np.full(half, x[0]), x, np.full(half, x[-1])])
+        padded = np.concatenate([x[:1].repeat(half), x, x[-1:].repeat(half)])
         return np.asarray((padded[2 * half :] - padded[: -2 * half]) * (0.5 * self.rate / half))
 
     @cached_property
@@ -130,7 +135,7 @@ class Signals:
 
     def acceleration_step(self) -> Array:
         """Return the increments of the piston's speed [m/s], by which a delay between channels shows."""
-        return np.gradient(self.step("x") * self.rate)
+        return _slope(self.step("x") * self.rate)
 
 
 def _middle(values: Array) -> Array:
@@ -141,6 +146,14 @@ def _middle(values: Array) -> Array:
 
 def _steps(values: Array) -> Array:
     return values[1:] - values[:-1]
+
+
+def _slope(values: Array) -> Array:
+    """Return half the difference of a value's neighbours, at the ends the whole one to its neighbour."""
+    slope = np.empty_like(values)
+    slope[0], slope[-1] = values[1] - values[0], values[-1] - values[-2]
+    slope[1:-1] = 0.5 * (values[2:] - values[:-2])
+    return slope
 
 
 class SpeedLoop(NamedTuple):
@@ -385,7 +398,7 @@ _SPEED_LOSS = Term(
     compared=True,
     needs=("x",),
 )
-_BIAS = Term(BIAS, "dt", "m^3/s", lambda s: s.dt, "sensor fault", "bias")
+_BIAS = Term(BIAS, "dt", "m^3/s", lambda s: s.time_step, "sensor fault", "bias")
 _PUMP = Term(
     PUMP,
     "(p_1 - p_2) dt",
@@ -471,7 +484,7 @@ def _edges(side: str) -> tuple[Term, ...]:
             return np.asarray(np.maximum(way.opens * s.mean("u"), 0.0) * way.root(s) * s.dt)
 
         def late(s: Signals, gain: Callable[[Signals], Array] = gain) -> Array:
-            return np.gradient(gain(s))
+            return _slope(gain(s))
 
         def overlap(s: Signals, way: _Way = way) -> Array:
             return np.asarray((way.opens * s.mean("u") > 0.0) * way.root(s) * s.dt)

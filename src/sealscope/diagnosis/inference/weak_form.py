@@ -56,6 +56,12 @@ def test_function(rate: float) -> Array:
     return np.asarray(phi * (rate / phi.sum())).reshape(SPAN, stride)
 
 
+@lru_cache(maxsize=8)
+def _weights(rate: float) -> Array:
+    """Return the transpose of `test_function` as BLAS reads it fastest, shape (stride, SPAN)."""
+    return np.ascontiguousarray(test_function(rate).T)
+
+
 def _overlap() -> float:
     phi = test_function(1e4).ravel()
     stride, energy = len(phi) // SPAN, float(phi @ phi)
@@ -84,17 +90,18 @@ def rows(increments: Sequence[Array], rate: float, start: float = 0.0) -> Rows:
     Rows
         Every test function whose support lies within the samples: n // stride - SPAN + 1 rows.
     """
-    phi = test_function(rate)
-    stride = phi.shape[1]
+    stride = stride_samples(rate)
     pieces = len(increments[0]) // stride
     count = max(0, pieces - SPAN + 1)
-    parts = np.stack([own[: pieces * stride].reshape(pieces, stride) @ phi.T for own in increments], axis=2)
-    missing = np.asarray(~(np.abs(parts) < LARGEST).all(axis=(1, 2)))
-    if missing.any():
-        parts[missing] = 0.0
-    values, touched = np.zeros((count, len(increments))), np.zeros(count, dtype=bool)
+    samples = np.concatenate([own[: pieces * stride] for own in increments]).reshape(-1, stride)
+    parts: Array = (samples @ _weights(rate)).reshape(len(increments), pieces, SPAN)
+    small = np.abs(parts) < LARGEST
+    missing = np.zeros(pieces, dtype=bool) if small.all() else np.asarray(~small.all(axis=(0, 2)))
+    parts[:, missing] = 0.0
+    values: Array = np.zeros((count, len(increments)))
+    touched = np.zeros(count, dtype=bool)
     for piece in range(SPAN):
-        values += parts[piece : piece + count, piece]
+        values += parts[:, piece : piece + count, piece].T
         touched |= missing[piece : piece + count]
-    time = start + (np.arange(count) + 0.5 * SPAN) * stride / rate
+    time: Array = start + (np.arange(count, dtype=float) + 0.5 * SPAN) * stride / rate
     return Rows(time, values, ~touched)

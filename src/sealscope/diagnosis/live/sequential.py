@@ -23,11 +23,13 @@ Trans. Automat. Contr. 21 (1976) 108 (step in a filter).
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.compiled import kernel
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
@@ -103,8 +105,7 @@ class StepDetector:
         begins = self._known >= 4
         if begins:
             self._begin_onset(begin, end)
-        if len(self._places):
-            self._follow(error, sigma, gain, begins)
+        _follow(self._onsets, self._places, error, sigma, gain, PARTS if begins else PARTS[:0])
         self._learn(sigma, own)
         self._level = self._level + gain * error
         self._spread = gain * variance
@@ -132,26 +133,11 @@ class StepDetector:
             kept = _kept(self._blocks, self._places)
             self._onsets, self._places = self._onsets[:, :, kept], self._places[kept]
 
-    def _follow(self, error: Array, sigma: Array, gain: Array, begins: bool) -> None:
-        answer, along, square, total, _ = self._onsets
-        part = 1.0 - answer
-        if begins:
-            part[:, -len(PARTS) :] = PARTS
-        scaled = part / sigma
-        along += scaled * error
-        square += scaled * part
-        total += error**2 / sigma
-        answer += gain * part
-        self._places[:, 0] += 1.0
-
     def log_e(self, least: float = -np.inf) -> float:
         """Return log M; minus infinity where it is surely not over `least`."""
         if not len(self._places):
             return -np.inf
-        _, along, square, total, _ = self._onsets
-        rising = np.maximum(along, 0.0) ** 2 / (square * total)
-        most = float(np.max(-0.5 * self._places[:, 0] * np.log1p(-np.minimum(rising, 1.0 - 1e-15))))
-        if most + np.log(len(self._places) / len(PARTS)) <= least:
+        if _most(self._onsets, self._places) + np.log(len(self._places) / len(PARTS)) <= least:
             return -np.inf
         return float(np.logaddexp.reduce(self._terms().ravel()))
 
@@ -221,6 +207,35 @@ class StepDetector:
         recall(self, _SAVED, state)
         if self._onsets.shape[2] != len(self._places):
             raise InputError(f"saved state's onsets must be {len(self._places)}, got {self._onsets.shape[2]}")
+
+
+@kernel
+def _follow(onsets: Any, places: Any, error: Any, sigma: Any, gain: Any, fresh: Any) -> None:
+    """Take innovations (q, 1) and their variances into the sums of all onsets, of which the last begin with a part."""
+    answer, along, square, total, _ = onsets
+    count, begun = len(places), len(places) - len(fresh)
+    for q in range(len(sigma)):
+        for j in range(count):
+            part = fresh[j - begun] if j >= begun else 1.0 - answer[q, j]
+            along[q, j] += part / sigma[q, 0] * error[q, 0]
+            square[q, j] += part / sigma[q, 0] * part
+            total[q, j] += error[q, 0] ** 2 / sigma[q, 0]
+            answer[q, j] += gain[q, 0] * part
+    for j in range(count):
+        places[j, 0] += 1.0
+
+
+@kernel
+def _most(onsets: Any, places: Any) -> float:
+    """Return the most that the logarithm of a ratio of likelihoods can be, for any size of a step."""
+    _, along, square, total, _ = onsets
+    most = 0.0
+    for q in range(len(along)):
+        for j in range(len(places)):
+            if along[q, j] > 0.0:
+                rising = min(along[q, j] ** 2 / (square[q, j] * total[q, j]), 1.0 - 1e-15)
+                most = max(most, -0.5 * places[j, 0] * math.log1p(-rising))
+    return most
 
 
 def _kept(now: int, places: Array) -> NDArray[np.bool_]:

@@ -6,7 +6,7 @@ import json
 import math
 import os
 from collections.abc import Iterator, Mapping
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -93,6 +93,10 @@ class Watch:
         """Return the probability of a false alarm of one look of a test, with so many seconds between looks."""
         hours = 1000.0 / _BELIEVED[test]
         return probability_of(self.false_alarms_per_1000_h, hours, seconds, "false_alarms_per_1000_h")
+
+    @cached_property
+    def _rig_text(self) -> str:
+        return json.dumps(self._rig.model_dump())
 
     @property
     def method(self) -> str:
@@ -349,7 +353,7 @@ class Watch:
         own = self._estimator if self._estimator is not None and self._estimator.method == self.method else None
         return {
             "version": STATE_VERSION,
-            "rig": json.dumps(self._rig.model_dump()),
+            "rig": self._rig_text,
             **saved(self, ("_litres", *_SAVED)),
             "estimator": None if own is None else own.state(),
         }

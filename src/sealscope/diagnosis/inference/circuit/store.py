@@ -72,7 +72,7 @@ def lost_oil(signals: Signals, rig: Rig, cycle: float | None, begin: float) -> d
     if rig.makeup.check_valves == "absent":
         return {}
     unit = 1.0 / signals.rate if cycle is None else cycle
-    seconds = len(signals.dt) / signals.rate
+    seconds = len(signals.time_step) / signals.rate
     length = unit * max(1, round(seconds / (BLOCKS * unit)))
     ends = np.round(np.arange(int(seconds / length) + 1) * length * signals.rate).astype(int)
     if len(ends) <= FEWEST:
