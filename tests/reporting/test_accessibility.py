@@ -65,8 +65,8 @@ def _thesis(folder: Path):
         (Item("table-4.2-a", 4, "case", "T", print), (table,)),
         (Item("chapter-4-claims", 4, "claims", "C", print), claims),
     ):
-        made.append((ItemStatus(item, "made", files=publish(item, products, folder)), products))
-    return [*made, (ItemStatus(Item("fig-1.1", 4, "figure", "F", print), "not made"), ())]
+        made.append(ItemStatus(item, "made", products=products, files=publish(item, products, folder)))
+    return [*made, ItemStatus(Item("fig-1.1", 4, "figure", "F", print), "not made")]
 
 
 def faults(browser, page: Path, width: int, scheme: str) -> list[str]:

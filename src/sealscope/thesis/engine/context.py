@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import copyreg
+import pickle
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from hashlib import sha256
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from sealscope.errors import SimulationFailed
+from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.recording import Array, Recording
+from sealscope.storage.atomic import atomic_write
+from sealscope.storage.folders import locked
 from sealscope.thesis.engine.products import Claim, Product, ThesisTable
 from sealscope.thesis.sheet import DataSheet
 
@@ -85,18 +92,45 @@ def simulated_run(spec: RunSpec) -> SimulatedRun:
     return SimulatedRun(simulated.recording, truth.t, truth.outputs, truth.mean_leak_lpm, resolved, moved)
 
 
+def _view(values: dict[str, Any]) -> MappingProxyType[str, Any]:
+    return MappingProxyType(values)
+
+
+copyreg.pickle(MappingProxyType, lambda view: (_view, (dict(view),)))  # a recording's channels
+
+
 @dataclass(frozen=True)
 class Context:
-    """Handed to every maker.
+    """Handed to the maker of the item of that name.
 
-    `sheet`: the measured sheet, None where it was not given or the item does not use it; `run` gives the run of a spec,
-    simulated now or earlier; `product` the products of an item among the maker's `needs`, () where it is left out.
+    `sheet`: the measured sheet, None where it was not given or the item does not use it; `products`: those of the items
+    that it needs, by id, without those that failed; `runs`: folder of this call's runs, which its processes share.
     """
 
+    name: str
+    needs: tuple[str, ...]
     quick: bool
     sheet: DataSheet | None
-    run: Callable[[RunSpec], SimulatedRun]
-    product: Callable[[str], Products]
+    products: Mapping[str, Products]
+    runs: Path
+
+    def run(self, spec: RunSpec) -> SimulatedRun:
+        """Return the run of a spec, simulated once while other processes that want it wait."""
+        path = self.runs / f"{sha256(repr(spec).encode()).hexdigest()}.run"
+        with locked(path.with_suffix(".lock"), None):
+            if not path.exists():
+                with atomic_write(path) as temporary:
+                    temporary.write_bytes(pickle.dumps(simulated_run(spec)))
+            run: SimulatedRun = pickle.loads(path.read_bytes())
+        return run
+
+    def product(self, name: str) -> Products:
+        """Return the products of an item among the needs, () where it is left out."""
+        if name not in self.needs:
+            raise InputError(f"{self.name} must name {name} among its needs to ask for its products")
+        if name not in self.products:
+            raise InputError(f"needs {name}, which failed")
+        return self.products[name]
 
 
 def first_table(context: Context, item: str) -> ThesisTable:
