@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.thesis.chapters.appendix_c_runs import SimulatedTest, table_of
+from sealscope.thesis.chapters.appendix_c_runs import COLUMNS, row_of
 from sealscope.thesis.engine.context import RunSpec, SimulatedRun, simulated_run
 from sealscope.thesis.engine.items import Item, collect
 from sealscope.thesis.engine.products import Claim, Figure, Product, ThesisTable
@@ -75,8 +75,8 @@ def table_with(sheet: DataSheet, item: str, range_MPa: Callable[[Condition], flo
     rows = []
     for k, condition in enumerate(APPENDIX_C):
         rms = {c: {q: tuple(sheet.rms[c][q][k].tolist()) for q in QUANTITIES} for c in CHAMBERS}
-        rows.append(SimulatedTest(condition, rms, condition.mean_leak_lpm, (range_MPa(condition),) * 2, True))
-    return table_of(rows, ITEMS[item])
+        rows.append(row_of(condition, "", condition.mean_leak_lpm, (range_MPa(condition),) * 2, rms))
+    return ITEMS[item].table(rows, "", COLUMNS, resolved=True)
 
 
 @pytest.fixture(scope="session")
