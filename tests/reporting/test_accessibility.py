@@ -7,8 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from sealscope.reporting import Mark, render_page, write_index
 from sealscope.reporting.campaign.page import render_campaign_page
+from sealscope.reporting.charts import Mark
+from sealscope.reporting.index import write_index
+from sealscope.reporting.page import render_page
 from sealscope.reporting.printing import BROWSERS
 from sealscope.reporting.thesis.files import publish
 from sealscope.reporting.thesis.page import VERDICTS, write_thesis_page
