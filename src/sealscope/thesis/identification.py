@@ -11,12 +11,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
+from sealscope.campaigns.cases.bound import noise_covariance
+from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
+from sealscope.signals.details import details
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.instruments import decimate
+from sealscope.simulation.integrate import oversampling, sized_run
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, ThesisTable
@@ -24,16 +30,11 @@ from sealscope.thesis.engine.texts import note, texts_of
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, QUANTITIES, Condition, DataSheet, experiment_values, groups
 from sealscope.units import PSI
 
-if TYPE_CHECKING:
-    from sealscope.parameters import Rig
-
 #: Part of a run that is used [s]: after the start-up, two of the slowest command's cycles (2 pi seconds each).
 SETTLING, USED = 7.2, 4.0 * np.pi
 
 
 def _identified_rig() -> Rig:
-    from sealscope.parameters import load_rig
-
     return load_rig(BENCH_RIG)
 
 
@@ -50,11 +51,6 @@ def noise_free_squares(
     Sampled as the instruments do (the rig's rate, its anti-alias filter), over `USED` seconds after the start-up. The
     rig itself sizes `leak`; `values` are set after those of the condition. Raises what simulating raises.
     """
-    from sealscope.signals.details import details
-    from sealscope.simulation.experiment import Experiment
-    from sealscope.simulation.instruments import decimate
-    from sealscope.simulation.integrate import oversampling, sized_run
-
     padded = USED + SETTLING + 128.0 / rig.daq.sample_rate  # the deepest detail looks 120 samples ahead
     values = {**experiment_values(condition), **(values or {})}
     experiment = Experiment.of(rig=rig, command=condition.command, set=values, leak=leak, duration=padded, x_0=x_0)
@@ -79,8 +75,6 @@ def log_rms(squares: Array, sigma: float) -> Array:
 
 def noise_of(rig: Rig, chamber: str) -> float:
     """Return the deviation of a sample [psi] in a chamber's channel by own noise, common noise and conversion."""
-    from sealscope.campaigns.cases.bound import noise_covariance
-
     return float(np.sqrt(noise_covariance(rig, [chamber])[0, 0])) / PSI
 
 
@@ -147,8 +141,6 @@ def _multiplied(rig: Rig, factors: Mapping[str, float]) -> Rig:
 
 def parameters_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate every parameter in which the identified rig differs from the thesis's."""
-    from sealscope.parameters import load_rig
-
     fitted, printed = _identified_rig(), {row.name: row for row in load_rig("thesis").table()}
     rows = [
         (row.name, row.meaning, printed[row.name].given, row.given, row.source)

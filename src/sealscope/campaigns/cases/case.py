@@ -15,6 +15,8 @@ import numpy as np
 
 from sealscope.campaigns.plans.duty import CONTROLLER
 from sealscope.campaigns.plans.model import SimulatedPlan, Use
+from sealscope.control.registry import source_of
+from sealscope.simulation.bench.profile import load_profile
 
 #: The factor whose levels are families of the plan's profile.
 FAMILY = "family"
@@ -67,8 +69,6 @@ def digest(value: Any) -> str:
 
 def profile_key(name: str) -> str:
     """Return a digest of what a bench profile says, the same wherever its file lies."""
-    from sealscope.simulation.bench.profile import load_profile
-
     profile = load_profile(name)
     return digest(repr(replace(profile, name=profile.seeds or profile.name, place="")))
 
@@ -86,8 +86,6 @@ def world(plan: SimulatedPlan) -> dict[str, Any]:
 
 def _families(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
     """Return, for each family of a plan, the digest of what it is: its cases do not depend on another family."""
-    from sealscope.simulation.bench.profile import load_profile
-
     if FAMILY not in plan.factors:
         return {}
     profile = load_profile(plan.profile)
@@ -96,8 +94,6 @@ def _families(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
 
 def _own_controllers(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
     """Return, for each controller of the user's own, the digest of its source: another law gives other cases."""
-    from sealscope.control.registry import source_of
-
     sources = {str(name): source_of(str(name)) for name in plan.factors.get(CONTROLLER, ())}
     return {name: {CONTROLLER: hashlib.sha256(path.read_bytes()).hexdigest()} for name, path in sources.items() if path}
 

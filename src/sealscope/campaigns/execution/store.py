@@ -12,6 +12,7 @@ from sealscope.campaigns.cases.case import CaseInputs, cases_of, code_key, diges
 from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.plans.detectors import DIAGNOSE, plan_detector
 from sealscope.campaigns.plans.model import SimulatedPlan
+from sealscope.diagnosis.registry import PlugIn, detectors
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.storage import rows
 from sealscope.storage.atomic import atomic_write
@@ -81,8 +82,6 @@ def made_from(plan: SimulatedPlan, mode: str = RUN_BY_RUN) -> dict[str, Any]:
 
 def _plug_ins(plan: SimulatedPlan) -> dict[str, str]:
     """Return the detectors of other distributions that a plan runs, each with a hash of its source."""
-    from sealscope.diagnosis.registry import PlugIn, detectors
-
     run = {detector.of for name in plan.detectors if (detector := plan_detector(name)).scorer is None}
     return {
         name: plug_in.fingerprint

@@ -10,23 +10,25 @@ import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sealscope.parameters import Rig
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
+from sealscope.signals.details import details
+from sealscope.signals.filters import reach
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.instruments import record
+from sealscope.simulation.integrate import Trajectory, oversampling, sized_leaks, trajectory
+from sealscope.simulation.leaks import From
+from sealscope.simulation.simulate import prove, simulate_with_truth
 from sealscope.thesis.engine.context import Context, first_table
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, ThesisTable
 from sealscope.thesis.engine.texts import note
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, QUANTITIES, UNITS, Condition, DataSheet, experiment_values
 from sealscope.units import PSI
-
-if TYPE_CHECKING:
-    from sealscope.parameters import Rig
-    from sealscope.simulation.experiment import Experiment
-    from sealscope.simulation.integrate import Trajectory
 
 #: Length of the part without and of the part with the leak [s]; a quick reproduction takes the shorter one.
 HALF, QUICK_HALF = 90.0, 40.0
@@ -71,8 +73,6 @@ def draw_rig_drift(number: int, draw: int = 0) -> RigDrift:
 
 def detail_series(recording: Recording, chamber: str) -> dict[str, Array]:
     """Return d1..d4 [psi] and d3d4 [psi^2] of a chamber's pressure."""
-    from sealscope.signals.details import details
-
     d = details(recording[chamber] / PSI)
     return {**{f"d{level}": d[level] for level in range(1, 5)}, "d3d4": d.product()}
 
@@ -82,8 +82,6 @@ def detail_rms(recording: Recording, parts: tuple[tuple[float, float], ...]) -> 
 
     A part is narrowed by the transform's reach on both sides, so that no coefficient saw anything outside of it.
     """
-    from sealscope.signals.filters import reach
-
     before, after = (int(samples) for samples in reach("db8", 4)[-1])
     rate = recording.rate
     slices = [slice(round(start * rate) + before, round(stop * rate) - after) for start, stop in parts]
@@ -108,24 +106,18 @@ def _range_MPa(t: Array, outputs: Mapping[str, Array] | Trajectory, stop: float)
 
 
 def _experiment(condition: Condition, duration: float, leak: str | None = None, seed: int = 0) -> Experiment:
-    from sealscope.simulation.experiment import Experiment
-
     values = experiment_values(condition)
     return Experiment.of(rig=BENCH_RIG, command=condition.command, set=values, leak=leak, duration=duration, seed=seed)
 
 
 def _recorded(experiment: Experiment, path: Trajectory) -> Recording:
     """Record a trajectory with the rig's instruments and the noise of the experiment's seed."""
-    from sealscope.simulation.instruments import record
-    from sealscope.simulation.integrate import oversampling
-
     volts = experiment.commanded.volts(experiment.sample_times())
     return record(experiment.rig, path, volts, oversampling(experiment), experiment.seed)
 
 
 def _leak_free_paths(duration: float) -> Callable[[Condition], Trajectory]:
     """Return what simulates an operating condition without a leak, each once for this call: a path is large."""
-    from sealscope.simulation.integrate import trajectory
 
     @cache
     def path(command: str, closed_pct: float) -> Trajectory:
@@ -139,10 +131,6 @@ def with_leak(half: float, quick: bool) -> Iterator[Simulated]:
 
     The first test of each condition is proved by halving the step, except in a quick reproduction.
     """
-    from sealscope.simulation.integrate import sized_leaks
-    from sealscope.simulation.leaks import From
-    from sealscope.simulation.simulate import prove, simulate_with_truth
-
     proved: set[tuple[str, float]] = set()
     for condition in APPENDIX_C:
         leak = f"{condition.mean_leak_lpm:g} L/min from {SETTLING:g} s"
@@ -174,8 +162,6 @@ def with_drift(half: float, quick: bool) -> Iterator[Simulated]:
     The second half comes from a rig with other friction, bulk modulus and noise (`draw_rig_drift`), two draws of each
     test, one where it is `quick`.
     """
-    from sealscope.simulation.integrate import trajectory
-
     length = SETTLING + half
     paths, part = _leak_free_paths(length), ((SETTLING, length),)
     for draw, condition in itertools.product(range(1 if quick else 2), APPENDIX_C):

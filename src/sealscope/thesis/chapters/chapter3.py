@@ -9,6 +9,7 @@ import numpy as np
 
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
+from sealscope.signals.filters import discrete_wavelet
 from sealscope.thesis.chapters.chapter4.cases import visible_pressure
 from sealscope.thesis.engine.context import Context, RunSpec
 from sealscope.thesis.engine.items import Item
@@ -31,8 +32,6 @@ _OCTAVES = 24
 
 def mother_wavelet() -> tuple[Array, Array, Array]:
     """Return scaling function, mother wavelet and their time [samples] by the cascade of db8's filters."""
-    from sealscope.signals.filters import discrete_wavelet
-
     phi, psi, t = discrete_wavelet(WAVELET).wavefun(level=10)
     return phi, psi, t
 
@@ -44,7 +43,6 @@ def wavelet_spectrum(omega: Array) -> np.ndarray:
     sum_k taps_k exp(-j w k); unit l2 norm.
     Source: Daubechies, Ten Lectures on Wavelets (1992), eqs. (5.1.17), (6.2.2).
     """
-    from sealscope.signals.filters import discrete_wavelet
 
     def response(taps: list[float], at: Array) -> np.ndarray:
         return np.asarray(np.polynomial.polynomial.polyval(np.exp(-1j * at), np.array(taps, dtype=np.float64)))

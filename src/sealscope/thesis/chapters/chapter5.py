@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
+from sealscope.signals.filters import reach
+from sealscope.signals.windows import WINDOW_SIZE, rms, windowed_rms
 from sealscope.thesis.chapters.appendix_c_runs import SETTLING, detail_rms, detail_series, pressure_range
 from sealscope.thesis.engine.context import Context, RunSpec, SimulatedRun
 from sealscope.thesis.engine.items import Item
@@ -221,9 +223,6 @@ def mean_slope(t: Array, y: Array, omega: float) -> float:
 
 def windowed(recording: Recording, chamber: str) -> tuple[Array, dict[str, Array]]:
     """Return the centres [s] of the windows of 1000 samples, 500 apart, and the RMS of d3, d4, d3d4 in each."""
-    from sealscope.signals.filters import reach
-    from sealscope.signals.windows import WINDOW_SIZE, windowed_rms
-
     before, after = (int(samples) for samples in reach("db8", 4)[-1])
     series = detail_series(recording, chamber)
     inside = slice(before, len(recording) - after)
@@ -266,8 +265,6 @@ def best_step(t: Array, y: Array, least: int = 5) -> float:
 
 def measure_test(context: Context, test: ShownTest, leak: bool = True) -> ShownMeasures:
     """Measure one of the ten tests, or the same run with its leak left out."""
-    from sealscope.signals.windows import rms
-
     spec = spec_of(test)
     run = context.run(spec if leak else replace(spec, leaks=(), prove=False))
     recording = run.recorded

@@ -9,19 +9,18 @@ from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.recording import Array, Recording
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.simulate import simulate_with_truth
 from sealscope.storage.atomic import atomic_write
 from sealscope.storage.folders import locked
 from sealscope.thesis.engine.products import Claim, Product, ThesisTable
 from sealscope.thesis.sheet import DataSheet
-
-if TYPE_CHECKING:
-    from sealscope.simulation.experiment import Experiment
 
 Products = tuple[Product | Claim, ...]
 
@@ -47,8 +46,6 @@ class RunSpec:
 
     def experiment(self) -> Experiment:
         """Return the experiment of this spec."""
-        from sealscope.simulation.experiment import Experiment
-
         given = {name: getattr(self, name) for name in ("command", "duration", "rig", "seed", "method", "step")}
         return Experiment.of(leak=self.leaks, set=dict(self.values), allow_unresolved=True, **given)
 
@@ -80,8 +77,6 @@ class SimulatedRun:
 
 def simulated_run(spec: RunSpec) -> SimulatedRun:
     """Simulate a run, with its halving test where it is asked for."""
-    from sealscope.simulation.simulate import simulate_with_truth
-
     try:
         simulated = simulate_with_truth(spec.experiment(), prove=spec.prove)
     except SimulationFailed as error:

@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 
+from sealscope.parameters import load_rig
 from sealscope.recordings.chambers import PRESSURES
 from sealscope.recordings.recording import Array
 from sealscope.thesis.engine.context import Context, RunSpec, SimulatedRun
@@ -196,7 +197,5 @@ def piston_drift(run: SimulatedRun) -> float:
 
 def visible_pressure() -> float:
     """Return the least pressure difference [Pa] that a transducer of the rig shows: its noise (standard deviation)."""
-    from sealscope.parameters import load_rig
-
     sensors = load_rig("thesis").sensors
     return math.hypot(sensors.p_A.noise, sensors.common_noise)
