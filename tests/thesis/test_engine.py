@@ -214,7 +214,7 @@ def test_without_the_sheet_items_that_need_it_are_left_out(
 
 def test_equal_runs_are_simulated_once(fakes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
-    monkeypatch.setattr(context, "simulated_run", lambda spec: calls.append(spec) or simulated_run(spec))
+    monkeypatch.setattr(context, "simulated_run", lambda *of: calls.append(of) or simulated_run(*of))
     drawn: dict[str, Any] = {}
 
     def publish(of: Item, products: Any, folder: Path) -> tuple[str, ...]:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import copyreg
 import pickle
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from hashlib import sha256
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -23,31 +22,6 @@ from sealscope.thesis.engine.products import Claim, Product, ThesisTable
 from sealscope.thesis.sheet import DataSheet
 
 Products = tuple[Product | Claim, ...]
-
-
-@dataclass(frozen=True)
-class RunSpec:
-    """A simulated run as text and numbers; equal specs are run once.
-
-    `values`: parameters by name, as text with unit or SI number; `leaks` as `simulation.faults.parse_leak` reads
-    them; `prove`: do the halving test too (its outcome is in `SimulatedRun.resolved`; an unresolved run is kept and
-    marked, not raised).
-    """
-
-    command: str = "3 sin(4t)"
-    duration: float = 180.0
-    leaks: tuple[str, ...] = ()
-    rig: str = "thesis"
-    values: tuple[tuple[str, str | float], ...] = ()
-    seed: int = 0
-    method: Literal["auto", "rk4", "imex"] = "auto"
-    step: float | None = None
-    prove: bool = False
-
-    def experiment(self) -> Experiment:
-        """Return the experiment of this spec."""
-        given = {name: getattr(self, name) for name in ("command", "duration", "rig", "seed", "method", "step")}
-        return Experiment.of(leak=self.leaks, set=dict(self.values), allow_unresolved=True, **given)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,12 +49,12 @@ class SimulatedRun:
         return self.recording
 
 
-def simulated_run(spec: RunSpec) -> SimulatedRun:
-    """Simulate a run, with its halving test where it is asked for."""
+def simulated_run(experiment: Experiment, prove: bool) -> SimulatedRun:
+    """Simulate a run, and `prove` it: halve its step, too; one that diverged or is not resolved says so."""
     try:
-        simulated = simulate_with_truth(spec.experiment(), prove=spec.prove)
+        simulated = simulate_with_truth(replace(experiment, allow_unresolved=True), prove=prove)
     except SimulationFailed as error:
-        return SimulatedRun(None, np.empty(0), {}, 0.0, False if spec.prove else None, diverged=str(error))
+        return SimulatedRun(None, np.empty(0), {}, 0.0, False if prove else None, diverged=str(error))
     truth, proof = simulated.truth, simulated.proof
     moved = {} if proof is None else {change.name: change.difference for change in proof.differences}
     resolved = None if proof is None else proof.resolved
@@ -109,13 +83,13 @@ class Context:
     products: Mapping[str, Products]
     runs: Path
 
-    def run(self, spec: RunSpec) -> SimulatedRun:
-        """Return the run of a spec, simulated once while other processes that want it wait."""
-        path = self.runs / f"{sha256(repr(spec).encode()).hexdigest()}.run"
+    def run(self, experiment: Experiment, *, prove: bool = True) -> SimulatedRun:
+        """Return the run of an experiment, simulated once while other processes that want it wait."""
+        path = self.runs / f"{experiment.key()}{'-proved' if prove else ''}.run"
         with locked(path.with_suffix(".lock"), None):
             if not path.exists():
                 with atomic_write(path) as temporary:
-                    temporary.write_bytes(pickle.dumps(simulated_run(spec)))
+                    temporary.write_bytes(pickle.dumps(simulated_run(experiment, prove)))
             run: SimulatedRun = pickle.loads(path.read_bytes())
         return run
 
