@@ -34,10 +34,6 @@ from sealscope.units import PSI
 SETTLING, USED = 7.2, 4.0 * np.pi
 
 
-def _identified_rig() -> Rig:
-    return load_rig(BENCH_RIG)
-
-
 def noise_free_squares(
     rig: Rig,
     condition: Condition,
@@ -141,7 +137,7 @@ def _multiplied(rig: Rig, factors: Mapping[str, float]) -> Rig:
 
 def parameters_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate every parameter in which the identified rig differs from the thesis's."""
-    fitted, printed = _identified_rig(), {row.name: row for row in load_rig("thesis").table()}
+    fitted, printed = load_rig(BENCH_RIG), {row.name: row for row in load_rig("thesis").table()}
     rows = [
         (row.name, row.meaning, printed[row.name].given, row.given, row.source)
         for row in fitted.table()
@@ -154,7 +150,7 @@ def parameters_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate simulated over measured leak-free RMS: geometric means over all tests, and by operating condition."""
     assert context.sheet is not None
-    log = log_residuals(_identified_rig(), context.sheet)
+    log = log_residuals(load_rig(BENCH_RIG), context.sheet)
     columns = [(c, q, log[:, k, j]) for k, c in enumerate(CHAMBERS) for j, q in enumerate(QUANTITIES)]
     rows: list[tuple[Cell, ...]] = []
     for chamber, name, of in columns:
@@ -185,7 +181,7 @@ def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
     measured = [float(100 * np.expm1(np.mean(sheet.log_change(c, q)))) for c, q in changed]
     rows: list[tuple[Cell, ...]] = [("the sheet", *[1.0] * 4, *measured, *[41] * 4)]
-    rig = _identified_rig()
+    rig = load_rig(BENCH_RIG)
     for hypothesis in HYPOTHESES[:2] if context.quick else HYPOTHESES:
         predicted = predicted_sheet(rig, hypothesis)
         levels = [np.mean(np.log(predicted.rms[c][q][:, 0] / sheet.rms[c][q][:, 0])) for c, q in shown]
