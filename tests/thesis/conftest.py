@@ -120,6 +120,10 @@ def broken(context, item):
     raise RuntimeError("no such curve\\nsecond line")
 
 
+def odd(context, item):
+    return (ThesisTable(item.id, item.title, ("a",), ((object(),),)),)
+
+
 def interrupted(context, item):
     if not Path(os.environ["FAKE_LOG"] + ".go").exists():
         raise KeyboardInterrupt

@@ -288,6 +288,12 @@ def test_a_failure_is_told_and_the_others_go_on(fakes: Path, tmp_path: Path, job
     assert "second line" in (tmp_path / "out" / "kept" / "rows.jsonl").read_text()
 
 
+def test_what_cannot_be_stored_fails_alone(fakes: Path, tmp_path: Path) -> None:
+    outcome = reproduce(["all"], "out", items=(item("t-0", "odd"), item("t-1", "table")), jobs=1)
+    assert states(outcome) == {"t-0": "failed", "t-1": "made"}
+    assert outcome["t-0"].reason.startswith("TypeError: ")
+
+
 def test_a_process_that_dies_takes_only_its_item(fakes: Path, tmp_path: Path) -> None:
     items = (item("t-1", "dies"), *(item(f"t-{number}", "table") for number in range(2, 6)))
     outcome = reproduce(["all"], "out", items=items, jobs=2)

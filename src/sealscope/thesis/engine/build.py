@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from graphlib import TopologicalSorter
 from importlib import metadata
-from json import loads
+from json import dumps, loads
 from pathlib import Path
 from typing import Any, Literal
 
@@ -105,8 +105,11 @@ def reproduce(
         statuses = {item.id: _status(item, data, rows.get(item.id), place) for item in every}
         waiting = {item.id: item for item in chosen if statuses[item.id].state == "not made"}
         runs = inner_folder(kept, "runs")
-        shutil.rmtree(runs)  # of a call that was broken off, or from outside: pickles
-        runs.mkdir()
+        try:
+            shutil.rmtree(runs)  # pickles of a call that was broken off, or from outside
+            runs.mkdir()
+        except OSError as error:
+            raise InputError(f"a folder of runs must be emptied, got: {error.strerror or error} ({runs})") from None
         task = partial(_made, quick, data, publish, place, runs)
         in_work: list[str] = []
         ended = 0
@@ -130,7 +133,7 @@ def reproduce(
                 ended += 1
             order.done(*ready)
         progress(ended, len(waiting), in_work)
-        shutil.rmtree(runs)
+        shutil.rmtree(runs, ignore_errors=True)
     return statuses
 
 
@@ -179,9 +182,11 @@ def _made(
     try:
         products = tuple(map(_thinned, item.make(context, item)))
         files = () if publish is None else publish(item, products, folder)
+        row = ItemRow(item.id, key, tuple(map(undrawn, products)), files)
+        dumps(row.as_dict())  # what cannot be stored fails here, and not all the others with it
     except Exception as error:
         return ItemRow(item.id, key, error=error_text(error) or type(error).__name__, trace=traceback.format_exc())
-    return ItemRow(item.id, key, tuple(map(undrawn, products)), files)
+    return row
 
 
 def _thinned(product: Product | Claim) -> Product | Claim:
