@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sealscope.campaigns.execution.store import ROWS, read_rows
+from sealscope.campaigns.execution.store import read_rows
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig, parse_overrides
 from sealscope.recordings import read, split_map_option
@@ -32,6 +32,7 @@ from sealscope.recordings.formats.timebase import is_stamp
 from sealscope.simulation.commands import parse_command
 from sealscope.simulation.faults import parse_fault
 from sealscope.simulation.leaks import parse_leak
+from sealscope.storage.rows import ROWS
 from sealscope.units import parse_quantity, parse_unit
 
 HEAD = "t [s],p_A [Pa]\n"

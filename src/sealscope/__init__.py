@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from sealscope.recordings import read as read
     from sealscope.recordings import read_parts as read_parts
     from sealscope.recordings import write as write
-    from sealscope.reporting import write_page as write_page
+    from sealscope.reporting.page import write_page as write_page
     from sealscope.signals.streams import DetailStream as DetailStream
     from sealscope.signals.windows import RmsStream as RmsStream
     from sealscope.simulation.batch.batch import simulate_batch as simulate_batch
@@ -56,7 +56,7 @@ _NAMES = {
     "parameters": "Rig load_rig",
     "recordings": "inspect read read_parts write",
     "recordings.recording": "Recording",
-    "reporting": "write_page",
+    "reporting.page": "write_page",
     "signals.streams": "DetailStream",
     "signals.windows": "RmsStream",
     "simulation.batch.batch": "simulate_batch",

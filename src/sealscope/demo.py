@@ -10,7 +10,7 @@ from sealscope.diagnosis.commissioned.machine import CommissionedMachine, commis
 from sealscope.diagnosis.commissioned.machine_file import write_machine
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.recordings import read, write
-from sealscope.reporting import write_page
+from sealscope.reporting.page import write_page
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import Progress, Truth, simulate_with_truth
 from sealscope.storage.folders import make_folder

@@ -16,7 +16,7 @@ from sealscope.campaigns.cases.scoring import stated
 from sealscope.campaigns.cases.work import work
 from sealscope.campaigns.execution import batches, store
 from sealscope.campaigns.execution import run as campaign
-from sealscope.campaigns.execution.batches import StepChooser
+from sealscope.campaigns.execution.batches import step_chooser
 from sealscope.campaigns.plans.reader import read_plan
 from sealscope.campaigns.results import simulated_result, write_result
 from sealscope.diagnosis.diagnose import Examination
@@ -57,7 +57,7 @@ def rows_of(plan, cases):
 def alone(plan, case):
     """Scores of a case's whole recording, at the step that it has in a batch."""
     experiment = unsized(plan, case)
-    experiment = replace(experiment, step=StepChooser(plan).of(case, experiment))
+    experiment = replace(experiment, step=step_chooser(plan)(case, experiment))
     made = simulate_with_truth(replace(experiment, leaks=sized_once(experiment)))
     examination = Examination(made.recording, false_alarm_probability=plan.false_alarm, rig=plan.rig)
     return stated(examination, plan.onset_s, plan.detectors, plan.views)[0], made.truth

@@ -54,7 +54,7 @@ def test_no_more_processes_than_two_a_core(call, tiny, tmp_path, monkeypatch):
     assert [workers.process_count(asked) for asked in (None, 1, 4, 30)] == [2, 1, 4, 4]
     started = []
 
-    def ended(task, cases, jobs):
+    def ended(task, cases, jobs, cluster):
         started.append(jobs)
         yield from ((case, CaseRow.of(case, error="not carried out")) for case in cases)
 

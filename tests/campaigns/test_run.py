@@ -22,6 +22,7 @@ from sealscope.campaigns.execution import store
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.campaigns.results import simulated_result, write_result
 from sealscope.errors import InputError, MissingExtra, SimulationFailed, UnreadableFile
+from sealscope.storage.rows import ROWS, locked
 
 SOURCES = Path(campaign.__file__).resolve().parents[3]
 
@@ -53,7 +54,7 @@ def start(plan, folder):
 
 def wait_for_rows(folder, count, process):
     """Until so many rows are there."""
-    path = folder / store.ROWS
+    path = folder / ROWS
     until = time.monotonic() + 120
     while time.monotonic() < until:
         if path.is_file() and path.read_bytes().count(b"\n") >= count:
@@ -73,7 +74,7 @@ def test_killed_twice_it_goes_on_to_the_same_bytes(once, tiny, tmp_path):
         wait_for_rows(folder, count, process)
         process.kill()
         process.wait()
-        with (folder / store.ROWS).open("ab") as file:  # the line that was being written when it died
+        with (folder / ROWS).open("ab") as file:  # the line that was being written when it died
             file.write(b'{"id": "0123", "sco')
     before = store.progress_of(plan, folder)
     assert 12 <= before.done < 26
@@ -81,7 +82,7 @@ def test_killed_twice_it_goes_on_to_the_same_bytes(once, tiny, tmp_path):
     assert campaign.run(plan, folder, jobs=2, progress=lambda *words: reported.append(words)).complete
     assert reported[0] == (before.done, 26, 0)
     assert files_of(plan, folder) == expected
-    ids = [json.loads(line)["id"] for line in (folder / store.ROWS).read_bytes().splitlines()]
+    ids = [json.loads(line)["id"] for line in (folder / ROWS).read_bytes().splitlines()]
     assert len(ids) == len(set(ids)) == 26
 
 
@@ -244,14 +245,14 @@ def test_more_records_and_detectors_are_added_to_what_is_there(finished_tiny, te
 def test_two_at_once_are_refused(tiny, tmp_path):
     plan = load_plan(tiny)
     store.begin(tmp_path / "mine", store.made_from(plan))
-    with store.locked(tmp_path / "mine"), pytest.raises(InputError, match="by one process at a time"):
+    with locked(tmp_path / "mine", "a campaign"), pytest.raises(InputError, match="by one process at a time"):
         campaign.run(plan, tmp_path / "mine", jobs=1)
 
 
 def test_a_spoilt_line_is_refused_with_its_place(tiny, tmp_path):
     plan = load_plan(tiny)
     store.begin(tmp_path, store.made_from(plan))
-    (tmp_path / store.ROWS).write_bytes(b'{"id": 3}\n')
+    (tmp_path / ROWS).write_bytes(b'{"id": 3}\n')
     with pytest.raises(UnreadableFile, match=r"rows.jsonl, line 1"):
         store.progress_of(plan, tmp_path)
 

@@ -16,6 +16,7 @@ from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.campaigns.results import simulated_result, write_result
 from sealscope.errors import InputError
+from sealscope.storage.rows import ROWS
 
 resource = pytest.importorskip("resource")
 
@@ -96,7 +97,7 @@ def test_a_campaign_goes_on_when_there_is_room_again(plan: SimulatedPlan, tmp_pa
             break
         except InputError as error:
             refusals += 1
-            name = store.HEAD if size == 0 else store.ROWS
+            name = store.HEAD if size == 0 else ROWS
             assert str(error).startswith(f"cannot write {tmp_path / 'full' / name}: ")
             assert not list((tmp_path / "full").glob(".*.part"))
     assert refusals > 5

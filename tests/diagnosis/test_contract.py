@@ -281,7 +281,7 @@ def test_odds_in_words() -> None:
 
 
 def test_odds_are_in_every_output(leaky: Recording) -> None:
-    from sealscope.reporting import diagnosis_text
+    from sealscope.reporting.messages import diagnosis_text
 
     result = diagnose(leaky)
     assert result.verdict == "leak"

@@ -38,8 +38,10 @@ from sealscope.simulation.commands import parse_command
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults import parse_fault
 from sealscope.simulation.leaks import parse_leak
-from sealscope.thesis.engine.kept import ResultsFolder
-from sealscope.thesis.engine.products import Claim, Figure, FigureCurve, Image, Number, Panel, ThesisTable
+from sealscope.storage.plain_values import as_type
+from sealscope.storage.rows import LOCK, ROWS, read_rows, stored
+from sealscope.thesis.engine.build import ItemRow
+from sealscope.thesis.engine.products import Claim, Figure, Number, ThesisTable
 from sealscope.units import parse_quantity, parse_unit
 
 from .mutations import change_tree, changed_bytes, changed_option, changed_toml
@@ -287,7 +289,7 @@ def campaigns(folder: Path) -> Use:
     write_result(simulated_result(plan, whole), whole)
     outside.mkdir()
     (outside / "diary.txt").write_text("kept\n")
-    names = [store.ROWS, store.ROWS, store.ROWS, store.HEAD, store.LOCK]
+    names = [ROWS, ROWS, ROWS, store.HEAD, LOCK]
 
     def change(draw: random.Random) -> None:
         name = draw.choice(names)
@@ -303,7 +305,7 @@ def campaigns(folder: Path) -> Use:
             case 2 | 3:
                 path.write_bytes(changed_bytes(data or b"\n", draw))
             case _:
-                lines = data.splitlines() if name == store.ROWS else [data]
+                lines = data.splitlines() if name == ROWS else [data]
                 at = draw.randrange(len(lines)) if lines else 0
                 try:
                     tree = json.loads(lines[at])
@@ -334,43 +336,28 @@ def campaigns(folder: Path) -> Use:
 
 
 def _products() -> tuple[Any, ...]:
-    curve = FigureCurve(T, np.sin(T), "p_A", "A")
-    image = Image(T[:4], T[:3], np.ones((3, 4)), "power")
-    panel = Panel("t [s]", "p_A [MPa]", (curve,), "title", ((1.0, "onset"),), None, (0.0, 5.0))
     return (
-        Figure("fig-1", "A figure", (panel, Panel("x", "y", image=image)), (Number("n", 1.0, "s"),), resolved=True),
+        Figure("fig-1", "A figure", (), (Number("n", 1.0, "s"),), resolved=True),
         ThesisTable("tab-1", "A table", ("a", "b"), ((1, "x"), (None, 2.5))),
         Claim("c-1", "p. 1", "a claim", "sheet", "simulation", "holds", "why"),
     )
 
 
 def kept(folder: Path) -> Use:
-    """What a reproduction keeps: products and notes, changed in their bytes or in their structure."""
-    results = ResultsFolder(folder / "results")
-    results.save("fig-1", "k", _products(), ("figures/a.svg",))
-    path = next((folder / "results" / "kept" / "items").glob("*.npz"))
+    """The rows of a reproduction, changed in their bytes or in their structure."""
+    row = ItemRow("fig-1", "k", _products(), ("figures/a.svg",))
+    list(stored(folder, (of for of in [row]), "a reproduction"))
+    path = folder / ROWS
     whole = path.read_bytes()
-    with np.load(path) as file:
-        arrays = {name: file[name] for name in file.files}
 
     def use(draw: random.Random) -> bool:
         if draw.random() < 0.5:
             path.write_bytes(changed_bytes(whole, draw))
         else:
-            changed = dict(arrays)
-            name = draw.choice(("value", "note"))
-            tree = json.loads(bytes(changed[name]))
+            tree = json.loads(whole)
             change_tree(tree, draw)
-            changed[name] = np.frombuffer(json.dumps(tree).encode(), dtype=np.uint8)
-            with path.open("wb") as file:
-                np.savez(file, **changed)
-
-        def work() -> object:
-            results.files("fig-1", "k")
-            return results.products("fig-1", "k")
-
-        assert taken(work)  # a damaged file is one that is not there
-        return results.products("fig-1", "k") is not None
+            path.write_text(json.dumps(tree) + "\n")
+        return taken(lambda: read_rows(folder, lambda tree: as_type(ItemRow, tree), "a reproduction", json.loads))
 
     return use
 

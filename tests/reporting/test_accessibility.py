@@ -7,8 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from sealscope.reporting import Mark, render_page, write_index
 from sealscope.reporting.campaign.page import render_campaign_page
+from sealscope.reporting.charts import Mark
+from sealscope.reporting.index import write_index
+from sealscope.reporting.page import render_page
 from sealscope.reporting.printing import BROWSERS
 from sealscope.reporting.thesis.files import publish
 from sealscope.reporting.thesis.page import VERDICTS, write_thesis_page
@@ -65,8 +67,8 @@ def _thesis(folder: Path):
         (Item("table-4.2-a", 4, "case", "T", print), (table,)),
         (Item("chapter-4-claims", 4, "claims", "C", print), claims),
     ):
-        made.append((ItemStatus(item, "made", files=publish(item, products, folder)), products))
-    return [*made, (ItemStatus(Item("fig-1.1", 4, "figure", "F", print), "not made"), ())]
+        made.append(ItemStatus(item, "made", products=products, files=publish(item, products, folder)))
+    return [*made, ItemStatus(Item("fig-1.1", 4, "figure", "F", print), "not made")]
 
 
 def faults(browser, page: Path, width: int, scheme: str) -> list[str]:

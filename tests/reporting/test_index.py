@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from sealscope.reporting import write_index
+from sealscope.reporting.index import write_index
 
 EVIL = 'a"><script>alert(1)</script>.nc'
 

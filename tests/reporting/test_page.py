@@ -16,7 +16,8 @@ from sealscope.diagnosis.verdict.evidence import Evidence, LeakCourse
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.recordings.quality import Finding
-from sealscope.reporting import Mark, render_page, write_page
+from sealscope.reporting.charts import Mark
+from sealscope.reporting.page import render_page, write_page
 from sealscope.reporting.particulars import particulars_of
 from sealscope.reporting.schematic import circuit_of, schematic
 

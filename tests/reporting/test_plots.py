@@ -220,15 +220,15 @@ def page(tmp_path: Path) -> str:
         for k, verdict in enumerate(VERDICTS)
     )
     long = ThesisTable("table-4.2-a", "Cases", ("name", "p_A [MPa]"), tuple((f"row {k}", k * 1e-7) for k in range(60)))
-    made: list[tuple[ItemStatus, tuple[Figure | ThesisTable | Claim, ...]]] = []
+    made: list[ItemStatus] = []
     for item, products in (
         (Item("fig-4.22", 4, "figure", "F", make), (figure(resolved=False),)),
         (Item("table-4.2-a", 4, "case", "T", make), (long,)),
         (Item("chapter-4-claims", 4, "claims", "C", make), claims),
     ):
-        made.append((ItemStatus(item, "made", files=publish(item, products, tmp_path)), products))
-    made.append((ItemStatus(Item("table-5.1", 5, "table", "Rates", make), "left out", "needs the data sheet"), ()))
-    made.append((ItemStatus(Item("fig-5.1", 5, "figure", "Broken", make), "failed", "RuntimeError: <no>"), ()))
+        made.append(ItemStatus(item, "made", products=products, files=publish(item, products, tmp_path)))
+    made.append(ItemStatus(Item("table-5.1", 5, "table", "Rates", make), "left out", "needs the data sheet"))
+    made.append(ItemStatus(Item("fig-5.1", 5, "figure", "Broken", make), "failed", "RuntimeError: <no>"))
     write_thesis_page(tmp_path, made, quick=True)
     return (tmp_path / "index.html").read_text(encoding="utf-8")
 
@@ -273,7 +273,7 @@ def test_the_pages_script_is_the_one_its_policy_allows(page: str) -> None:
 
 
 def test_an_empty_folder_gives_a_page_that_says_so(tmp_path: Path) -> None:
-    page = write_thesis_page(tmp_path, [(ItemStatus(Item("fig-1.1", 4, "figure", "F", make), "not made"), ())])
+    page = write_thesis_page(tmp_path, [ItemStatus(Item("fig-1.1", 4, "figure", "F", make), "not made")])
     text = page.read_text(encoding="utf-8")
     assert "0 of 1 items" in text
     assert "not made yet, or from other sources (1)" in text

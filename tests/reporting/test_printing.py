@@ -17,8 +17,8 @@ import pytest
 
 from sealscope.diagnosis.verdict.evidence import LeakCourse
 from sealscope.errors import InputError, MissingExtra
-from sealscope.reporting import printing, write_page
-from sealscope.reporting.page import render_card
+from sealscope.reporting import printing
+from sealscope.reporting.page import render_card, write_page
 
 PAGE = "<!DOCTYPE html><title>t</title><h1>Leak</h1>"
 BROWSER = next(filter(None, map(shutil.which, printing.BROWSERS)), None)

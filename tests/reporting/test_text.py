@@ -6,7 +6,8 @@ import pytest
 
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.diagnosis.verdict.states import state_of
-from sealscope.reporting import diagnosis_text, messages
+from sealscope.reporting import messages
+from sealscope.reporting.messages import diagnosis_text
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,8 @@ from sealscope.campaigns.plans.reader import load_plan
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.storage.atomic import atomic_write, remove_temporaries
 from sealscope.storage.opening import open_inner, open_regular
+from sealscope.storage.rows import LOCK, ROWS
 from sealscope.thesis.engine.build import reproduce
-from sealscope.thesis.engine.kept import ResultsFolder
 
 PLAN = """
 [campaign]
@@ -48,7 +48,7 @@ def plan(tmp_path: Path) -> SimulatedPlan:
     return load_plan(tmp_path / "plan.toml")  # type: ignore[return-value]
 
 
-@pytest.mark.parametrize("name", [store.LOCK, store.ROWS, store.HEAD])
+@pytest.mark.parametrize("name", [LOCK, ROWS, store.HEAD])
 @pytest.mark.parametrize("kind", ["link", "link to nothing", "hard link"])
 def test_a_campaign_follows_no_link(name: str, kind: str, plan: SimulatedPlan, outside: Path, tmp_path: Path) -> None:
     folder = tmp_path / "campaign"
@@ -78,11 +78,11 @@ def test_a_pipe_in_a_folder_is_not_waited_for(name: str, plan: SimulatedPlan, tm
         run(plan, tmp_path / "campaign", jobs=1)
 
 
-@pytest.mark.parametrize("name", ["kept", "kept/items", "kept/runs", "kept/failed", "kept/lock"])
+@pytest.mark.parametrize("name", ["kept", "kept/runs", "kept/.lock", "kept/rows.jsonl"])
 def test_a_reproduction_follows_no_link(name: str, outside: Path, tmp_path: Path) -> None:
     path = tmp_path / "thesis" / name
     path.parent.mkdir(parents=True)
-    path.symlink_to(outside / "diary.txt" if name.endswith("lock") else outside)
+    path.symlink_to(outside / "diary.txt" if name.endswith((".lock", ".jsonl")) else outside)
     with pytest.raises(InputError, match=r"got (a link|one) "):
         reproduce(["table-5.1"], tmp_path / "thesis", jobs=1)
 
@@ -95,17 +95,6 @@ def test_products_go_into_no_linked_folder(name: str, outside: Path, tmp_path: P
     (tmp_path / "thesis" / name).symlink_to(outside)
     with pytest.raises(InputError, match="a folder of results must not be a link"):
         publish(None, (), tmp_path / "thesis")  # type: ignore[arg-type]  # the folders are first
-
-
-def test_a_kept_file_or_failure_is_no_link(outside: Path, tmp_path: Path) -> None:
-    kept = ResultsFolder(tmp_path / "thesis")
-    for place in ("failed/tab-1.txt", "items/tab-1.npz"):
-        (tmp_path / "thesis" / "kept" / place).symlink_to(outside / "diary.txt")
-    kept.save_failure("tab-1", "trace")
-    kept.save("tab-2", "key", ())
-    assert kept.products("tab-1", "key") is None
-    assert kept.files("tab-1", "key") is None
-    assert (tmp_path / "thesis" / "kept" / "failed" / "tab-1.txt").read_text() == "trace"
 
 
 @pytest.mark.parametrize("name", ["out.nc", "out.csv", "page.html"])

@@ -18,7 +18,7 @@ from sealscope.simulation.commands import Chirp, check_command, parse_command
 from sealscope.simulation.faults import Fault, parse_fault
 from sealscope.simulation.leaks import parse_leak
 from sealscope.storage.opening import names_a_file
-from sealscope.thesis.engine.kept import ResultsFolder
+from sealscope.storage.rows import ROWS
 from sealscope.units import parse_quantity
 
 PLAN = '[campaign]\nname = "a"\nduration = "6 s"\ndetectors = ["rms change"]\n[[records]]\ncount = 1\n'
@@ -72,15 +72,9 @@ def test_what_no_path_can_be_is_no_file(name: str) -> None:
         load_rig(name)
 
 
-def test_a_kept_note_of_drawn_files_with_such_a_name(tmp_path: Path) -> None:
-    kept = ResultsFolder(tmp_path)
-    kept.save("fig-1", "k", (), ("x" * 500,))
-    assert kept.files("fig-1", "k") is None
-
-
 def test_a_row_without_its_time_is_no_row(tmp_path: Path) -> None:
     row = '{"id": "a", "use": "judge", "leak_lpm": 0, "fault": "", "levels": {}, "replicate": 0, "error": "e", '
-    (tmp_path / store.ROWS).write_text(row + '"scores": {}, "seconds": null}\n')
+    (tmp_path / ROWS).write_text(row + '"scores": {}, "seconds": null}\n')
     with pytest.raises(UnreadableFile, match="a line of a campaign must be a row, got something else"):
         store.read_rows(tmp_path)
 

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.thesis.chapters.appendix_c_runs import SimulatedTest, table_of
-from sealscope.thesis.engine.context import RunSpec, SimulatedRun, simulated_run
+from sealscope.simulation.experiment import Experiment
+from sealscope.thesis.chapters.appendix_c_runs import COLUMNS, row_of
+from sealscope.thesis.engine.context import SimulatedRun, simulated_run
 from sealscope.thesis.engine.items import Item, collect
 from sealscope.thesis.engine.products import Claim, Figure, Product, ThesisTable
 from sealscope.thesis.sheet import APPENDIX_C, FILES, QUANTITIES, Condition, DataSheet, read_sheet
@@ -37,14 +38,15 @@ class Kept:
         self,
         products: dict[str, tuple[Product | Claim, ...]] | None = None,
         sheet: DataSheet | None = None,
-        runs: dict[RunSpec, SimulatedRun] | None = None,
+        runs: dict[tuple[str, bool], SimulatedRun] | None = None,
     ) -> None:
         self.products, self.sheet, self.runs = products or {}, sheet, {} if runs is None else runs
 
-    def run(self, spec: RunSpec) -> SimulatedRun:
-        if spec not in self.runs:
-            self.runs[spec] = simulated_run(spec)
-        return self.runs[spec]
+    def run(self, experiment: Experiment, *, prove: bool = True) -> SimulatedRun:
+        of = experiment.key(), prove
+        if of not in self.runs:
+            self.runs[of] = simulated_run(experiment, prove)
+        return self.runs[of]
 
     def product(self, item: str) -> tuple[Product | Claim, ...]:
         return self.products[item]
@@ -75,8 +77,8 @@ def table_with(sheet: DataSheet, item: str, range_MPa: Callable[[Condition], flo
     rows = []
     for k, condition in enumerate(APPENDIX_C):
         rms = {c: {q: tuple(sheet.rms[c][q][k].tolist()) for q in QUANTITIES} for c in CHAMBERS}
-        rows.append(SimulatedTest(condition, rms, condition.mean_leak_lpm, (range_MPa(condition),) * 2, True))
-    return table_of(rows, ITEMS[item])
+        rows.append(row_of(condition, "", condition.mean_leak_lpm, (range_MPa(condition),) * 2, rms))
+    return ITEMS[item].table(rows, "", COLUMNS, resolved=True)
 
 
 @pytest.fixture(scope="session")
@@ -88,7 +90,7 @@ def measured_sheet() -> DataSheet:
 CHAPTER = """
 import os, time
 from pathlib import Path
-from sealscope.thesis.engine.context import RunSpec
+from sealscope.simulation.experiment import Experiment
 from sealscope.thesis.engine.products import Claim, FigureCurve, Figure, Panel, ThesisTable
 
 def _note(item):
@@ -118,6 +120,10 @@ def broken(context, item):
     raise RuntimeError("no such curve\\nsecond line")
 
 
+def odd(context, item):
+    return (ThesisTable(item.id, item.title, ("a",), ((object(),),)),)
+
+
 def interrupted(context, item):
     if not Path(os.environ["FAKE_LOG"] + ".go").exists():
         raise KeyboardInterrupt
@@ -145,7 +151,7 @@ def perhaps_measured(context, item):
 
 def simulated(context, item):
     _note(item)
-    run = context.run(RunSpec("3 sin(4t)", 2.0, prove=True))
+    run = context.run(Experiment.of(command="3 sin(4t)", duration=2.0))
     curve = FigureCurve(run.t, run.outputs["p_A"] / 1e6, "p_A", "A")
     return (Figure(item.id, item.title, (Panel("t [s]", "p_A [MPa]", (curve,)),), resolved=run.resolved),)
 """

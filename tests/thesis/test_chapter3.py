@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sealscope.parameters import load_rig
+from sealscope.simulation.experiment import Experiment
 from sealscope.thesis.chapters import chapter3
 from sealscope.thesis.chapters.chapter3 import (
     continuous_transform,
@@ -14,7 +15,7 @@ from sealscope.thesis.chapters.chapter3 import (
     wavelet_centre,
     wavelet_spectrum,
 )
-from sealscope.thesis.engine.context import RunSpec, SimulatedRun
+from sealscope.thesis.engine.context import SimulatedRun
 from sealscope.thesis.engine.products import Claim, Figure, verdict_of
 
 from .conftest import ITEMS, Kept, numbers
@@ -144,8 +145,8 @@ def test_a_pressure_that_drops_makes_claim_3_6_hold(monkeypatch: pytest.MonkeyPa
     from dataclasses import replace
 
     class Dropping(Kept):
-        def run(self, spec: RunSpec) -> SimulatedRun:
-            run = super().run(spec)
+        def run(self, spec: Experiment, *, prove: bool = True) -> SimulatedRun:
+            run = super().run(spec, prove=prove)
             if not spec.leaks:
                 return run
             return replace(run, outputs={name: 0.5 * values for name, values in run.outputs.items()})

@@ -4,6 +4,8 @@ that are broken off, fail or lose a process."""
 from __future__ import annotations
 
 import importlib
+import json
+import math
 import os
 import re
 import signal
@@ -11,6 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Any
@@ -18,12 +21,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sealscope.errors import InputError
-from sealscope.thesis.engine import build
-from sealscope.thesis.engine.build import Reproduction, reproduce
-from sealscope.thesis.engine.context import RunSpec, simulated_run
+from sealscope.errors import InputError, UnreadableFile
+from sealscope.storage.plain_values import as_type
+from sealscope.storage.rows import locked, read_rows, stored
+from sealscope.thesis.engine import build, context
+from sealscope.thesis.engine.build import ItemRow, ItemStatus, reproduce, undrawn
+from sealscope.thesis.engine.context import simulated_run
 from sealscope.thesis.engine.items import Item, collect, select_items
-from sealscope.thesis.engine.kept import ResultsFolder
 from sealscope.thesis.engine.products import Claim, Figure, FigureCurve, Image, Number, Panel, ThesisTable
 from sealscope.thesis.sheet import MISSING
 
@@ -52,8 +56,8 @@ def worked(tmp_path: Path) -> list[str]:
     return log.read_text().split() if log.exists() else []
 
 
-def states(outcome: Reproduction) -> dict[str, str]:
-    return {name: status.state for name, status in outcome.statuses.items()}
+def states(outcome: dict[str, ItemStatus]) -> dict[str, str]:
+    return {name: status.state for name, status in outcome.items()}
 
 
 # registry
@@ -101,7 +105,7 @@ def test_a_second_call_makes_nothing(fakes: Path, tmp_path: Path) -> None:
     assert states(first) == {"t-1": "made", "t-2": "made"}
     assert states(second) == {"t-1": "kept", "t-2": "kept"}
     assert worked(tmp_path) == ["t-1", "t-2"]
-    (table,) = second.products("t-2") or ()
+    (table,) = second["t-2"].products
     assert isinstance(table, ThesisTable)
     assert table.rows == ((2,),)
 
@@ -122,8 +126,7 @@ def test_changed_inputs_and_quick_make_anew(fakes: Path, tmp_path: Path) -> None
     assert states(reproduce(["all"], "out", items=(changed,), jobs=1, quick=True)) == {"t-1": "kept"}
 
 
-@pytest.mark.parametrize("name", ["kept/items/t-1.npz", "drawn.txt"])
-def test_a_damaged_or_lost_file_is_made_anew(name: str, fakes: Path, tmp_path: Path) -> None:
+def test_a_lost_drawing_is_made_anew(fakes: Path, tmp_path: Path) -> None:
     def publish(of: Item, products: object, folder: Path) -> tuple[str, ...]:
         (folder / "drawn.txt").write_text(of.id)
         return ("drawn.txt",)
@@ -131,12 +134,23 @@ def test_a_damaged_or_lost_file_is_made_anew(name: str, fakes: Path, tmp_path: P
     items = (item("t-1", "table"),)
     reproduce(["all"], "out", items=items, jobs=1, publish=publish)
     assert states(reproduce(["all"], "out", items=items, jobs=1, publish=publish)) == {"t-1": "kept"}
-    if name == "drawn.txt":
-        (tmp_path / "out" / name).unlink()
-    else:
-        (tmp_path / "out" / name).write_bytes(b"PK broken")
+    (tmp_path / "out" / "drawn.txt").unlink()
     assert states(reproduce(["all"], "out", items=items, jobs=1, publish=publish)) == {"t-1": "made"}
     assert (tmp_path / "out" / "drawn.txt").read_text() == "t-1"
+
+
+def test_a_damaged_row_is_one_line_with_its_place(fakes: Path, tmp_path: Path) -> None:
+    items = (item("t-1", "table"), item("t-2", "table"))
+    reproduce(["all"], "out", items=items, jobs=1)
+    rows = tmp_path / "out" / "kept" / "rows.jsonl"
+    whole = rows.read_bytes()
+    rows.write_bytes(whole[:-9])  # the last was being written when the power went
+    assert states(reproduce(["all"], "out", items=items, jobs=1)) == {"t-1": "kept", "t-2": "made"}
+    assert rows.read_bytes() == whole
+    for damage in (b"PK" + whole, whole.replace(b'"columns"', b'"colours"'), b"[" * 10**5 + b"\n"):
+        rows.write_bytes(damage)
+        with pytest.raises(UnreadableFile, match=r"must be a row, got something else .*rows\.jsonl, line 1"):
+            reproduce(["all"], "out", items=items, jobs=1)
 
 
 def test_only_the_asked_items_and_their_needs_are_made(fakes: Path, tmp_path: Path) -> None:
@@ -151,41 +165,29 @@ def test_only_the_asked_items_and_their_needs_are_made(fakes: Path, tmp_path: Pa
 def test_a_maker_may_ask_only_for_what_it_named(fakes: Path, tmp_path: Path) -> None:
     items = (item("t-1", "table"), item("t-2", "unknown_need"))
     outcome = reproduce(["all"], "out", items=items, jobs=1)
-    assert outcome.statuses["t-2"].reason == "t-2 must name t-1 among its needs to ask for its products"
+    assert outcome["t-2"].reason == "t-2 must name t-1 among its needs to ask for its products"
 
 
 def test_a_folder_in_use_is_refused(fakes: Path, tmp_path: Path) -> None:
-    with ResultsFolder(tmp_path / "out").locked(), pytest.raises(InputError, match="one call at a time"):
+    (tmp_path / "out" / "kept").mkdir(parents=True)
+    with locked(tmp_path / "out" / "kept", "x"), pytest.raises(InputError, match="by one process at a time"):
         reproduce(["all"], "out", items=(item("t-1", "table"),), jobs=1)
 
 
-def test_products_and_runs_survive_the_file(tmp_path: Path) -> None:
+def test_products_survive_the_file_but_for_what_is_drawn(tmp_path: Path) -> None:
     t = np.linspace(0.0, 1.0, 5)
-    curve, image = FigureCurve(t, t**2, "x", "A"), Image(t, t, np.eye(5), "z")
-    panel = Panel("t [s]", "x", (curve,), "a", ((0.5, "here"),), image, (0.0, 1.0), log_y=True)
-    numbers = (Number("n", float("nan"), "Pa"), Number("m", "text"))
+    panel = Panel("t [s]", "x", (FigureCurve(t, t**2, "x", "A"),), image=Image(t, t, np.eye(5), "z"))
+    numbers = (Number("n", float("inf"), "Pa"), Number("m", "text"))
     figure = Figure("fig-1", "One", (panel,), numbers, ("claim-1",), False, "note")
     claim = Claim("claim-1", "section 1", "It is.", "so", "so", "holds", "why")
-    table = ThesisTable("t-1", "T", ("a", "b"), ((1, 2.5), ("x", None), (np.float64(0.5), True)))
-    kept = ResultsFolder(tmp_path)
-    kept.save("one", "key", (figure, claim, table))
-    again: Any = kept.products("one", "key")
-    assert kept.products("one", "other key") is None
-    assert again[1] == claim
-    assert (again[2].id, again[2].rows) == ("t-1", ((1, 2.5), ("x", None), (0.5, True)))
-    panel = again[0].panels[0]
-    assert (panel.x_label, panel.marks, panel.x_range, panel.log_y) == ("t [s]", ((0.5, "here"),), (0.0, 1.0), True)
-    np.testing.assert_array_equal(panel.curves[0].y, t**2)
-    np.testing.assert_array_equal(panel.image.values, np.eye(5))
-    assert np.isnan(again[0].numbers[0].value)
-    assert again[0].resolved is False
-
-
-@pytest.mark.parametrize("odd", [object(), np.array([object()])])
-def test_what_cannot_be_kept_is_refused_and_leaves_no_file(odd: Any, tmp_path: Path) -> None:
-    with pytest.raises(TypeError, match="must hold texts, numbers and arrays"):
-        ResultsFolder(tmp_path).save("one", "key", (odd,))
-    assert list((tmp_path / "kept" / "items").iterdir()) == []
+    table = ThesisTable("t-1", "T", ("a", "b"), ((1, 2.5), ("x", None), (np.float64(0.1), math.inf)))
+    row = ItemRow("one", "key", tuple(map(undrawn, (figure, claim, table))), ("a.svg",))
+    list(stored(tmp_path, (of for of in [row]), "x"))
+    again = read_rows(tmp_path, lambda tree: as_type(ItemRow, tree), "x", json.loads)["one"]
+    assert again.files == ("a.svg",)
+    assert again.products[1] == claim
+    assert asdict(again.products[0]) == asdict(undrawn(figure))
+    assert (again.products[2].id, again.products[2].rows) == ("t-1", ((1, 2.5), ("x", None), (0.1, math.inf)))
 
 
 def test_without_the_sheet_items_that_need_it_are_left_out(
@@ -198,47 +200,37 @@ def test_without_the_sheet_items_that_need_it_are_left_out(
     )
     without = reproduce(["all"], "out", items=items, jobs=1)
     assert states(without) == {"t-1": "left out", "t-2": "made", "t-3": "made"}
-    assert without.statuses["t-1"].reason == MISSING
+    assert without["t-1"].reason == MISSING
     sheet = write_sheet(tmp_path / "sheet")
     given = reproduce(["all"], "out", items=items, jobs=1, sheet=sheet)
     assert states(given) == {"t-1": "made", "t-2": "made", "t-3": "kept"}
     write_sheet(sheet, 1.0)
     changed = reproduce(["all"], "out", items=items, jobs=1, sheet=sheet)
     assert states(changed) == {"t-1": "made", "t-2": "made", "t-3": "kept"}
-    (table,) = changed.products("t-1") or ()
+    (table,) = changed["t-1"].products
     assert isinstance(table, ThesisTable)
     assert table.rows == ((2.0,),)
 
 
-def test_equal_runs_are_simulated_once_and_kept_exactly(
-    fakes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_equal_runs_are_simulated_once(fakes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
-    monkeypatch.setattr(build, "simulated_run", lambda *given: calls.append(given) or simulated_run(*given))
-    items = tuple(item(f"fig-4.{k}", make) for k, make in enumerate(("simulated", "interrupted", "simulated")))
-    with pytest.raises(KeyboardInterrupt):
-        reproduce(["all"], "out", items=items, jobs=1)
-    (tmp_path / "log.go").touch()
-    second = reproduce(["all"], "out", items=items, jobs=1)
+    monkeypatch.setattr(context, "simulated_run", lambda *of: calls.append(of) or simulated_run(*of))
+    drawn: dict[str, Any] = {}
+
+    def publish(of: Item, products: Any, folder: Path) -> tuple[str, ...]:
+        drawn[of.id] = products[0]
+        return ()
+
+    runs = tmp_path / "out" / "kept" / "runs"
+    runs.mkdir(parents=True)
+    (runs / "planted.run").write_bytes(b"a pickle of somebody else")
+    items = tuple(item(f"fig-4.{k}", "simulated") for k in range(2))
+    made = reproduce(["all"], "out", items=items, jobs=1, publish=publish)
     assert len(calls) == 1
-    assert not (tmp_path / "out" / "kept" / "runs").exists()
-    (fresh,), (loaded,) = (second.products(f"fig-4.{k}") or () for k in (0, 2))
-    assert isinstance(fresh, Figure)
-    assert isinstance(loaded, Figure)
-    np.testing.assert_array_equal(fresh.panels[0].curves[0].y, loaded.panels[0].curves[0].y)
-    assert fresh.resolved is True
-
-
-def test_a_run_survives_the_file(tmp_path: Path) -> None:
-    run = simulated_run(RunSpec("3 sin(4t)", 2.0))
-    kept = ResultsFolder(tmp_path)
-    kept.run("key", lambda: run)
-    again = kept.run("key", lambda: pytest.fail("simulated again"))
-    assert run.recording is not None
-    assert again.recording is not None
-    assert dict(again.recording.provenance) == dict(run.recording.provenance)
-    np.testing.assert_array_equal(again.recording["p_A"], run.recording["p_A"])
-    np.testing.assert_array_equal(again.outputs["p_A"], run.outputs["p_A"])
+    assert not runs.exists()
+    fresh, loaded = (drawn[name].panels[0].curves[0].y for name in ("fig-4.0", "fig-4.1"))
+    np.testing.assert_array_equal(fresh, loaded)
+    assert [of.products[0].resolved for of in made.values()] == [True, True]
 
 
 # calls that do not end well
@@ -272,13 +264,14 @@ def test_a_killed_call_is_taken_up_where_it_stopped(fakes: Path, tmp_path: Path,
         [sys.executable, str(script)], env={**os.environ, "PYTHONPATH": paths}, cwd=tmp_path, stderr=subprocess.DEVNULL
     )
     end = time.monotonic() + 60
-    while len(list((tmp_path / "out" / "kept" / "items").glob("*.npz"))) < 3 and time.monotonic() < end:
+    rows = tmp_path / "out" / "kept" / "rows.jsonl"
+    while not (rows.is_file() and rows.read_bytes().count(b"\n") >= 3) and time.monotonic() < end:
         assert call.poll() is None
         time.sleep(0.02)
     call.send_signal(how)
     call.wait(20)
     time.sleep(1.0)  # workers of a killed parent end with it
-    finished = {path.stem for path in (tmp_path / "out" / "kept" / "items").glob("*.npz")}
+    finished = {json.loads(line)["id"] for line in rows.read_bytes().splitlines()}
     assert 3 <= len(finished) < 8
     again = reproduce(["all"], "out", items=tuple(item(name, "slow") for name in names), jobs=2)
     assert {name for name, state in states(again).items() if state == "kept"} == finished
@@ -290,13 +283,19 @@ def test_a_failure_is_told_and_the_others_go_on(fakes: Path, tmp_path: Path, job
     items = (item("t-0", "broken"), item("t-1", "table"), item("t-2", "doubled", "t-0"), item("t-3", "doubled", "t-1"))
     outcome = reproduce(["all"], "out", items=items, jobs=jobs)
     assert states(outcome) == {"t-0": "failed", "t-1": "made", "t-2": "failed", "t-3": "made"}
-    assert outcome.statuses["t-0"].reason == "RuntimeError: no such curve"
-    assert outcome.statuses["t-2"].reason == "needs t-0, which failed"
-    assert "second line" in (tmp_path / "out" / "kept" / "failed" / "t-0.txt").read_text()
+    assert outcome["t-0"].reason == "RuntimeError: no such curve"
+    assert outcome["t-2"].reason == "needs t-0, which failed"
+    assert "second line" in (tmp_path / "out" / "kept" / "rows.jsonl").read_text()
+
+
+def test_what_cannot_be_stored_fails_alone(fakes: Path, tmp_path: Path) -> None:
+    outcome = reproduce(["all"], "out", items=(item("t-0", "odd"), item("t-1", "table")), jobs=1)
+    assert states(outcome) == {"t-0": "failed", "t-1": "made"}
+    assert outcome["t-0"].reason.startswith("TypeError: ")
 
 
 def test_a_process_that_dies_takes_only_its_item(fakes: Path, tmp_path: Path) -> None:
     items = (item("t-1", "dies"), *(item(f"t-{number}", "table") for number in range(2, 6)))
     outcome = reproduce(["all"], "out", items=items, jobs=2)
     assert states(outcome) == {"t-1": "failed", "t-2": "made", "t-3": "made", "t-4": "made", "t-5": "made"}
-    assert outcome.statuses["t-1"].reason == "the process that made it died"
+    assert outcome["t-1"].reason == "the process that made it died"

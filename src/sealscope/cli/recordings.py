@@ -98,8 +98,7 @@ def diagnose(
 
 def _text(diagnosis: Diagnosis, form: str, start_s: float | None) -> str:
     """Return what is printed of a verdict in a form: jsonl, whole, short, line or table."""
-    from sealscope.reporting import diagnosis_text, short_text
-    from sealscope.reporting.messages import table_line
+    from sealscope.reporting.messages import diagnosis_text, short_text, table_line
 
     if form == "jsonl":
         return json.dumps(diagnosis.as_dict(), allow_nan=False)
@@ -190,7 +189,8 @@ def report(
     With --machine also of a folder: a single page of all its recordings.
     """
     from sealscope.diagnosis.diagnose import check_probability
-    from sealscope.reporting import write_index, write_page
+    from sealscope.reporting.index import write_index
+    from sealscope.reporting.page import write_page
     from sealscope.reporting.template import check_page
     from sealscope.storage.folders import make_folder
 
@@ -271,7 +271,7 @@ def inspect(
     from sealscope.parameters.load import save_channel_map
     from sealscope.recordings import inspect as inspected
     from sealscope.recordings.formats.columns import by_names, map_taken, stated_columns
-    from sealscope.reporting import overview_text
+    from sealscope.reporting.overview import overview_text
 
     _check_standard_input(files)
     stated = opt.StatedMachine.of(None, maps, rate, rig)

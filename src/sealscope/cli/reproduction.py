@@ -44,7 +44,7 @@ def reproduce(
     from sealscope.reporting.thesis.page import write_thesis_page
     from sealscope.reporting.thesis.plots import require_drawing
     from sealscope.thesis.engine.build import reproduce as build
-    from sealscope.thesis.sheet import MISSING
+    from sealscope.thesis.sheet import MISSING, find_sheet
 
     if not ids:
         raise InputError("an item must be named: an id, chapter-N or all (sealscope reproduce --list)")
@@ -55,9 +55,8 @@ def reproduce(
             ids, output, quick=quick, jobs=jobs, sheet=sheet, publish=publish,
             progress=lambda ended, total, in_work: update(ended, total, ", ".join(in_work)),
         )  # fmt: skip
-    statuses = made.statuses.values()
-    products = ((status, (made.products(status.item.id) or ()) if status.available else ()) for status in statuses)
-    page = write_thesis_page(output, products, quick=quick, sheet=made.sheet is not None)
+    statuses = list(made.values())
+    page = write_thesis_page(output, statuses, quick=quick, sheet=find_sheet(sheet) is not None)
     for status in statuses:
         if status.state == "failed":
             opt.complain(f"{status.item.id} failed: {status.reason}")

@@ -113,7 +113,7 @@ def demo(
     With -v what was learnt, and every method's verdict.
     """
     from sealscope.demo import run_demo
-    from sealscope.reporting import diagnosis_text, short_text
+    from sealscope.reporting.messages import diagnosis_text, short_text
     from sealscope.storage.folders import make_folder
 
     make_folder(folder)

@@ -11,12 +11,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
+from sealscope.campaigns.cases.bound import noise_covariance
+from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
+from sealscope.signals.details import details
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.instruments import decimate
+from sealscope.simulation.integrate import oversampling, sized_run
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, ThesisTable
@@ -24,17 +30,8 @@ from sealscope.thesis.engine.texts import note, texts_of
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, QUANTITIES, Condition, DataSheet, experiment_values, groups
 from sealscope.units import PSI
 
-if TYPE_CHECKING:
-    from sealscope.parameters import Rig
-
 #: Part of a run that is used [s]: after the start-up, two of the slowest command's cycles (2 pi seconds each).
 SETTLING, USED = 7.2, 4.0 * np.pi
-
-
-def _identified_rig() -> Rig:
-    from sealscope.parameters import load_rig
-
-    return load_rig(BENCH_RIG)
 
 
 def noise_free_squares(
@@ -50,11 +47,6 @@ def noise_free_squares(
     Sampled as the instruments do (the rig's rate, its anti-alias filter), over `USED` seconds after the start-up. The
     rig itself sizes `leak`; `values` are set after those of the condition. Raises what simulating raises.
     """
-    from sealscope.signals.details import details
-    from sealscope.simulation.experiment import Experiment
-    from sealscope.simulation.instruments import decimate
-    from sealscope.simulation.integrate import oversampling, sized_run
-
     padded = USED + SETTLING + 128.0 / rig.daq.sample_rate  # the deepest detail looks 120 samples ahead
     values = {**experiment_values(condition), **(values or {})}
     experiment = Experiment.of(rig=rig, command=condition.command, set=values, leak=leak, duration=padded, x_0=x_0)
@@ -79,8 +71,6 @@ def log_rms(squares: Array, sigma: float) -> Array:
 
 def noise_of(rig: Rig, chamber: str) -> float:
     """Return the deviation of a sample [psi] in a chamber's channel by own noise, common noise and conversion."""
-    from sealscope.campaigns.cases.bound import noise_covariance
-
     return float(np.sqrt(noise_covariance(rig, [chamber])[0, 0])) / PSI
 
 
@@ -147,9 +137,7 @@ def _multiplied(rig: Rig, factors: Mapping[str, float]) -> Rig:
 
 def parameters_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate every parameter in which the identified rig differs from the thesis's."""
-    from sealscope.parameters import load_rig
-
-    fitted, printed = _identified_rig(), {row.name: row for row in load_rig("thesis").table()}
+    fitted, printed = load_rig(BENCH_RIG), {row.name: row for row in load_rig("thesis").table()}
     rows = [
         (row.name, row.meaning, printed[row.name].given, row.given, row.source)
         for row in fitted.table()
@@ -162,7 +150,7 @@ def parameters_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate simulated over measured leak-free RMS: geometric means over all tests, and by operating condition."""
     assert context.sheet is not None
-    log = log_residuals(_identified_rig(), context.sheet)
+    log = log_residuals(load_rig(BENCH_RIG), context.sheet)
     columns = [(c, q, log[:, k, j]) for k, c in enumerate(CHAMBERS) for j, q in enumerate(QUANTITIES)]
     rows: list[tuple[Cell, ...]] = []
     for chamber, name, of in columns:
@@ -193,7 +181,7 @@ def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
     measured = [float(100 * np.expm1(np.mean(sheet.log_change(c, q)))) for c, q in changed]
     rows: list[tuple[Cell, ...]] = [("the sheet", *[1.0] * 4, *measured, *[41] * 4)]
-    rig = _identified_rig()
+    rig = load_rig(BENCH_RIG)
     for hypothesis in HYPOTHESES[:2] if context.quick else HYPOTHESES:
         predicted = predicted_sheet(rig, hypothesis)
         levels = [np.mean(np.log(predicted.rms[c][q][:, 0] / sheet.rms[c][q][:, 0])) for c, q in shown]

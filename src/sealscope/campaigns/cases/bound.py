@@ -11,12 +11,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.evaluation.checks import share
+from sealscope.parameters import Rig
 from sealscope.recordings.chambers import CHAMBERS, PRESSURES
 from sealscope.recordings.recording import Array
 from sealscope.simulation.commands import Recorded
@@ -24,9 +24,6 @@ from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.integrate import trajectory
 from sealscope.simulation.sensitivity import REFERENCE_DP, leak_sensitivity, parameter_sensitivity
 from sealscope.units import LITRE_PER_MINUTE
-
-if TYPE_CHECKING:
-    from sealscope.parameters import Rig
 
 #: Parameters that are not known of a pump-controlled machine: the friction law (level, viscous slope, breakaway, its
 #: decay), the oil's stiffness and the gain of the speed loop.

@@ -15,6 +15,8 @@ import numpy as np
 
 from sealscope.campaigns.plans.duty import CONTROLLER
 from sealscope.campaigns.plans.model import SimulatedPlan, Use
+from sealscope.control.registry import source_of
+from sealscope.simulation.bench.profile import load_profile
 
 #: The factor whose levels are families of the plan's profile.
 FAMILY = "family"
@@ -67,8 +69,6 @@ def digest(value: Any) -> str:
 
 def profile_key(name: str) -> str:
     """Return a digest of what a bench profile says, the same wherever its file lies."""
-    from sealscope.simulation.bench.profile import load_profile
-
     profile = load_profile(name)
     return digest(repr(replace(profile, name=profile.seeds or profile.name, place="")))
 
@@ -84,29 +84,25 @@ def world(plan: SimulatedPlan) -> dict[str, Any]:
     }
 
 
-def _families(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
-    """Return, for each family of a plan, the digest of what it is: its cases do not depend on another family."""
-    from sealscope.simulation.bench.profile import load_profile
+def _named(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
+    """Return factor -> level -> digest of what its name stands for: a family, or a controller of the user's own.
 
-    if FAMILY not in plan.factors:
-        return {}
-    profile = load_profile(plan.profile)
-    return {str(name): {FAMILY: digest(repr(profile.family(str(name))))} for name in plan.factors[FAMILY]}
-
-
-def _own_controllers(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
-    """Return, for each controller of the user's own, the digest of its source: another law gives other cases."""
-    from sealscope.control.registry import source_of
-
-    sources = {str(name): source_of(str(name)) for name in plan.factors.get(CONTROLLER, ())}
-    return {name: {CONTROLLER: hashlib.sha256(path.read_bytes()).hexdigest()} for name, path in sources.items() if path}
+    Another law gives other cases; a case does not depend on another family.
+    """
+    named: dict[str, dict[str, str]] = {FAMILY: {}, CONTROLLER: {}}
+    for level in plan.factors.get(FAMILY, ()):
+        named[FAMILY][str(level)] = digest(repr(load_profile(plan.profile).family(str(level))))
+    for level in plan.factors.get(CONTROLLER, ()):
+        if path := source_of(str(level)):
+            named[CONTROLLER][str(level)] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return named
 
 
 def cases_of(plan: SimulatedPlan) -> list[CampaignCase]:
     """Return all cases of a plan: records of each kind go round the cells one by one, the last round may be short."""
     cells = [dict(zip(plan.factors, levels, strict=True)) for levels in itertools.product(*plan.factors.values())]
     shared = world(plan)
-    families, controllers = _families(plan), _own_controllers(plan)
+    named = _named(plan)
     cases = []
     for group in plan.records:
         for number in range(group.count):
@@ -119,11 +115,9 @@ def cases_of(plan: SimulatedPlan) -> list[CampaignCase]:
                 "levels": cells[k],
                 "replicate": replicate,
             }
-            named = {
-                **families.get(str(cells[k].get(FAMILY)), {}),
-                **controllers.get(str(cells[k].get(CONTROLLER)), {}),
-            }
-            name = digest({"world": shared, **content, **named})
+            levels = {key: str(level) for key, level in cells[k].items()}
+            behind = {key: own[levels[key]] for key, own in named.items() if levels.get(key) in own}
+            name = digest({"world": shared, **content, **behind})
             machine, noise = np.random.SeedSequence(int(name, 16)).generate_state(2, np.uint64)
             machine_seed, noise_seed = int(machine >> np.uint64(1)), int(noise >> np.uint64(1))
             cases.append(CampaignCase(id=name[:16], machine_seed=machine_seed, noise_seed=noise_seed, **content))

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sealscope.campaigns.cases.case import FAMILY, CampaignCase
 from sealscope.campaigns.plans.duty import COMMAND, CONTROLLER, LOAD, closing_values, fault_of
 from sealscope.campaigns.plans.model import SimulatedPlan
-
-if TYPE_CHECKING:
-    from sealscope.simulation.bench.profile import Profile
-    from sealscope.simulation.experiment import Experiment
-    from sealscope.simulation.leaks import Leak
+from sealscope.parameters import declared_names
+from sealscope.parameters.names import resolve
+from sealscope.simulation.bench.machines import BenchMachine, draw
+from sealscope.simulation.bench.profile import Profile
+from sealscope.simulation.commands import Sine
+from sealscope.simulation.courses import command_or_target, parse_force
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.integrate import sized_leaks
+from sealscope.simulation.leaks import From, Leak
+from sealscope.units import LITRE_PER_MINUTE
 
 #: Length [s] of the run that sizes a leak on its machine; two periods of the slowest of the thesis's commands.
 SIZING_SECONDS = 13.0
@@ -21,9 +26,6 @@ SIZING_SECONDS = 13.0
 
 def leak_of(plan: SimulatedPlan, case: CampaignCase) -> tuple[Leak, ...]:
     """Return the case's leak, open from the plan's onset on; its size still a mean flow."""
-    from sealscope.simulation.leaks import From, Leak
-    from sealscope.units import LITRE_PER_MINUTE
-
     if not case.leak_lpm:
         return ()
     laws: tuple[Any, ...] = ("laminar", "orifice") if case.law == "mixture" else (case.law,)
@@ -37,10 +39,6 @@ def unsized(plan: SimulatedPlan, case: CampaignCase, profile: Profile | None = N
     The machine is the one that the case's seed draws from the bench (or the plan's rig), with the case's levels on
     top. `profile`: the plan's bench, where it has been loaded.
     """
-    from sealscope.simulation.bench.machines import BenchMachine, draw
-    from sealscope.simulation.commands import Sine
-    from sealscope.simulation.courses import command_or_target, parse_force
-
     if plan.profile:
         family = str(case.levels.get(FAMILY, ""))
         machine = draw(
@@ -73,16 +71,11 @@ def experiment_of(plan: SimulatedPlan, case: CampaignCase) -> Experiment:
 
 def _by_full_name(values: Mapping[str, str | float]) -> dict[str, str | float]:
     """Return the values by their full names, a later one in place of an earlier."""
-    from sealscope.parameters import declared_names
-    from sealscope.parameters.names import resolve
-
     return {resolve(name, declared_names()): value for name, value in values.items()}
 
 
 def sizing_run(experiment: Experiment) -> Experiment:
     """Return the short run on which an experiment's leaks are sized, open from its start."""
-    from sealscope.simulation.leaks import From
-
     return replace(
         experiment,
         duration=min(experiment.duration, SIZING_SECONDS),
@@ -96,8 +89,6 @@ def sized_once(experiment: Experiment) -> tuple[Leak, ...]:
     Sizing on the whole record would cost it two or three times over; the mean that the record really had is in its
     row.
     """
-    from sealscope.simulation.integrate import sized_leaks
-
     if not experiment.leaks:
         return ()
     sized = sized_leaks(sizing_run(experiment))

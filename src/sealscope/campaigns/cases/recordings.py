@@ -15,7 +15,10 @@ import numpy as np
 from sealscope.campaigns.cases.row import STROKE, CaseRow, error_text
 from sealscope.campaigns.cases.scoring import stated
 from sealscope.campaigns.plans.model import RecordedPlan, RecordingSet
+from sealscope.diagnosis.diagnose import Examination
+from sealscope.diagnosis.inspection import inspected
 from sealscope.errors import InputError, SealscopeError
+from sealscope.recordings import read
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Recording
 
@@ -64,10 +67,6 @@ def _direction(recording: Recording) -> str:
 
 
 def _row(plan: RecordedPlan, recordings: RecordingSet, path: Path, name: str) -> CaseRow:
-    from sealscope.diagnosis.diagnose import Examination
-    from sealscope.diagnosis.inspection import inspected
-    from sealscope.recordings import read
-
     label = recordings.label or recordings.files
     row = partial(
         CaseRow,

@@ -6,17 +6,15 @@ import math
 import os
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from sealscope.campaigns.cases.row import Scores, Statement, finite, rank_of
 from sealscope.campaigns.plans.detectors import ALL_CHANNELS, DIAGNOSE, WATCH, PlanDetector, Views, plan_detector
 from sealscope.campaigns.plans.scorers import Sides
 from sealscope.diagnosis.diagnose import Examination
+from sealscope.diagnosis.live.watch import Watch
 from sealscope.diagnosis.verdict.evidence import Evidence
+from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording
-
-if TYPE_CHECKING:
-    from sealscope.parameters import Rig
 
 #: Samples of a stream arrive in portions of this length [s].
 _PORTION = 1.0
@@ -78,9 +76,6 @@ def watched(recording: Recording, rig: Rig | str | os.PathLike[str], false_alarm
     Its rate of alarms is the one at which a healthy machine alarms within the record with the probability
     `false_alarm` at most.
     """
-    from sealscope.diagnosis.live.watch import Watch
-    from sealscope.parameters import load_rig
-
     watch = Watch(load_rig(rig), false_alarm * 3.6e6 / recording.duration, learn_hours=1000.0)
     begin = float(recording.t[0])
     for second in range(math.ceil(recording.duration / _PORTION)):

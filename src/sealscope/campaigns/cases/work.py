@@ -8,11 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
+from sealscope.campaigns.cases.bound import change_bound
 from sealscope.campaigns.cases.case import CampaignCase
 from sealscope.campaigns.cases.machines import experiment_of
 from sealscope.campaigns.cases.row import CaseRow, error_text
+from sealscope.campaigns.cases.scoring import stated
 from sealscope.campaigns.plans.model import SimulatedPlan
+from sealscope.diagnosis.diagnose import Examination
+from sealscope.diagnosis.inspection import inspected
 from sealscope.errors import InputError
+from sealscope.simulation.simulate import simulate_with_truth
 
 #: Channels that are inspected for findings: those that can spoil a verdict.
 INSPECTED = ("u", "x", "p_A", "p_B")
@@ -29,12 +34,6 @@ def work(plan: SimulatedPlan, case: CampaignCase, folder: Path | None = None) ->
 
 
 def _work(plan: SimulatedPlan, case: CampaignCase, folder: Path | None) -> CaseRow:
-    from sealscope.campaigns.cases.bound import change_bound
-    from sealscope.campaigns.cases.scoring import stated
-    from sealscope.diagnosis.diagnose import Examination
-    from sealscope.diagnosis.inspection import inspected
-    from sealscope.simulation.simulate import simulate_with_truth
-
     experiment = experiment_of(plan, case)
     simulated = simulate_with_truth(experiment)
     if folder is not None:

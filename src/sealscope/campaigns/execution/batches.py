@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from functools import cache
+from typing import Any
 
 import numpy as np
 
@@ -24,13 +25,15 @@ from sealscope.campaigns.plans.duty import fault_of
 from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.campaigns.plans.scorers import Sides, side_bounds
 from sealscope.errors import InputError, SealscopeError
+from sealscope.physics.solvers.limits import longest_step
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.signals.filters import IntArray
-from sealscope.simulation.integrate import oversampling, trajectory
-
-if TYPE_CHECKING:
-    from sealscope.simulation.bench.profile import Profile
-    from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.batch.batch import simulate_batch
+from sealscope.simulation.batch.run import refuse, with_sizes
+from sealscope.simulation.bench.profile import Profile, load_profile
+from sealscope.simulation.courses import numbers_under
+from sealscope.simulation.experiment import LONGEST_STEP, Experiment, choose_method
+from sealscope.simulation.integrate import FINEST, oversampling, steps_per_output, trajectory
 
 #: Runs of a batch, after each of which the rows are on disk.
 RUNS = 256
@@ -49,7 +52,6 @@ def bounds_of(plan: SimulatedPlan) -> IntArray:
 
 def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
     """Raise InputError for what a plan asks that no batch can do, naming it."""
-    from sealscope.simulation.batch.run import refuse
 
     def no(rule: str) -> InputError:
         return InputError(f"a plan in batches must have {rule}; run it without --batch ({plan.place})")
@@ -87,10 +89,8 @@ def in_batches(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads: int)
 
     A row derives from its case alone, whatever stands beside it.
     """
-    from sealscope.simulation.bench.profile import load_profile
-
     profile = load_profile(plan.profile) if plan.profile else None
-    steps = StepChooser(plan, profile)
+    step_of = step_chooser(plan, profile)
     for start in range(0, len(cases), RUNS):
         started, batch = time.process_time(), cases[start : start + RUNS]
         drawn: list[tuple[CampaignCase, Experiment]] = []
@@ -98,7 +98,7 @@ def in_batches(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads: int)
         for case in batch:
             try:
                 experiment = unsized(plan, case, profile)
-                drawn.append((case, replace(experiment, step=steps.of(case, experiment))))
+                drawn.append((case, replace(experiment, step=step_of(case, experiment))))
             except Exception as error:
                 rows.append(CaseRow.of(case, error=error_text(error)))
         rows += _carried_out(plan, drawn, threads)
@@ -108,8 +108,6 @@ def in_batches(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads: int)
 
 def _carried_out(plan: SimulatedPlan, drawn: Sequence[tuple[CampaignCase, Experiment]], threads: int) -> list[CaseRow]:
     """Return the rows of one batch; where it fails, of its halves, down to the run that is to blame."""
-    from sealscope.simulation.batch.batch import simulate_batch
-
     if not drawn:
         return []
     bounds, rows = bounds_of(plan), []
@@ -130,11 +128,6 @@ def _carried_out(plan: SimulatedPlan, drawn: Sequence[tuple[CampaignCase, Experi
 
 def _sized(experiments: Sequence[Experiment], threads: int) -> list[Experiment]:
     """Return the experiments with steps that resolve their leaks, sized side by side as `sized_once` does."""
-    from sealscope.physics.solvers.limits import longest_step
-    from sealscope.simulation.batch.batch import simulate_batch
-    from sealscope.simulation.batch.run import with_sizes
-    from sealscope.simulation.courses import numbers_under
-
     sized = list(experiments)
     leaky = [k for k, experiment in enumerate(experiments) if experiment.leaks]
     if not leaky:
@@ -157,59 +150,41 @@ def _sized(experiments: Sequence[Experiment], threads: int) -> list[Experiment]:
     return sized
 
 
-class StepChooser:
-    """Chooses the steps [s] of a plan's cases, each from what the case is, so that no other case can change it."""
+def step_chooser(plan: SimulatedPlan, profile: Profile | None = None) -> Callable[[CampaignCase, Experiment], float]:
+    """Return what chooses the step [s] of a case from what the case is, so that no other case can change it.
 
-    def __init__(self, plan: SimulatedPlan, profile: Profile | None = None) -> None:
-        self._plan, self._profile = plan, profile
-        self._world = digest(world(plan))
-        self._cells: dict[str, dict[str, float]] = {}
+    It is what `integrate` chooses by error on `SCOUTS` machines of the case's cell with seeds of their own, the finest
+    of those with its method, and no longer than its own machine allows.
+    """
+    shared = digest(world(plan))
 
-    def of(self, case: CampaignCase, experiment: Experiment) -> float:
-        """Return the step of a case, no longer than its own machine allows.
+    @cache
+    def of_cell(*levels: tuple[str, str | float]) -> dict[str, float]:
+        """Return method -> step of a cell of the factors."""
+        steps: dict[str, float] = {}
+        for number in range(SCOUTS):
+            content: dict[str, Any] = {"use": "calibrate", "leak_lpm": 0.0, "levels": dict(levels), "replicate": number}
+            seed = int(digest([shared, dict(levels), f"scout {number}"])[:15], 16)
+            try:
+                method, step = _chosen(
+                    unsized(plan, CampaignCase(id="", machine_seed=seed, noise_seed=0, **content), profile)
+                )
+            except SealscopeError:  # a machine of the bench that cannot do this duty
+                continue
+            steps[method] = min(step, steps.get(method, math.inf))
+        return steps
 
-        It is what `integrate` chooses by error on `SCOUTS` machines of the case's cell with seeds of their own, the
-        finest of those with its method.
-        """
-        from sealscope.physics.solvers.limits import longest_step
-        from sealscope.simulation.courses import numbers_under
-        from sealscope.simulation.experiment import LONGEST_STEP, choose_method
-        from sealscope.simulation.integrate import FINEST
-
+    def step_of(case: CampaignCase, experiment: Experiment) -> float:
         method = choose_method(experiment.rig, experiment.method)
-        step = self._cell(case.levels).get(method) or _chosen(experiment)[1]
+        step = of_cell(*case.levels.items()).get(method) or _chosen(experiment)[1]
         limit = max(longest_step(numbers_under(experiment.rig, experiment.load)), LONGEST_STEP / FINEST)
         return step if step <= limit else stepped(experiment.rate * oversampling(experiment), limit)
 
-    def _cell(self, levels: Mapping[str, str | float]) -> dict[str, float]:
-        """Return method -> step of a cell of the factors."""
-        key = digest(dict(levels))
-        if key not in self._cells:
-            steps: dict[str, float] = {}
-            for number in range(SCOUTS):
-                seed = int(digest([self._world, dict(levels), f"scout {number}"])[:15], 16)
-                scout = CampaignCase(
-                    id="",
-                    machine_seed=seed,
-                    noise_seed=0,
-                    use="calibrate",
-                    leak_lpm=0.0,
-                    levels=levels,
-                    replicate=number,
-                )
-                try:
-                    method, step = _chosen(unsized(self._plan, scout, self._profile))
-                except SealscopeError:  # a machine of the bench that cannot do this duty
-                    continue
-                steps[method] = min(step, steps.get(method, math.inf))
-            self._cells[key] = steps
-        return self._cells[key]
+    return step_of
 
 
 def stepped(rate: float, limit: float) -> float:
     """Return the longest step [s] within `limit` [s] that divides the interval of outputs at `rate` [Hz]."""
-    from sealscope.simulation.integrate import steps_per_output
-
     return 1.0 / (rate * steps_per_output(rate, limit))
 
 

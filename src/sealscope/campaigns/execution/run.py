@@ -13,11 +13,12 @@ from sealscope.campaigns.cases.recordings import ProgressCallback
 from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.cases.work import work
 from sealscope.campaigns.execution import batches, store
-from sealscope.campaigns.execution.workers import carried_out, on_cluster, process_count
+from sealscope.campaigns.execution.workers import carried_out, process_count
 from sealscope.campaigns.plans.duty import check_controllers
 from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.errors import InputError
 from sealscope.storage.folders import inner_folder
+from sealscope.storage.rows import locked, stored
 
 #: Carries out one case of a plan; `folder` to write its recording into, None for none.
 Task = Callable[..., CaseRow]
@@ -57,28 +58,24 @@ def run(
         mode = batches.IN_BATCHES
     place = Path(folder)
     store.begin(place, store.made_from(plan, mode))
-    with store.locked(place):
+    with locked(place, store.WHAT):
         rows = store.rows_of(plan, place)
         if retry:
             rows = {name: row for name, row in rows.items() if row.error is None}
         waiting = [case for case in interleaved(cases) if case.id not in rows]
-        failures, done = sum(row.error is not None for row in rows.values()), len(rows)
         report = progress or (lambda done, size, failures: None)
+        done, failures = len(rows), sum(row.error is not None for row in rows.values())
         report(done, plan.size, failures)
         recordings = inner_folder(place, RECORDINGS) if plan.keep_recordings else None
         jobs = process_count(jobs)
         if batch:
             new_rows = batches.in_batches(plan, waiting, jobs)
         else:
-            carry_out = partial(task, plan, folder=recordings)
-            ended = on_cluster(carry_out, waiting, cluster) if cluster else carried_out(carry_out, waiting, jobs)
-            new_rows = _rows(ended)
-        with store.appending(place) as append, closing(new_rows):
-            for row in new_rows:
-                append(row)
-                done += 1
-                failures += row.error is not None
-                report(done, plan.size, failures)
+            new_rows = _rows(carried_out(partial(task, plan, folder=recordings), waiting, jobs, cluster))
+        for row in stored(place, new_rows, store.WHAT):
+            done += 1
+            failures += row.error is not None
+            report(done, plan.size, failures)
     return store.progress_of(plan, place)
 
 

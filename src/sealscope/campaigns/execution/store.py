@@ -1,11 +1,9 @@
-"""A campaign's folder: rows appended safely while it runs, and what they were made from."""
+"""A campaign's folder: which rows belong to a plan, and what they were made from."""
 
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -14,9 +12,11 @@ from sealscope.campaigns.cases.case import CaseInputs, cases_of, code_key, diges
 from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.plans.detectors import DIAGNOSE, plan_detector
 from sealscope.campaigns.plans.model import SimulatedPlan
+from sealscope.diagnosis.registry import PlugIn, detectors
 from sealscope.errors import InputError, UnreadableFile
-from sealscope.storage import folders
-from sealscope.storage.atomic import atomic_write, remove_temporaries
+from sealscope.storage import rows
+from sealscope.storage.atomic import atomic_write
+from sealscope.storage.folders import make_folder
 from sealscope.storage.opening import open_inner
 from sealscope.storage.plain_values import parse_json
 
@@ -34,9 +34,9 @@ _SAME = {
 }
 #: The form of a row: 3 since rows hold no operating point.
 FORMAT = 3
-ROWS, HEAD, LOCK = "rows.jsonl", "campaign.json", ".lock"
-#: Longest line of a row, and largest head [bytes].
-_LONGEST_ROW = _LARGEST_HEAD = 1_000_000
+HEAD, WHAT = "campaign.json", "a campaign"
+#: Largest head [bytes].
+_LARGEST_HEAD = 1_000_000
 #: How rows are made unless in batches.
 RUN_BY_RUN = "run by run"
 
@@ -82,8 +82,6 @@ def made_from(plan: SimulatedPlan, mode: str = RUN_BY_RUN) -> dict[str, Any]:
 
 def _plug_ins(plan: SimulatedPlan) -> dict[str, str]:
     """Return the detectors of other distributions that a plan runs, each with a hash of its source."""
-    from sealscope.diagnosis.registry import PlugIn, detectors
-
     run = {detector.of for name in plan.detectors if (detector := plan_detector(name)).scorer is None}
     return {
         name: plug_in.fingerprint
@@ -102,30 +100,8 @@ def _version() -> str:
 
 
 def read_rows(folder: Path) -> dict[str, CaseRow]:
-    """Return rows by case id, the last of each; a torn last line is ignored.
-
-    Raises UnreadableFile for a line that is no row.
-    """
-    path = folder / ROWS
-    rows: dict[str, CaseRow] = {}
-    try:
-        with open_inner(path, "a campaign's file of rows") as file:
-            for number, line in enumerate(iter(lambda: file.readline(_LONGEST_ROW), b""), 1):
-                if not line.endswith(b"\n") and len(line) < _LONGEST_ROW:
-                    break
-                try:
-                    row = CaseRow.from_dict(parse_json(line))
-                except ValueError:
-                    raise UnreadableFile(
-                        f"a line of a campaign must be a row, got something else ({path}, line {number})"
-                    ) from None
-                rows[row.id] = row
-    except OSError as error:
-        if not isinstance(error, FileNotFoundError):
-            raise UnreadableFile(
-                f"a campaign's file of rows must be readable, got: {error.strerror or error} ({path})"
-            ) from None
-    return rows
+    """Return rows by case id, the last of each (`storage.rows.read_rows`)."""
+    return rows.read_rows(folder, CaseRow.from_dict, WHAT)
 
 
 def rows_of(plan: SimulatedPlan, folder: Path) -> dict[str, CaseRow]:
@@ -134,15 +110,16 @@ def rows_of(plan: SimulatedPlan, folder: Path) -> dict[str, CaseRow]:
     A row without one of the plan's detectors is not among them. Raises UnreadableFile for a row that says another input
     than its case has.
     """
-    rows = read_rows(folder)
+    made = read_rows(folder)
     wanted = set(plan.detectors)
     of_plan: dict[str, CaseRow] = {}
     for case in sorted(cases_of(plan), key=lambda case: case.id):
-        row = rows.get(case.id)
+        row = made.get(case.id)
         if row is None:
             continue
         if any(getattr(row, of.name) != getattr(case, of.name) for of in fields(CaseInputs)):
-            raise UnreadableFile(f"a row must say the inputs of its case, got others of {case.id} ({folder / ROWS})")
+            place = folder / rows.ROWS
+            raise UnreadableFile(f"a row must say the inputs of its case, got others of {case.id} ({place})")
         if row.error is not None or wanted <= set(row.scores):
             of_plan[row.id] = row
     return of_plan
@@ -150,10 +127,10 @@ def rows_of(plan: SimulatedPlan, folder: Path) -> dict[str, CaseRow]:
 
 def progress_of(plan: SimulatedPlan, folder: Path) -> CampaignProgress:
     """Return how far the campaign in the folder is."""
-    rows = rows_of(plan, folder).values()
-    seconds = [row.seconds for row in rows if row.error is None]
+    done = rows_of(plan, folder).values()
+    seconds = [row.seconds for row in done if row.error is None]
     mean = sum(seconds) / len(seconds) if seconds else None
-    return CampaignProgress(plan.size, len(rows), len(rows) - len(seconds), mean)
+    return CampaignProgress(plan.size, len(done), len(done) - len(seconds), mean)
 
 
 def head(folder: Path) -> dict[str, Any] | None:
@@ -175,9 +152,9 @@ def head(folder: Path) -> dict[str, Any] | None:
 
 def begin(folder: Path, source: Mapping[str, Any]) -> None:
     """Make the folder a campaign's, or continue in it; raise InputError where it holds rows of another campaign."""
-    folders.make_folder(folder)
+    make_folder(folder)
     before = head(folder)
-    if before is not None and (folder / ROWS).is_file():
+    if before is not None and (folder / rows.ROWS).is_file():
         for key, name in _SAME.items():
             if before.get(key) != source[key]:
                 raise InputError(
@@ -186,36 +163,3 @@ def begin(folder: Path, source: Mapping[str, Any]) -> None:
                 )
     with atomic_write(folder / HEAD) as temporary:
         temporary.write_text(json.dumps(source, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-
-
-@contextmanager
-def appending(folder: Path) -> Iterator[Callable[[CaseRow], None]]:
-    """Give a function that appends a row to the folder; each line is on disk before the next is begun."""
-    with open_inner(folder / ROWS, "a campaign's file of rows", "ab+") as file:
-        size = file.seek(0, os.SEEK_END)
-        file.seek(max(0, size - _LONGEST_ROW))
-        torn = file.read().rpartition(b"\n")[2]  # a line that was being written when the power went
-        file.truncate(size - len(torn))
-
-        def append(row: CaseRow) -> None:
-            line = json.dumps(row.as_dict(), allow_nan=False, sort_keys=True).encode() + b"\n"
-            try:
-                while line:  # past the buffer of `file`, which would be written again at its end
-                    line = line[os.write(file.fileno(), line) :]
-                os.fsync(file.fileno())
-            except OSError as error:
-                raise InputError(f"cannot write {folder / ROWS}: {error.strerror or error}") from error
-
-        yield append
-
-
-@contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Hold the folder's lock; raise InputError where another run of the campaign holds it.
-
-    The lock ends with the process, however that ends.
-    """
-    busy = f"a campaign must be run by one process at a time, got another at work ({folder})"
-    with folders.locked(folder / LOCK, busy):
-        remove_temporaries(folder)
-        yield

@@ -6,14 +6,14 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from functools import partial
 from itertools import islice
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from sealscope.campaigns.cases.case import code_key
 from sealscope.errors import InputError, MissingExtra
@@ -30,30 +30,27 @@ _AHEAD = 4
 
 
 def carried_out(
-    task: Callable[[Item], Result], items: Iterable[Item], jobs: int
+    task: Callable[[Item], Result], items: Iterable[Item], jobs: int, cluster: str | None = None
 ) -> Generator[tuple[Item, Result | None], None, None]:
-    """Yield each item and its result as it ends, from up to `jobs` spawned processes; 1: from this process.
+    """Yield each item and its result as it ends: from `jobs` spawned processes, or from this one alone (1).
 
-    An item is taken from `items` when a process is free for it. `task` and items are pickled; `task` goes to each
-    process once. Every process is an executor of its own, so that one that dies, by a hand or the memory's end, breaks
-    no other: its item is tried once more after all others, and has then the result None. Processes ignore the
-    interrupt, and end when the generator is closed or the parent ends, however that ends. Raises what `task` raised.
+    `cluster`: address of a Dask scheduler, whose workers are taken instead. An item is taken from `items` when a
+    process is free for it. `task` and items are pickled; `task` goes to each process once. An item whose process dies,
+    by a hand or the memory's end, is tried once more after all others, and has then the result None. Processes ignore
+    the interrupt, and end when the generator is closed or the parent ends, however that ends. Raises what `task`
+    raised; MissingExtra without Dask, InputError where no scheduler answers or a worker has another Sealscope.
     """
-    if jobs == 1:
+    if jobs == 1 and cluster is None:
         yield from ((item, task(item)) for item in items)
         return
-    context, waiting = get_context("spawn"), iter(items)
-    lifeline, held = context.Pipe(duplex=False)
-    idle: list[ProcessPoolExecutor] = []
-    busy: dict[Future[Result], tuple[ProcessPoolExecutor, Item]] = {}
-    died: list[Item] = []
-    tried_again = False
-    try:
+    waiting, died, tried_again = iter(items), list[Item](), False
+    idle: list[Executor] = []
+    busy: dict[Future[Result], tuple[Executor, Item]] = {}
+    with _processes(task, jobs) if cluster is None else _on_cluster(task, cluster) as pools:
         while True:
-            for item in islice(waiting, jobs - len(busy)):
-                with _worker_environment():  # a process starts with its first item
-                    pool = idle.pop() if idle else ProcessPoolExecutor(1, context, _begin, (task, lifeline))
-                    busy[pool.submit(_carry_out, item)] = pool, item
+            for item in islice(waiting, pools.most - len(busy)):
+                pool = idle.pop() if idle else pools.new()
+                busy[pools.submit(pool, item)] = pool, item
             if not busy:
                 if tried_again or not died:
                     return
@@ -63,7 +60,7 @@ def carried_out(
                 pool, item = busy.pop(future)
                 try:
                     result = future.result()
-                except BrokenProcessPool:
+                except pools.death:
                     if tried_again:
                         yield item, None
                     else:
@@ -71,11 +68,6 @@ def carried_out(
                     continue
                 idle.append(pool)
                 yield item, result
-    finally:
-        held.close()
-        lifeline.close()
-        for pool in (*idle, *(pool for pool, _ in busy.values())):
-            pool.shutdown(wait=False, cancel_futures=True)
 
 
 def in_order(jobs: int, task: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[Item, Result | None]]:
@@ -89,13 +81,40 @@ def in_order(jobs: int, task: Callable[[Item], Result], items: Sequence[Item]) -
             place += 1
 
 
-def on_cluster(
-    task: Callable[[Item], Result], items: Iterable[Item], address: str
-) -> Generator[tuple[Item, Result | None], None, None]:
-    """Yield each item and its result as it ends, from the workers of the Dask scheduler at `address`; None: one failed.
+class _Pools(NamedTuple):
+    """What carries items out: `most` at once, each by `submit` to a pool of `new`; a process's end raises `death`."""
 
-    Raises MissingExtra without Dask, InputError where no scheduler answers or a worker has another Sealscope.
-    """
+    new: Callable[[], Executor]
+    most: int
+    submit: Callable[[Executor, Any], Future[Any]]
+    death: type[Exception]
+
+
+@contextmanager
+def _processes(task: Callable[[Any], Any], most: int) -> Iterator[_Pools]:
+    """Give processes of this machine, each a pool of its own, so that one that dies breaks no other."""
+    context = get_context("spawn")
+    lifeline, held = context.Pipe(duplex=False)
+    pools: list[Executor] = []
+
+    def new() -> Executor:
+        with _worker_environment():  # a process starts with what it is given first
+            pools.append(ProcessPoolExecutor(1, context, _begin, (task, lifeline)))
+            pools[-1].submit(os.getpid)
+        return pools[-1]
+
+    try:
+        yield _Pools(new, most, lambda pool, item: pool.submit(_carry_out, item), BrokenProcessPool)
+    finally:
+        held.close()
+        lifeline.close()
+        for pool in pools:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+@contextmanager
+def _on_cluster(task: Callable[[Any], Any], address: str) -> Iterator[_Pools]:
+    """Give the workers of the Dask scheduler at `address`, which are one pool."""
     try:
         import distributed
     except ImportError:
@@ -114,21 +133,9 @@ def on_cluster(
             raise InputError(f"the cluster's workers must have Sealscope, got: {error} ({address})") from None
         if keys != {code_key()}:
             raise InputError(f"the cluster's workers must have this machine's Sealscope, got another ({address})")
-        shared, waiting = client.scatter(task, broadcast=True), iter(items)
-        by_key: dict[str, Item] = {}
-
-        def submitted(count: int) -> list[Any]:
-            futures = []
-            for item in islice(waiting, count):
-                futures.append(client.submit(_call, shared, item, pure=False, retries=1))
-                by_key[futures[-1].key] = item
-            return futures
-
-        futures = dask.as_completed(submitted(_AHEAD * sum(client.nthreads().values())), loop=client.loop)
-        for future in futures:
-            yield by_key.pop(future.key), None if future.exception() is not None else future.result()
-            future.release()
-            futures.update(submitted(1))
+        pool, shared = client.get_executor(pure=False), client.scatter(task, broadcast=True)
+        most = _AHEAD * sum(client.nthreads().values())
+        yield _Pools(lambda: pool, most, lambda pool, item: pool.submit(_call, shared, item), Exception)
 
 
 def _call(task: Callable[[Item], Result], item: Item) -> Result:

@@ -6,16 +6,17 @@ The words are those of `sealscope simulate`: `command` as `--command` (a voltage
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from sealscope.campaigns.plans.model import SimulatedPlan
+from sealscope.control.registry import CONTROLLERS, check_name, controller_named, is_installed
 from sealscope.errors import InputError
-
-if TYPE_CHECKING:
-    from sealscope.campaigns.plans.model import SimulatedPlan
-    from sealscope.parameters import Rig
-    from sealscope.simulation.faults import Fault
+from sealscope.parameters import Rig
+from sealscope.simulation.bench.profile import load_profile
+from sealscope.simulation.courses import Position, command_or_target, parse_force, parse_position
+from sealscope.simulation.experiment import check_target
+from sealscope.simulation.faults import Fault, parse_fault
+from sealscope.units import parse_quantity
 
 #: Factors whose levels are the duty of a machine, in the words of the command line.
 COMMAND, CONTROLLER, LOAD = "command", "controller", "load"
@@ -25,10 +26,6 @@ _LOOKED = 50.0
 
 def check_duty(name: str, level: str | float, rig: Rig, duration: float) -> None:
     """Raise InputError for a level of `command`, `controller` or `load` that no run of `duration` [s] can have."""
-    from sealscope.control.registry import CONTROLLERS, check_name
-    from sealscope.simulation.courses import Position, command_or_target, parse_force
-    from sealscope.simulation.experiment import check_target
-
     examples = {COMMAND: "'3 sin(4t)' or 'position 50 mm sin(2t)'", CONTROLLER: "'pi'", LOAD: "'2 kN'"}
     if not isinstance(level, str):
         raise InputError(f"a {name} must be a text such as {examples[name]}, got {level!r}")
@@ -48,9 +45,6 @@ def check_controllers(plan: SimulatedPlan, trust: bool) -> None:
     Raises InputError where one cannot be made, and where one is a program that the plan leads to and the caller does
     not `trust` it: a plan may be hostile. Installed controllers are trusted.
     """
-    from sealscope.control.registry import CONTROLLERS, controller_named, is_installed
-    from sealscope.simulation.bench.profile import load_profile
-
     names = [str(level) for level in plan.factors.get(CONTROLLER, ())]
     if plan.profile:
         profile = load_profile(plan.profile)
@@ -68,15 +62,11 @@ def check_controllers(plan: SimulatedPlan, trust: bool) -> None:
 
 def voltage_in(commands: tuple[str | float, ...]) -> str | None:
     """Return the first of these commands that is no target for a piston, None where all are."""
-    from sealscope.simulation.courses import parse_position
-
     return next((str(command) for command in commands if parse_position(str(command)) is None), None)
 
 
 def closing_values(level: str | float) -> dict[str, str | float]:
     """Return the rig's parameters for both throttles closed by a share; 0 leaves `line.orifices` as it is."""
-    from sealscope.units import parse_quantity
-
     share = parse_quantity(level, "1") if isinstance(level, str) else float(level)
     if not 0.0 <= share < 1.0:
         raise InputError(f"closed must be 0 to under 100 %, got {level!r}")
@@ -86,8 +76,6 @@ def closing_values(level: str | float) -> dict[str, str | float]:
 
 def fault_of(text: str, onset_s: float) -> Fault:
     """Parse a fault other than a piston leak; it sets in at the plan's onset unless the text says when."""
-    from sealscope.simulation.faults import parse_fault
-
     timed = any(f" {word} " in f" {text} " for word in ("from", "growing"))
     fault = parse_fault(text if timed else f"{text} from {onset_s:g} s")
     if fault is None:

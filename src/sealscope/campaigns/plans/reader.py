@@ -32,7 +32,10 @@ from sealscope.campaigns.plans.model import (
     SimulatedPlan,
 )
 from sealscope.errors import InputError
+from sealscope.evaluation.thresholds import records_needed
 from sealscope.parameters import Rig, load_rig
+from sealscope.recordings.recording import CHANNEL_UNITS
+from sealscope.simulation.bench.profile import load_profile
 from sealscope.storage.opening import names_a_file
 from sealscope.storage.plain_values import as_type
 from sealscope.storage.toml_file import read_toml
@@ -174,8 +177,6 @@ def _assumed(head: dict[str, Any], rig: Rig | None, place: str) -> Rig | None:
 
 def _views(given: Any, head: dict[str, Any], place: str) -> dict[str, tuple[str, ...]]:
     """Read the table [views], name -> channels, and under "" the entry `channels` where there is one."""
-    from sealscope.recordings.recording import CHANNEL_UNITS
-
     views = {name: (f"views.{name}", channels) for name, channels in _table(given, "views", place).items()}
     for name, (entry, _) in views.items():
         if not name.strip() or name != name.strip() or "@" in name:
@@ -207,8 +208,6 @@ def _judged(
 
 
 def _simulated(tree: Mapping[str, Any], place: str) -> SimulatedPlan:
-    from sealscope.simulation.bench.profile import load_profile
-
     head = _table(tree.get("campaign", {}), "campaign", place, {*_NO_ENTRIES, "factors", "records"})
     rig, profile = _rig(head, place), _beside(head.pop("profile", "none"), place)
     if profile != "none":
@@ -252,8 +251,6 @@ def _check_factors(plan: SimulatedPlan) -> None:
 
 def _commands(plan: SimulatedPlan) -> tuple[str | float, ...]:
     """Return the commands of a plan: its factor's, or else those of its profile, or of its families there."""
-    from sealscope.simulation.bench.profile import load_profile
-
     if COMMAND in plan.factors or not plan.profile:
         return plan.factors.get(COMMAND, ("3 sin(4t)",))
     drawn = load_profile(plan.profile)
@@ -262,8 +259,6 @@ def _commands(plan: SimulatedPlan) -> tuple[str | float, ...]:
 
 
 def _check_level(plan: SimulatedPlan, name: str, level: str | float) -> None:
-    from sealscope.simulation.bench.profile import load_profile
-
     if name == "family":
         if not plan.profile:
             raise InputError(f"a family must be of the plan's profile, got {level!r} and no profile")
@@ -276,8 +271,6 @@ def _check_level(plan: SimulatedPlan, name: str, level: str | float) -> None:
 
 def _check_records(plan: SimulatedPlan) -> None:
     """Refuse records that say the same twice, a fault that is none, and too few records to judge or to calibrate."""
-    from sealscope.evaluation.thresholds import records_needed
-
     kinds = [(group.use, group.leak_lpm, group.law, group.fault) for group in plan.records]
     for number, (kind, group) in enumerate(zip(kinds, plan.records, strict=True), 1):
         if group.fault:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from base64 import b64encode
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
@@ -14,7 +13,7 @@ from sealscope.reporting import template
 from sealscope.reporting.thesis.plot_style import caption
 from sealscope.reporting.thesis.plots import UNRESOLVED
 from sealscope.thesis.engine.build import ItemStatus
-from sealscope.thesis.engine.products import Claim, Figure, Product, ThesisTable, Verdict
+from sealscope.thesis.engine.products import Claim, Figure, ThesisTable, Verdict
 
 THESIS = "Understanding Effect and Diagnosis of Internal Leakage in Hydrostatic Actuation Systems"
 VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
@@ -42,27 +41,21 @@ class PageProduct(NamedTuple):
 
 
 def write_thesis_page(
-    folder: Path,
-    products: Iterable[tuple[ItemStatus, Sequence[Product | Claim]]],
-    *,
-    quick: bool = False,
-    sheet: bool = False,
+    folder: Path, statuses: Sequence[ItemStatus], *, quick: bool = False, sheet: bool = False
 ) -> Path:
-    """Write `index.html` into `folder` from the status of every item and its products; return its path.
+    """Write `index.html` into `folder` from the status of every item; return its path.
 
     It refers to nothing outside it but the drawn files, which lie in the folder. `quick`: made with shorter runs;
     `sheet`: the measured sheet was given. Raises InputError where the page cannot be written.
     """
-    statuses: list[ItemStatus] = []
     shown: list[tuple[ItemStatus, Figure | ThesisTable, str]] = []
     claims: dict[str, Claim] = {}
-    for status, item_products in products:
-        statuses.append(status)
-        for product in item_products:
+    for status in statuses:
+        for product in status.products:
             if isinstance(product, Claim):
                 claims.setdefault(product.id, product)
-            elif isinstance(product, Figure):  # its picture takes the place of its arrays
-                shown.append((status, replace(product, panels=()), _picture(folder, product.id)))
+            elif isinstance(product, Figure):
+                shown.append((status, product, _picture(folder, product.id)))
             elif status.item.id != "claims":  # the claims have a section of their own
                 shown.append((status, product, ""))
     chapters: dict[int, list[PageProduct]] = defaultdict(list)
@@ -73,7 +66,7 @@ def write_thesis_page(
             bearing[name].append(product.id)
     absent: dict[str, list[ItemStatus]] = defaultdict(list)
     for status in statuses:
-        if not status.available:
+        if status.state not in ("made", "kept"):
             why = f"{status.state}: {status.reason}"
             absent["not made yet, or from other sources" if status.state == "not made" else why].append(status)
     claims_files = [name for status in statuses if status.item.id == "claims" for name in status.files]

@@ -7,26 +7,28 @@ reduced at once and not kept: all of them would fill gigabytes.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sealscope.parameters import Rig
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
+from sealscope.signals.details import details
+from sealscope.signals.filters import reach
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.instruments import record
+from sealscope.simulation.integrate import Trajectory, oversampling, sized_leaks, trajectory
+from sealscope.simulation.leaks import From
+from sealscope.simulation.simulate import prove, simulate_with_truth
 from sealscope.thesis.engine.context import Context, first_table
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, ThesisTable
 from sealscope.thesis.engine.texts import note
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, QUANTITIES, UNITS, Condition, DataSheet, experiment_values
 from sealscope.units import PSI
-
-if TYPE_CHECKING:
-    from sealscope.parameters import Rig
-    from sealscope.simulation.experiment import Experiment
-    from sealscope.simulation.integrate import Trajectory
 
 #: Length of the part without and of the part with the leak [s]; a quick reproduction takes the shorter one.
 HALF, QUICK_HALF = 90.0, 40.0
@@ -39,6 +41,8 @@ _SIZING = 30.0
 _DRIFT_SEED = 2000
 #: RMS without and with what happened at half time, by chamber and quantity.
 Pairs = Mapping[str, Mapping[str, tuple[float, ...]]]
+#: A test as a row of the table, and whether its run passed the halving test (None: not made).
+Simulated = tuple[tuple[Cell, ...], bool | None]
 
 
 @dataclass(frozen=True)
@@ -67,22 +71,8 @@ def draw_rig_drift(number: int, draw: int = 0) -> RigDrift:
     return RigDrift(*(float(1.0 + sign * share) for sign, share in zip(signs, shares, strict=True)))
 
 
-@dataclass(frozen=True)
-class SimulatedTest:
-    """One simulated test: RMS without and with what happened at half time, and what the run was."""
-
-    condition: Condition
-    rms: Pairs
-    mean_leak_lpm: float
-    range_MPa: tuple[float, ...]
-    resolved: bool | None = None
-    happened: str = ""
-
-
 def detail_series(recording: Recording, chamber: str) -> dict[str, Array]:
     """Return d1..d4 [psi] and d3d4 [psi^2] of a chamber's pressure."""
-    from sealscope.signals.details import details
-
     d = details(recording[chamber] / PSI)
     return {**{f"d{level}": d[level] for level in range(1, 5)}, "d3d4": d.product()}
 
@@ -92,8 +82,6 @@ def detail_rms(recording: Recording, parts: tuple[tuple[float, float], ...]) -> 
 
     A part is narrowed by the transform's reach on both sides, so that no coefficient saw anything outside of it.
     """
-    from sealscope.signals.filters import reach
-
     before, after = (int(samples) for samples in reach("db8", 4)[-1])
     rate = recording.rate
     slices = [slice(round(start * rate) + before, round(stop * rate) - after) for start, stop in parts]
@@ -118,24 +106,18 @@ def _range_MPa(t: Array, outputs: Mapping[str, Array] | Trajectory, stop: float)
 
 
 def _experiment(condition: Condition, duration: float, leak: str | None = None, seed: int = 0) -> Experiment:
-    from sealscope.simulation.experiment import Experiment
-
     values = experiment_values(condition)
     return Experiment.of(rig=BENCH_RIG, command=condition.command, set=values, leak=leak, duration=duration, seed=seed)
 
 
 def _recorded(experiment: Experiment, path: Trajectory) -> Recording:
     """Record a trajectory with the rig's instruments and the noise of the experiment's seed."""
-    from sealscope.simulation.instruments import record
-    from sealscope.simulation.integrate import oversampling
-
     volts = experiment.commanded.volts(experiment.sample_times())
     return record(experiment.rig, path, volts, oversampling(experiment), experiment.seed)
 
 
 def _leak_free_paths(duration: float) -> Callable[[Condition], Trajectory]:
     """Return what simulates an operating condition without a leak, each once for this call: a path is large."""
-    from sealscope.simulation.integrate import trajectory
 
     @cache
     def path(command: str, closed_pct: float) -> Trajectory:
@@ -144,15 +126,11 @@ def _leak_free_paths(duration: float) -> Callable[[Condition], Trajectory]:
     return lambda condition: path(*condition.group)
 
 
-def with_leak(half: float, quick: bool) -> Iterator[SimulatedTest]:
+def with_leak(half: float, quick: bool) -> Iterator[Simulated]:
     """Simulate the tests as they were: the leak opens at half time.
 
     The first test of each condition is proved by halving the step, except in a quick reproduction.
     """
-    from sealscope.simulation.integrate import sized_leaks
-    from sealscope.simulation.leaks import From
-    from sealscope.simulation.simulate import prove, simulate_with_truth
-
     proved: set[tuple[str, float]] = set()
     for condition in APPENDIX_C:
         leak = f"{condition.mean_leak_lpm:g} L/min from {SETTLING:g} s"
@@ -166,26 +144,24 @@ def with_leak(half: float, quick: bool) -> Iterator[SimulatedTest]:
             resolved = prove(replace(experiment, allow_unresolved=True)).resolved
         rms, truth = detail_rms(simulated.recording, ((SETTLING, half), (half, 2 * half))), simulated.truth
         ranges = _range_MPa(truth.t, truth.outputs, half)
-        yield SimulatedTest(condition, rms, truth.mean_leak_lpm, ranges, resolved, "leak opened")
+        yield row_of(condition, "leak opened", truth.mean_leak_lpm, ranges, rms), resolved
 
 
-def without_leak(half: float, quick: bool) -> Iterator[SimulatedTest]:
+def without_leak(half: float, quick: bool) -> Iterator[Simulated]:
     """Simulate the same tests with no leak: nothing happens at half time; the noise alone differs."""
     paths = _leak_free_paths(2 * half)
     for condition in APPENDIX_C:
         path, experiment = paths(condition), _experiment(condition, 2 * half, seed=1000 + condition.number)
         rms = detail_rms(_recorded(experiment, path), ((SETTLING, half), (half, 2 * half)))
-        yield SimulatedTest(condition, rms, 0.0, _range_MPa(path.t, path, half), None, "nothing")
+        yield row_of(condition, "nothing", 0.0, _range_MPa(path.t, path, half), rms), None
 
 
-def with_drift(half: float, quick: bool) -> Iterator[SimulatedTest]:
+def with_drift(half: float, quick: bool) -> Iterator[Simulated]:
     """Simulate the same tests with no leak on a rig that drifts.
 
     The second half comes from a rig with other friction, bulk modulus and noise (`draw_rig_drift`), two draws of each
     test, one where it is `quick`.
     """
-    from sealscope.simulation.integrate import trajectory
-
     length = SETTLING + half
     paths, part = _leak_free_paths(length), ((SETTLING, length),)
     for draw, condition in itertools.product(range(1 if quick else 2), APPENDIX_C):
@@ -197,7 +173,7 @@ def with_drift(half: float, quick: bool) -> Iterator[SimulatedTest]:
         after = detail_rms(_recorded(second, trajectory(second, ())), part)
         rms = {c: {name: (*before[c][name], *after[c][name]) for name in QUANTITIES} for c in CHAMBERS}
         happened = f"friction x {drift.friction:.3f}, K x {drift.bulk:.3f}, noise x {drift.noise:.3f}"
-        yield SimulatedTest(condition, rms, 0.0, _range_MPa(path.t, path, length), None, happened)
+        yield row_of(condition, happened, 0.0, _range_MPa(path.t, path, length), rms), None
 
 
 #: Chamber, quantity, half and head of the RMS columns.
@@ -207,20 +183,18 @@ _RMS_COLUMNS = [
     for name in QUANTITIES
     for k, when in enumerate(("no leak", "leak"))
 ]
-_COLUMNS = (
+COLUMNS = (
     *("test", "input", "closed [%]", "at half time", "mean leak [L/min]", "p_A range [MPa]", "p_B range [MPa]"),
     *(head for *_, head in _RMS_COLUMNS),
 )
 
 
-def table_of(tests: list[SimulatedTest], item: Item, notes: str = "") -> ThesisTable:
-    """Tabulate the tests; `sheet_of` reads the table back. It is resolved when every run that was proved is."""
-    rows: list[tuple[Cell, ...]] = []
-    for test in tests:
-        of, rms = test.condition, (test.rms[chamber][name][k] for chamber, name, k, _ in _RMS_COLUMNS)
-        rows.append((of.number, of.command, of.closed_pct, test.happened, test.mean_leak_lpm, *test.range_MPa, *rms))
-    outcomes = [test.resolved for test in tests if test.resolved is not None]
-    return item.table(rows, notes, _COLUMNS, resolved=all(outcomes) if outcomes else None)
+def row_of(
+    condition: Condition, happened: str, mean_leak_lpm: float, ranges_MPa: Sequence[float], rms: Pairs
+) -> tuple[Cell, ...]:
+    """Return a test as a row under `COLUMNS`; `sheet_of` reads the RMS back."""
+    of, values = condition, (rms[chamber][name][k] for chamber, name, k, _ in _RMS_COLUMNS)
+    return (of.number, of.command, of.closed_pct, happened, mean_leak_lpm, *ranges_MPa, *values)
 
 
 def column(table: ThesisTable, head: str) -> Array:
@@ -230,7 +204,7 @@ def column(table: ThesisTable, head: str) -> Array:
 
 
 def sheet_of(table: ThesisTable) -> DataSheet:
-    """Read the RMS columns of a table made by `table_of` as a sheet, in the table's order of rows."""
+    """Read the RMS columns of a table of such rows as a sheet, in the table's order."""
     values = np.array([column(table, head) for *_, head in _RMS_COLUMNS]).reshape(len(CHAMBERS), len(QUANTITIES), 2, -1)
     return DataSheet({c: {q: values[k, j].T for j, q in enumerate(QUANTITIES)} for k, c in enumerate(CHAMBERS)})
 
@@ -245,7 +219,9 @@ def runs_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     bounds = {part: f"{100 * low:g} to {100 * high:g} %" for part, (low, high) in parts.items()}
     of = note(f"runs-{name}", proof=proof, **bounds)
     notes = note("runs", rig=BENCH_RIG, half=half, quick=" (quick)" if context.quick else "", of=of)
-    return (table_of(list(_RUNS[name](half, context.quick)), item, notes),)
+    rows, tested = zip(*_RUNS[name](half, context.quick), strict=True)
+    outcomes = [passed for passed in tested if passed is not None]
+    return (item.table(rows, notes, COLUMNS, resolved=all(outcomes) if outcomes else None),)
 
 
 def simulated_sheet(context: Context, runs: str) -> tuple[ThesisTable, DataSheet]:

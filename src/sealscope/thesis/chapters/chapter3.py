@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
+from sealscope.signals.filters import discrete_wavelet
+from sealscope.simulation.experiment import Experiment
 from sealscope.thesis.chapters.chapter4.cases import visible_pressure
-from sealscope.thesis.engine.context import Context, RunSpec
+from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Claim, Figure, FigureCurve, Image, Number, Panel, Role
 from sealscope.thesis.engine.texts import judged, note
@@ -20,19 +21,14 @@ RATE = 1000.0
 #: Frequency [Hz] and amplitude of the two components of eq. (3.3).
 TONES = ((100.0, 1.0), (30.0, 0.5))
 WAVELET = "db8"
-#: Sine command and leak of the pressure record of eq. (3.4): the largest mean leak at 3 sin(4t) among the tests.
-RECORD = RunSpec(command="3 sin(4t)", duration=20.0, leaks=("0.0163 L/min from 10 s",), prove=True)
-#: Pressures without a leak and with the largest mean leak among the tests at 3 sin(4t).
-_NO_LEAK = RunSpec(command="3 sin(4t)", duration=40.0)
-_LEAK = replace(_NO_LEAK, leaks=("0.0163 L/min",))
+#: Command of the pressures that are looked at, and the largest mean leak among the tests at it.
+_COMMAND, _LEAK = "3 sin(4t)", "0.0163 L/min"
 _ONSET, _SETTLED, _BLOCK = 10.0, 1.0, 0.05
 _OCTAVES = 24
 
 
 def mother_wavelet() -> tuple[Array, Array, Array]:
     """Return scaling function, mother wavelet and their time [samples] by the cascade of db8's filters."""
-    from sealscope.signals.filters import discrete_wavelet
-
     phi, psi, t = discrete_wavelet(WAVELET).wavefun(level=10)
     return phi, psi, t
 
@@ -44,7 +40,6 @@ def wavelet_spectrum(omega: Array) -> np.ndarray:
     sum_k taps_k exp(-j w k); unit l2 norm.
     Source: Daubechies, Ten Lectures on Wavelets (1992), eqs. (5.1.17), (6.2.2).
     """
-    from sealscope.signals.filters import discrete_wavelet
 
     def response(taps: list[float], at: Array) -> np.ndarray:
         return np.asarray(np.polynomial.polynomial.polyval(np.exp(-1j * at), np.array(taps, dtype=np.float64)))
@@ -228,7 +223,7 @@ def _width(t: Array, values: Array) -> float:
 
 def pressure_scalogram(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw eqs. (3.4)-(3.6) on a simulated record of p_A: the ringing after each reversal, before and with a leak."""
-    run = context.run(RECORD)
+    run = context.run(Experiment.of(command=_COMMAND, duration=20.0, leak=f"{_LEAK} from {_ONSET:g} s"))
     t = run.recorded.t
     rate = 1.0 / float(t[1] - t[0])
     wanted = np.geomspace(12.0, 0.45 * rate, 64)
@@ -252,7 +247,7 @@ def pressure_scalogram(context: Context, item: Item) -> tuple[Figure, ...]:
         Number("rms at the ringing, leak / no leak", float(strength["leak"][ring] / strength["no leak"][ring])),
         Number("mean leak", run.mean_leak_lpm, "L/min"),
     )
-    notes = note("scalogram", command=RECORD.command, onset=_ONSET, block=_BLOCK)
+    notes = note("scalogram", command=_COMMAND, onset=_ONSET, block=_BLOCK)
     return (item.figure(panels, numbers, run.resolved, notes),)
 
 
@@ -299,7 +294,9 @@ def _wavelet() -> Iterator[Claim]:
 
 
 def _leak(context: Context) -> Claim:
-    without, leaking = context.run(_NO_LEAK), context.run(_LEAK)
+    without, leaking = (
+        context.run(Experiment.of(command=_COMMAND, duration=40.0, leak=leak), prove=False) for leak in (None, _LEAK)
+    )
     late = without.t > 10.0
     measures = (np.mean, np.max, np.ptp)
     changes = {

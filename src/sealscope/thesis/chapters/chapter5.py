@@ -11,8 +11,11 @@ from numpy.typing import NDArray
 
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
+from sealscope.signals.filters import reach
+from sealscope.signals.windows import WINDOW_SIZE, rms, windowed_rms
+from sealscope.simulation.experiment import Experiment
 from sealscope.thesis.chapters.appendix_c_runs import SETTLING, detail_rms, detail_series, pressure_range
-from sealscope.thesis.engine.context import Context, RunSpec, SimulatedRun
+from sealscope.thesis.engine.context import Context, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Figure, FigureCurve, Number, Panel, Role
 from sealscope.thesis.engine.texts import note, texts_of
@@ -72,12 +75,17 @@ class ShownTest:
 TESTS: dict[str, ShownTest] = {row[0]: ShownTest(*row) for row in texts_of("cases.toml")["shown"]}
 
 
-def spec_of(test: ShownTest) -> RunSpec:
+def spec_of(test: ShownTest) -> Experiment:
     """Return the run of a test: its command and throttles on the identified rig, its mean leak from half time."""
     condition = test.condition
-    leak = f"{condition.mean_leak_lpm:g} L/min from {test.half:g} s"
-    values = tuple(experiment_values(condition).items())
-    return RunSpec(condition.command, 2 * test.half, (leak,), BENCH_RIG, values, condition.number, prove=True)
+    return Experiment.of(
+        command=condition.command,
+        duration=2 * test.half,
+        leak=f"{condition.mean_leak_lpm:g} L/min from {test.half:g} s",
+        rig=BENCH_RIG,
+        set=experiment_values(condition),
+        seed=condition.number,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,9 +229,6 @@ def mean_slope(t: Array, y: Array, omega: float) -> float:
 
 def windowed(recording: Recording, chamber: str) -> tuple[Array, dict[str, Array]]:
     """Return the centres [s] of the windows of 1000 samples, 500 apart, and the RMS of d3, d4, d3d4 in each."""
-    from sealscope.signals.filters import reach
-    from sealscope.signals.windows import WINDOW_SIZE, windowed_rms
-
     before, after = (int(samples) for samples in reach("db8", 4)[-1])
     series = detail_series(recording, chamber)
     inside = slice(before, len(recording) - after)
@@ -266,10 +271,8 @@ def best_step(t: Array, y: Array, least: int = 5) -> float:
 
 def measure_test(context: Context, test: ShownTest, leak: bool = True) -> ShownMeasures:
     """Measure one of the ten tests, or the same run with its leak left out."""
-    from sealscope.signals.windows import rms
-
     spec = spec_of(test)
-    run = context.run(spec if leak else replace(spec, leaks=(), prove=False))
+    run = context.run(spec) if leak else context.run(replace(spec, leaks=()), prove=False)
     recording = run.recorded
     t, period = recording.t, 2.0 * np.pi / test.omega
     # the last whole periods of the command in each half

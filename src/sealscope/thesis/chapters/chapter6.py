@@ -7,20 +7,19 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sealscope.control import FaultTolerant, controller_named
+from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Array
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.integrate import Trajectory, trajectory
 from sealscope.thesis.engine.context import Context, first_table
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, Claim, Figure, FigureCurve, Panel, Role, ThesisTable
 from sealscope.thesis.engine.texts import judged, note
 from sealscope.units import LITRE_PER_MINUTE
-
-if TYPE_CHECKING:
-    from sealscope.parameters import Rig
-    from sealscope.simulation.integrate import Trajectory
 
 RIG = "thesis-closed-loop"
 #: The valve-controlled rig with the same cylinder, and what it is compared by.
@@ -65,8 +64,6 @@ def conductance(lpm: float, rig: Rig) -> float:
 
 @cache
 def _rig(name: str = RIG) -> Rig:
-    from sealscope.parameters import load_rig
-
     return load_rig(name)
 
 
@@ -96,10 +93,6 @@ class ControlledRig:
 
     def run(self, command: str, duration: float, load: str = "0 N") -> Trajectory:
         """Run a command under a load in words beside `LOAD`."""
-        from sealscope.control import FaultTolerant, controller_named
-        from sealscope.simulation.experiment import Experiment
-        from sealscope.simulation.integrate import trajectory
-
         rig = _rig(self.rig)
         size, controller = conductance(self.lpm, rig), None
         if self.controller:

@@ -7,11 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from sealscope.campaigns.held_out.classifiers import MeasuredSamples, held_out_scores
+from sealscope.campaigns.plans.model import LogisticClassifier
 from sealscope.evaluation.binomial import clopper_pearson
+from sealscope.evaluation.roc import auc
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.thesis.chapters.appendix_c_runs import simulated_sheet
@@ -21,9 +24,6 @@ from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.products import Claim, ThesisTable
 from sealscope.thesis.engine.texts import judged
 from sealscope.thesis.sheet import APPENDIX_C, DataSheet
-
-if TYPE_CHECKING:
-    from sealscope.campaigns.held_out.classifiers import MeasuredSamples
 
 NO_SHEET = "the thesis's data sheet was not given"
 #: The details that chapter 5 calls sensitive.
@@ -155,8 +155,6 @@ def change_columns(sheet: DataSheet) -> Array:
 
 def samples_of(sheet: DataSheet) -> MeasuredSamples:
     """Return the sheet as samples: log RMS of each detail, each test without and with its leak."""
-    from sealscope.campaigns.held_out.classifiers import MeasuredSamples
-
     leaks = [row.mean_leak_lpm for row in APPENDIX_C]
     return MeasuredSamples(
         features={
@@ -176,10 +174,6 @@ def separation_by_levels(sheet: DataSheet, leave_out: str) -> tuple[float, float
     Logistic regression with a ridge of 1; `leave_out`: every "test" or every "condition" is left out in turn. Returns
     the accuracy and the area under the curve.
     """
-    from sealscope.campaigns.held_out.classifiers import held_out_scores
-    from sealscope.campaigns.plans.model import LogisticClassifier
-    from sealscope.evaluation.roc import auc
-
     samples = samples_of(sheet)
     features = tuple(f"d{level} of {chamber}" for chamber in CHAMBERS for level in range(1, 5))
     scores = held_out_scores(samples, LogisticClassifier("levels", features, 1.0), leave_out)

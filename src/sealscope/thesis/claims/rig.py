@@ -7,7 +7,10 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
+from sealscope.parameters import load_rig
 from sealscope.recordings.chambers import CHAMBERS
+from sealscope.signals.filters import decomposition_filters, reach
+from sealscope.signals.windows import WINDOW_SIZE
 from sealscope.thesis.chapters.appendix_c_runs import column
 from sealscope.thesis.chapters.success_rates import CLAIMED
 from sealscope.thesis.claims.evidence import NO_SHEET, ClaimEvidence, counted_share, fired
@@ -33,10 +36,6 @@ def claims(evidence: ClaimEvidence) -> tuple[Claim, ...]:
 
 def _method() -> Iterator[Claim]:
     """Judge what is said of the wavelet and its cost."""
-    from sealscope.parameters import load_rig
-    from sealscope.signals.filters import decomposition_filters, reach
-    from sealscope.signals.windows import WINDOW_SIZE
-
     shares = {}
     for order in (1, 2, 4, 8):
         response = np.abs(np.fft.rfft(decomposition_filters(f"db{order}")[1], 4096)) ** 2

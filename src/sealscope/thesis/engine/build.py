@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import os
+import shutil
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import astuple, dataclass, replace
-from functools import cache
+from dataclasses import asdict, dataclass, replace
+from functools import cache, partial
+from graphlib import TopologicalSorter
 from importlib import metadata
+from json import dumps, loads
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from sealscope.campaigns.cases.case import digest, files_digest
+from sealscope.campaigns.cases.row import error_text
 from sealscope.campaigns.execution.workers import carried_out, process_count
-from sealscope.errors import InputError, SealscopeError
-from sealscope.thesis.engine.context import Context, Products, RunSpec, SimulatedRun, simulated_run
+from sealscope.errors import InputError
+from sealscope.storage.folders import inner_folder
+from sealscope.storage.opening import names_a_file
+from sealscope.storage.plain_values import as_type
+from sealscope.storage.rows import locked, read_rows, stored
+from sealscope.thesis.engine.context import Context, Products
 from sealscope.thesis.engine.items import Item, collect, select_items, with_needed
-from sealscope.thesis.engine.kept import ResultsFolder
 from sealscope.thesis.engine.products import Claim, Figure, Product, thinned
 from sealscope.thesis.sheet import MISSING, DataSheet, find_sheet, read_sheet
 
@@ -28,6 +35,7 @@ Progress = Callable[[int, int, Sequence[str]], None]
 State = Literal["made", "kept", "left out", "failed", "not made"]
 #: Libraries that results and drawings rest on, beside the sources of this package.
 _LIBRARIES = ("numpy", "scipy", "numba", "PyWavelets", "matplotlib")
+_WHAT = "a reproduction"
 
 
 @dataclass(frozen=True)
@@ -35,81 +43,35 @@ class ItemStatus:
     """The state of an item in a results folder.
 
     `state`: made now, kept from an earlier call, left out or failed (`reason` says why), or not made (not chosen, or
-    made by other sources); `files`: what was drawn of it, relative to the folder.
+    made by other sources); `products` without the curves of figures; `files`: what was drawn of it, relative to the
+    folder.
     """
 
     item: Item
     state: State
     reason: str = ""
+    products: Products = ()
     files: tuple[str, ...] = ()
 
-    @property
-    def available(self) -> bool:
-        """Whether its products can be shown."""
-        return self.state in ("made", "kept")
+
+@dataclass(frozen=True)
+class ItemRow:
+    """What a results folder stores of an item, under the `key` of what it rests on; or its `error` with the trace."""
+
+    id: str
+    key: str
+    products: Products = ()
+    files: tuple[str, ...] = ()
+    error: str = ""
+    trace: str = ""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the row as plain JSON values."""
+        return asdict(self)
 
 
-class Reproduction:
-    """The items of a results folder: the status of each by its id, in the order of the list, and its products."""
-
-    def __init__(
-        self, folder: Path, items: Sequence[Item], quick: bool, sheet: Path | None, publish: Publish | None
-    ) -> None:
-        self.folder, self.items = ResultsFolder(folder), {item.id: item for item in items}
-        self.quick, self.publish = quick, publish
-        self.sheet: DataSheet | None = None
-        self._sheet_key = ""
-        if sheet is not None:
-            self.sheet, self._sheet_key = read_sheet(sheet)
-        self.statuses: dict[str, ItemStatus] = {}
-
-    def products(self, name: str) -> Products | None:
-        """Return the products of an item that the folder holds; None where it has none of these sources."""
-        return self.folder.products(name, self._key(self.items[name]))
-
-    def status(self, item: Item) -> ItemStatus:
-        """Return the status of an item as the folder has it: kept, left out or not made."""
-        if self._left_out(item):
-            return ItemStatus(item, "left out", MISSING)
-        files = self.folder.files(item.id, self._key(item))
-        return ItemStatus(item, "not made" if files is None else "kept", files=files or ())
-
-    def make(self, name: str) -> ItemStatus:
-        """Make and draw an item; the status holds the reason of a failure."""
-        item = self.items[name]
-        try:
-            products = self.products(name) or tuple(map(_thinned, item.make(self._context(item), item)))
-            files = () if self.publish is None else self.publish(item, products, self.folder.path)
-            self.folder.save(name, self._key(item), products, files)
-        except Exception as error:
-            self.folder.save_failure(name, traceback.format_exc())
-            text = str(error) if isinstance(error, SealscopeError) else f"{type(error).__name__}: {error}"
-            return ItemStatus(item, "failed", (text.strip() or type(error).__name__).splitlines()[0])
-        return ItemStatus(item, "made", files=files)
-
-    def _left_out(self, item: Item) -> bool:
-        return item.needs_sheet and self.sheet is None
-
-    def _key(self, item: Item) -> str:
-        """Digest of what an item's products and drawings rest on."""
-        sheet = self._sheet_key if item.needs_sheet or item.uses_sheet else ""
-        needs = [self._key(self.items[needed]) for needed in item.needs]
-        own = [item.id, item.title, item.make.__module__, item.make.__qualname__, item.inputs]
-        return digest([own, needs, sheet, self.publish is not None, self.quick, sources_key()])
-
-    def _context(self, item: Item) -> Context:
-        def product(name: str) -> Products:
-            if name not in item.needs:
-                raise InputError(f"{item.id} must name {name} among its needs to ask for its products")
-            products = () if self._left_out(self.items[name]) else self.products(name)
-            if products is None:
-                raise InputError(f"needs {name}, which failed")
-            return products
-
-        def run(spec: RunSpec) -> SimulatedRun:
-            return self.folder.run(digest([astuple(spec), sources_key()]), lambda: simulated_run(spec))
-
-        return Context(self.quick, self.sheet if item.needs_sheet or item.uses_sheet else None, run, product)
+#: An item to make, its key, and the products of what it needs.
+_Job = tuple[Item, str, Mapping[str, Products]]
 
 
 def reproduce(
@@ -122,43 +84,109 @@ def reproduce(
     items: Sequence[Item] | None = None,
     publish: Publish | None = None,
     progress: Progress = lambda ended, total, in_work: None,
-) -> Reproduction:
-    """Make the chosen items (see `items.select_items`) and what they need, and draw them with `publish`.
+) -> dict[str, ItemStatus]:
+    """Make the chosen items (see `items.select_items`) and what they need, draw them, and return the status of all.
 
     `jobs` processes (default: one a core, at most two; 1: in this process); `sheet`: folder of the data sheet (see
-    `sheet.find_sheet`). What was made by an earlier call from the same sources stays. A failed item does not stop the
-    others. KeyboardInterrupt leaves all finished items valid.
+    `sheet.find_sheet`); `publish` draws. What was made by an earlier call from the same sources stays. A failed item
+    does not stop the others. KeyboardInterrupt leaves all finished items valid.
 
-    Raises InputError for an unknown item, a bad sheet, or a folder that cannot be written or is in use.
+    Raises InputError for an unknown item, a bad sheet, or a folder that cannot be written, is in use or is damaged.
     """
     if jobs is not None and jobs < 1:
         raise InputError(f"jobs must be >= 1, got {jobs}")
     every = collect() if items is None else items
-    chosen = with_needed(every, select_items(every, patterns))
-    result = Reproduction(Path(folder), every, quick, find_sheet(sheet), publish)
-    with result.folder.locked():
-        result.statuses = {item.id: result.status(item) for item in every}
-        waiting = [item for item in chosen if result.statuses[item.id].state == "not made"]
-        total, ended, in_work = len(waiting), 0, list[str]()
+    chosen, where, place = with_needed(every, select_items(every, patterns)), find_sheet(sheet), Path(folder)
+    data, sheet_key = (None, "") if where is None else read_sheet(where)
+    keys = _keys(every, sheet_key, quick, publish is not None)
+    kept = inner_folder(place, "kept")
+    with locked(kept, _WHAT):
+        rows = read_rows(kept, partial(_row, keys), _WHAT, loads)
+        statuses = {item.id: _status(item, data, rows.get(item.id), place) for item in every}
+        waiting = {item.id: item for item in chosen if statuses[item.id].state == "not made"}
+        runs = inner_folder(kept, "runs")
+        try:
+            shutil.rmtree(runs)  # pickles of a call that was broken off, or from outside
+            runs.mkdir()
+        except OSError as error:
+            raise InputError(f"a folder of runs must be emptied, got: {error.strerror or error} ({runs})") from None
+        task = partial(_made, quick, data, publish, place, runs)
+        in_work: list[str] = []
+        ended = 0
 
-        def begun(ready: Sequence[Item]) -> Iterator[str]:
-            for item in ready:
-                in_work.append(item.id)
-                progress(ended, total, in_work)
-                yield item.id
+        def begun(ready: Sequence[str]) -> Iterator[_Job]:
+            for name in ready:
+                in_work.append(name)
+                progress(ended, len(waiting), in_work)
+                done = {need: statuses[need] for need in waiting[name].needs}
+                yield waiting[name], keys[name], {n: of.products for n, of in done.items() if of.state != "failed"}
 
-        while waiting:
-            unmade = {item.id for item in waiting}
-            ready = [item for item in waiting if unmade.isdisjoint(item.needs)]
-            waiting = [item for item in waiting if item not in ready]
-            with closing(carried_out(result.make, begun(ready), min(process_count(jobs), len(ready)))) as made:
-                for name, status in made:
-                    died = ItemStatus(result.items[name], "failed", "the process that made it died")
-                    result.statuses[name] = status or died
-                    in_work.remove(name)
-                    ended += 1
-        progress(ended, total, in_work)
-    return result
+        order = TopologicalSorter({name: waiting.keys() & item.needs for name, item in waiting.items()})
+        order.prepare()
+        while order.is_active():
+            ready = sorted(order.get_ready(), key=list(waiting).index)
+            made = _rows(carried_out(task, begun(ready), min(process_count(jobs), len(ready))))
+            for row in stored(kept, made, _WHAT):
+                state: State = "failed" if row.error else "made"
+                statuses[row.id] = ItemStatus(waiting[row.id], state, row.error, row.products, row.files)
+                in_work.remove(row.id)
+                ended += 1
+            order.done(*ready)
+        progress(ended, len(waiting), in_work)
+        shutil.rmtree(runs, ignore_errors=True)
+    return statuses
+
+
+def _keys(items: Sequence[Item], sheet: str, quick: bool, drawn: bool) -> dict[str, str]:
+    """Return the digest of what each item's products and drawings rest on."""
+    by_id, sources = {item.id: item for item in items}, sources_key()
+
+    @cache
+    def key(name: str) -> str:
+        item = by_id[name]
+        own = [item.id, item.title, item.make.__module__, item.make.__qualname__, item.inputs]
+        return digest([own, [*map(key, item.needs)], sheet if item.of_sheet else "", drawn, quick, sources])
+
+    return {name: key(name) for name in by_id}
+
+
+def _row(keys: Mapping[str, str], tree: Any) -> ItemRow | None:
+    """Return the row of an item as it is now, None for one of other sources."""
+    if not isinstance(tree, dict):
+        raise ValueError("no row")
+    return as_type(ItemRow, tree) if keys.get(str(tree.get("id"))) == tree.get("key") else None
+
+
+def _status(item: Item, sheet: DataSheet | None, row: ItemRow | None, folder: Path) -> ItemStatus:
+    """Return the status of an item as the folder has it: kept, left out or not made."""
+    if item.needs_sheet and sheet is None:
+        return ItemStatus(item, "left out", MISSING)
+    if row is None or row.error or not all(names_a_file(folder / name) for name in row.files):
+        return ItemStatus(item, "not made")
+    return ItemStatus(item, "kept", "", row.products, row.files)
+
+
+def _rows(ended: Generator[tuple[_Job, ItemRow | None], None, None]) -> Generator[ItemRow, None, None]:
+    """Yield the rows of the items as they end."""
+    with closing(ended):
+        for (item, key, _), row in ended:
+            yield row or ItemRow(item.id, key, error="the process that made it died")
+
+
+def _made(
+    quick: bool, sheet: DataSheet | None, publish: Publish | None, folder: Path, runs: Path, job: _Job
+) -> ItemRow:
+    """Make and draw an item; the row holds the reason of a failure."""
+    item, key, needed = job
+    context = Context(item.id, item.needs, quick, sheet if item.of_sheet else None, needed, runs)
+    try:
+        products = tuple(map(_thinned, item.make(context, item)))
+        files = () if publish is None else publish(item, products, folder)
+        row = ItemRow(item.id, key, tuple(map(undrawn, products)), files)
+        dumps(row.as_dict())  # what cannot be stored fails here, and not all the others with it
+    except Exception as error:
+        return ItemRow(item.id, key, error=error_text(error) or type(error).__name__, trace=traceback.format_exc())
+    return row
 
 
 def _thinned(product: Product | Claim) -> Product | Claim:
@@ -171,6 +199,11 @@ def _thinned(product: Product | Claim) -> Product | Claim:
         curves = tuple(replace(curve, x=x, y=y) for curve, (x, y) in zip(panel.curves, pairs, strict=True))
         panels.append(replace(panel, curves=curves))
     return replace(product, panels=tuple(panels))
+
+
+def undrawn(product: Product | Claim) -> Product | Claim:
+    """Leave out what is drawn: the arrays."""
+    return replace(product, panels=()) if isinstance(product, Figure) else product
 
 
 @cache

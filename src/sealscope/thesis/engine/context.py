@@ -2,48 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+import copyreg
+import pickle
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
-from sealscope.errors import SimulationFailed
+from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.recording import Array, Recording
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.storage.atomic import atomic_write
+from sealscope.storage.folders import locked
 from sealscope.thesis.engine.products import Claim, Product, ThesisTable
 from sealscope.thesis.sheet import DataSheet
 
-if TYPE_CHECKING:
-    from sealscope.simulation.experiment import Experiment
-
 Products = tuple[Product | Claim, ...]
-
-
-@dataclass(frozen=True)
-class RunSpec:
-    """A simulated run as text and numbers; equal specs are run once.
-
-    `values`: parameters by name, as text with unit or SI number; `leaks` as `simulation.faults.parse_leak` reads
-    them; `prove`: do the halving test too (its outcome is in `SimulatedRun.resolved`; an unresolved run is kept and
-    marked, not raised).
-    """
-
-    command: str = "3 sin(4t)"
-    duration: float = 180.0
-    leaks: tuple[str, ...] = ()
-    rig: str = "thesis"
-    values: tuple[tuple[str, str | float], ...] = ()
-    seed: int = 0
-    method: Literal["auto", "rk4", "imex"] = "auto"
-    step: float | None = None
-    prove: bool = False
-
-    def experiment(self) -> Experiment:
-        """Return the experiment of this spec."""
-        from sealscope.simulation.experiment import Experiment
-
-        given = {name: getattr(self, name) for name in ("command", "duration", "rig", "seed", "method", "step")}
-        return Experiment.of(leak=self.leaks, set=dict(self.values), allow_unresolved=True, **given)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,32 +49,57 @@ class SimulatedRun:
         return self.recording
 
 
-def simulated_run(spec: RunSpec) -> SimulatedRun:
-    """Simulate a run, with its halving test where it is asked for."""
-    from sealscope.simulation.simulate import simulate_with_truth
-
+def simulated_run(experiment: Experiment, prove: bool) -> SimulatedRun:
+    """Simulate a run, and `prove` it: halve its step, too; one that diverged or is not resolved says so."""
     try:
-        simulated = simulate_with_truth(spec.experiment(), prove=spec.prove)
+        simulated = simulate_with_truth(replace(experiment, allow_unresolved=True), prove=prove)
     except SimulationFailed as error:
-        return SimulatedRun(None, np.empty(0), {}, 0.0, False if spec.prove else None, diverged=str(error))
+        return SimulatedRun(None, np.empty(0), {}, 0.0, False if prove else None, diverged=str(error))
     truth, proof = simulated.truth, simulated.proof
     moved = {} if proof is None else {change.name: change.difference for change in proof.differences}
     resolved = None if proof is None else proof.resolved
     return SimulatedRun(simulated.recording, truth.t, truth.outputs, truth.mean_leak_lpm, resolved, moved)
 
 
+def _view(values: dict[str, Any]) -> MappingProxyType[str, Any]:
+    return MappingProxyType(values)
+
+
+copyreg.pickle(MappingProxyType, lambda view: (_view, (dict(view),)))  # a recording's channels
+
+
 @dataclass(frozen=True)
 class Context:
-    """Handed to every maker.
+    """Handed to the maker of the item of that name.
 
-    `sheet`: the measured sheet, None where it was not given or the item does not use it; `run` gives the run of a spec,
-    simulated now or earlier; `product` the products of an item among the maker's `needs`, () where it is left out.
+    `sheet`: the measured sheet, None where it was not given or the item does not use it; `products`: those of the items
+    that it needs, by id, without those that failed; `runs`: folder of this call's runs, which its processes share.
     """
 
+    name: str
+    needs: tuple[str, ...]
     quick: bool
     sheet: DataSheet | None
-    run: Callable[[RunSpec], SimulatedRun]
-    product: Callable[[str], Products]
+    products: Mapping[str, Products]
+    runs: Path
+
+    def run(self, experiment: Experiment, *, prove: bool = True) -> SimulatedRun:
+        """Return the run of an experiment, simulated once while other processes that want it wait."""
+        path = self.runs / f"{experiment.key()}{'-proved' if prove else ''}.run"
+        with locked(path.with_suffix(".lock"), None):
+            if not path.exists():
+                with atomic_write(path) as temporary:
+                    temporary.write_bytes(pickle.dumps(simulated_run(experiment, prove)))
+            run: SimulatedRun = pickle.loads(path.read_bytes())
+        return run
+
+    def product(self, name: str) -> Products:
+        """Return the products of an item among the needs, () where it is left out."""
+        if name not in self.needs:
+            raise InputError(f"{self.name} must name {name} among its needs to ask for its products")
+        if name not in self.products:
+            raise InputError(f"needs {name}, which failed")
+        return self.products[name]
 
 
 def first_table(context: Context, item: str) -> ThesisTable:

@@ -39,6 +39,11 @@ class Item:
     claims: tuple[str, ...] = ()
     columns: tuple[str, ...] = ()
 
+    @property
+    def of_sheet(self) -> bool:
+        """Whether it rests on the data sheet where that is given."""
+        return self.uses_sheet or self.needs_sheet
+
     def figure(
         self, panels: Iterable[Panel], numbers: Iterable[Number] = (), resolved: bool | None = None, notes: str = ""
     ) -> Figure:

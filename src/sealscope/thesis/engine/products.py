@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import PlainValidator
 
 from sealscope.recordings.recording import Array
 
@@ -18,14 +19,15 @@ Role = Literal[
 ]  # fmt: skip
 #: A value of a table; None: no value.
 Cell = float | int | str | None
+Values = Annotated[Array, PlainValidator(np.asarray)]
 
 
 @dataclass(frozen=True, eq=False)
 class FigureCurve:
     """One series of points (x, y), in the panel's units."""
 
-    x: Array
-    y: Array
+    x: Values
+    y: Values
     label: str
     role: Role = "other"
     kind: Literal["line", "points", "stems"] = "line"
@@ -35,9 +37,9 @@ class FigureCurve:
 class Image:
     """Values (rows over y, columns over x) drawn as greys, such as a spectrogram."""
 
-    x: Array
-    y: Array
-    values: Array
+    x: Values
+    y: Values
+    values: Values
     label: str
 
 

@@ -14,9 +14,11 @@ from typing import Literal
 
 import numpy as np
 
+from sealscope.parameters import load_rig
 from sealscope.recordings.chambers import PRESSURES
 from sealscope.recordings.recording import Array
-from sealscope.thesis.engine.context import Context, RunSpec, SimulatedRun
+from sealscope.simulation.experiment import Experiment
+from sealscope.thesis.engine.context import Context, SimulatedRun
 
 Solver = Literal["converged", "literal"]
 SOLVERS: tuple[Solver, ...] = ("converged", "literal")
@@ -120,14 +122,14 @@ def spec(
     solver: Solver = "converged",
     duration: float = DURATION,
     changed: Mapping[str, str | float] = MappingProxyType({}),
-) -> RunSpec:
+) -> Experiment:
     """Return the run of a command with throttles closed by `closed_pct` [%] (None: absent); `changed` parameters."""
     values = {**dict(reading.values(closed_pct)), **changed}
-    run = RunSpec(command, duration, values=tuple(values.items()), prove=True)
+    run = Experiment.of(command=command, duration=duration, set=values)
     return replace(run, method="rk4", step=THESIS_STEP) if solver == "literal" else run
 
 
-def drift_spec(reading: Reading, closed_pct: float | None, solver: Solver, **changed: str | float) -> RunSpec:
+def drift_spec(reading: Reading, closed_pct: float | None, solver: Solver, **changed: str | float) -> Experiment:
     """Return a long run of section 4.3's command for the drift of the piston."""
     return spec(COMMAND, closed_pct, reading, solver, _DRIFT_DURATION, {"daq.sample_rate": _DRIFT_RATE, **changed})
 
@@ -196,7 +198,5 @@ def piston_drift(run: SimulatedRun) -> float:
 
 def visible_pressure() -> float:
     """Return the least pressure difference [Pa] that a transducer of the rig shows: its noise (standard deviation)."""
-    from sealscope.parameters import load_rig
-
     sensors = load_rig("thesis").sensors
     return math.hypot(sensors.p_A.noise, sensors.common_noise)

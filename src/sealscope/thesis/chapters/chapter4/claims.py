@@ -14,8 +14,10 @@ from typing import TypeVar
 
 import numpy as np
 
+from sealscope.physics.rig import throttle_coefficients
 from sealscope.recordings.chambers import CHAMBERS, PRESSURES
 from sealscope.recordings.recording import Array
+from sealscope.simulation.commands import Sine, parse_command
 from sealscope.thesis.chapters.chapter4 import cases
 from sealscope.thesis.chapters.chapter4.cases import (
     CLOSINGS,
@@ -66,8 +68,6 @@ def ringing(run: SimulatedRun, window: float = 0.05, after: float = 0.3) -> floa
 
 def _without_orifices(context: Context) -> Iterator[Claim]:
     """Judge what is said of cases 4.2 a) to c)."""
-    from sealscope.simulation.commands import Sine, parse_command
-
     runs = {command: context.run(spec(command, None)) for command in COMMANDS}
     fits, tests = [], []
     for name, run in runs.items():
@@ -116,8 +116,6 @@ def _step_and_gains(context: Context) -> Iterator[Claim]:
 
 def _printed(context: Context) -> Iterator[Claim]:
     """Judge what the equations and tables themselves decide."""
-    from sealscope.physics.rig import throttle_coefficients
-
     rig = thesis_rig()
     charge, run = rig.fluid.p_charge * 1e-6, context.run(spec(COMMANDS[0], 25.0))
     peaks = [float(steady_output(run, name).max()) * 1e-6 for name in PRESSURES]

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from sealscope.recordings.chambers import PRESSURES
+from sealscope.simulation.commands import parse_command
 from sealscope.thesis.chapters.chapter4.cases import (
     CASES,
     CLOSINGS,
@@ -119,8 +120,6 @@ def case_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 def over_time(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw the named quantities over time, each with both solvers on one axis."""
-    from sealscope.simulation.commands import parse_command
-
     runs, notes = _case_of(context, item)
     (command, _), t = CASES[item.inputs["case"]], runs["converged"].t
     panels, numbers = [], []

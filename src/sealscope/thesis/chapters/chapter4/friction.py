@@ -3,33 +3,28 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from sealscope.parameters import Rig, load_rig
+from sealscope.physics.friction import stribeck_friction
 from sealscope.recordings.recording import Array
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Figure, FigureCurve, Number, Panel
 from sealscope.thesis.engine.texts import note
 
-if TYPE_CHECKING:
-    from sealscope.parameters import Rig
-
 _AXES = ("v [m/s]", "F_f [N]")
 
 
 def thesis_rig() -> Rig:
     """Return the rig of the thesis."""
-    from sealscope.parameters import load_rig
-
     return load_rig("thesis")
 
 
 def stribeck(v: Array, F_C: float, *, literal_bracket: bool = False) -> Array:
     """Return the rig's friction [N] at `v` [m/s] (n,) under the Coulomb force `F_C` [N], eqs. (4.21), (4.22)."""
-    from sealscope.physics.friction import stribeck_friction
-
     f = thesis_rig().friction
     plain = getattr(stribeck_friction, "py_func", stribeck_friction)
     return np.array([plain(float(value), F_C, f.K_brk, f.C_c, f.F_v, f.v_th, literal_bracket) for value in v])
