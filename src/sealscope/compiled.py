@@ -34,11 +34,27 @@ from numba import types
 from numba.core import config, ir
 from numba.core.caching import FunctionCache
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import CompilerBase, DefaultPassBuilder
-from numba.core.compiler_machinery import FunctionPass, register_pass
+from numba.core.compiler import CompilerBase
+from numba.core.compiler_machinery import FunctionPass, PassManager, register_pass
 from numba.core.ir_utils import get_definition, guard
 from numba.core.registry import CPUDispatcher
-from numba.core.untyped_passes import RewriteSemanticConstants
+from numba.core.typed_passes import (
+    AnnotateTypes,
+    IRLegalization,
+    NativeLowering,
+    NoPythonBackend,
+    NopythonTypeInference,
+    PreLowerStripPhis,
+)
+from numba.core.untyped_passes import (
+    DeadBranchPrune,
+    FixupArgs,
+    GenericRewrites,
+    IRProcessing,
+    ReconstructSSA,
+    RewriteSemanticConstants,
+    TranslateByteCode,
+)
 from numba.extending import intrinsic
 
 config._config_fname = ""  # numba's settings in the working folder may be hostile, and name a library to load
@@ -212,13 +228,22 @@ class _SettledLaws(FunctionPass):  # type: ignore[misc]
         return changed
 
 
+#: What of numba's compiler numbers and arrays need, closures, literals and expressions of whole arrays apart.
+_PASSES = (
+    *(TranslateByteCode, FixupArgs, IRProcessing, RewriteSemanticConstants, _SettledLaws, DeadBranchPrune),
+    *(GenericRewrites, ReconstructSSA, NopythonTypeInference, PreLowerStripPhis, IRLegalization, AnnotateTypes),
+    *(NativeLowering, NoPythonBackend),
+)
+
+
 class _Compiler(CompilerBase):  # type: ignore[misc]
-    """numba's compiler, with `_SettledLaws`."""
+    """numba's compiler, reduced to `_PASSES`."""
 
     def define_pipelines(self) -> list[Any]:
         """Return the one pipeline."""
-        pipeline = DefaultPassBuilder.define_nopython_pipeline(self.state)
-        pipeline.add_pass_after(_SettledLaws, RewriteSemanticConstants)
+        pipeline = PassManager("nopython")
+        for own in _PASSES:
+            pipeline.add_pass(own, own.__name__)
         pipeline.finalize()
         return [pipeline]
 
@@ -249,7 +274,13 @@ def _cached(function: _F, own: dict[str, Any]) -> _F:
 
 
 class _LawLibrary(JITCodeLibrary):  # type: ignore[misc]
-    """The code of a law, which kernels are linked with: without machine code, for no address of it is asked for."""
+    """The code of a law, which kernels are linked with and optimised as a whole: no address of it is asked for."""
+
+    def _optimize_functions(self, module: Any) -> None:
+        module.data_layout = self._codegen._data_layout
+
+    def _optimize_final_module(self) -> None:
+        pass
 
     def _finalize_final_module(self) -> None:
         self._finalized = True

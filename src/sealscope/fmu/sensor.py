@@ -91,13 +91,13 @@ def variables(rig: Rig) -> Iterator[Variable]:
 class SensorChoice(NamedTuple):
     """What the code of a soft sensor depends on.
 
-    `rate` [Hz]; `size_error`: how far the machine's size is known; `fast`, `own`: columns as `weigh` takes them.
+    `rate` [Hz]; `size_error`: how far the machine's size is known; `place`, `fast`: columns as `weigh` takes them.
     """
 
     rate: float
     size_error: float
-    fast: tuple[int, ...]
-    own: tuple[int, ...]
+    place: tuple[int, ...]
+    fast: int
 
     @classmethod
     def of(cls, rig: Rig, rate: float) -> SensorChoice:
@@ -106,7 +106,8 @@ class SensorChoice(NamedTuple):
         columns = Columns(balance)
         if columns.names != COLUMNS[:-1]:
             raise InputError(f"a soft sensor's terms must be {', '.join(COLUMNS[:-1])}, got {', '.join(columns.names)}")
-        return cls(rate, size_error(rig), columns.fast, (*columns.support, columns.left))
+        fast = columns.fast
+        return cls(rate, size_error(rig), (*fast, *columns.support, columns.left), len(fast))
 
 
 class _Numbers(NamedTuple):
@@ -130,7 +131,7 @@ def memory_of(choice: SensorChoice) -> np.dtype[Any]:
     blocks that are learned from; `last`: of each of the last blocks total, conductance, its variance, that of the
     level, and abs(p_A - p_B); `workspace`, `known`: a `Workspace` and a `Known`.
     """
-    n, slow = _Numbers.of(choice.rate), len(choice.own) - 1
+    n, slow = _Numbers.of(choice.rate), len(choice.place) - choice.fast - 1
     rows = SUPPORT * n.strides
     shapes: dict[str, tuple[int, ...]] = {
         **dict.fromkeys(_COUNTERS, ()),
@@ -147,7 +148,7 @@ def memory_of(choice: SensorChoice) -> np.dtype[Any]:
         "ordered": (LEARNED,),
         "last": (WINDOW, 5),
     }
-    workspace = zip(Workspace._fields, workspace_shapes(rows, SUPPORT, len(choice.fast), slow), strict=True)
+    workspace = zip(Workspace._fields, workspace_shapes(rows, SUPPORT, len(choice.place), slow), strict=True)
     known = zip(Known._fields, known_shapes(_LEAK), strict=True)
     records = [("workspace", _doubles(workspace)), ("known", _doubles(known))]
     return np.dtype([*_doubles(shapes.items()).descr, *records])
@@ -340,7 +341,7 @@ def _take(m: Any, error: float, b: int, rows: float, size: float) -> None:
 
 def _close(choice: SensorChoice) -> Callable[..., Any]:
     """Return the law that closes a block."""
-    fast, own, error = choice.fast, choice.own, choice.size_error
+    place, fast, error = choice.place, choice.fast, choice.size_error
 
     @large_law
     def close(m: Any, rows: Any, ends: Any, block: int) -> None:
@@ -354,7 +355,7 @@ def _close(choice: SensorChoice) -> Callable[..., Any]:
         for r in range(count):
             rows[r, _LEFT] *= m.sign
         m.closed += pending
-        weigh(rows, ends, fast, own, m.support, min(1.0, SUPPORT / m.closed), m.workspace, m.gram)
+        weigh(rows, ends, place, fast, m.support, min(1.0, SUPPORT / m.closed), m.workspace, m.gram)
         m.pending = m.row_count = 0.0
         for b in range(pending):
             of_block = ends[b] - (ends[b - 1] if b else 0.0)

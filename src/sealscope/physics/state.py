@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
-from sealscope.compiled import contracted, law
+from sealscope.compiled import contracted
 
 STATES = ("I", "i", "omega", "theta", "x", "v", "p_A", "p_B", "p_1", "p_2", "V_up", "z", "x_s", "v_s")
 INTEGRAL, CURRENT, OMEGA, THETA, POSITION, VELOCITY, P_A, P_B, P_1, P_2, MADE_UP, BRISTLE, SPOOL, SPOOL_SPEED = range(
@@ -56,16 +54,3 @@ def pressures_moved(y: State, h: float, s: Pressures) -> State:
     """Return the state with h s added to its pressures."""
     p_A, p_B, p_1, p_2 = y[P_A] + h * s[0], y[P_B] + h * s[1], y[P_1] + h * s[2], y[P_2] + h * s[3]
     return y[0], y[1], y[2], y[3], y[4], y[5], p_A, p_B, p_1, p_2, y[10], y[11], y[12], y[13]
-
-
-@law
-def survey(rows: np.ndarray) -> tuple[bool, float, float]:
-    """Of rows of outputs (n, 21): whether all are finite, the largest |x| [m], and the lowest pressure [Pa]."""
-    reach, least, total = 0.0, math.inf, 0.0
-    for k in range(rows.shape[0]):
-        row = rows[k]
-        reach = max(reach, abs(row[POSITION]))
-        least = min(least, row[P_A], row[P_B], row[P_1], row[P_2])
-        for value in row:
-            total += 0.0 * value  # NaN from any value that is not finite
-    return total == 0.0, reach, least

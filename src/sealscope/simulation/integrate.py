@@ -351,28 +351,42 @@ class _Run:
                 if not self.allow_unresolved and max(worst) > 0.0:
                     refuse_long(h, longest_step(p, *worst), "the leak")
                 part = slice((k - first) * every, (end - first) * every)
-                out = rows[k - origin : end - origin]
+                out, outputs = rows[k - origin : end - origin], end - k
                 inputs, how = (G[part], C[part], F[part]), (packed(p), self.euler, every)
                 if self.feedback is None:
-                    outputs, *surveyed = end - k, *advance(implicit, y, h, u[part], *inputs, *how, out)
+                    advance(implicit, y, h, u[part], *inputs, *how, out)
                 else:
-                    outputs, *surveyed = advance_closed(implicit, y, h, *inputs, *how, k, out, self.feedback.loop)
-                self._refuse(surveyed, p, h, out[:outputs], k)
+                    outputs = advance_closed(implicit, y, h, *inputs, *how, k, out, self.feedback.loop)
+                self._refuse(p, h, out[:outputs], k)
                 if self.feedback is not None and outputs < end - k:
                     self.feedback.refuse()
             if self.progress is not None and last / self.rate > self.reached:
                 self.reached = last / self.rate
                 self.progress(self.reached)
 
-    def _refuse(self, surveyed: Sequence[float], p: RigNumbers, h: float, rows: Array, first: int) -> None:
-        """Raise SimulationFailed where rows from the output `first` on, as surveyed, are beyond what the rig allows."""
+    def _refuse(self, p: RigNumbers, h: float, rows: Array, first: int) -> None:
+        """Raise SimulationFailed where rows from the output `first` on are beyond what the rig allows."""
         from sealscope.physics.solvers.limits import longest_step_on_stop
+        from sealscope.physics.state import OUTPUTS, P_2, P_A, POSITION
 
-        finite, reach, least = surveyed
-        if not (self.allow_unresolved or reach <= 0.5 * p.L):
+        if not self.allow_unresolved and (np.abs(rows[:, POSITION]) > 0.5 * p.L).any():
             refuse_long(h, longest_step_on_stop(p), "the hard stop (cylinder.k_stop, d_stop)")
-        if not finite or (not self.allow_unresolved and least < VACUUM):
-            _refuse_rows(rows, first, self.rate, self.allow_unresolved)
+        bad = ~np.isfinite(rows)
+        if bad.any():
+            k, column = np.unravel_index(int(np.argmax(bad)), bad.shape)
+            raise SimulationFailed(
+                f"the run diverged: {OUTPUTS[column]} is not finite at t = {(first + k) / self.rate:.4g} s; take a "
+                "smaller step or smaller gains"
+            )
+        low = rows[:, P_A : P_2 + 1] < VACUUM
+        if low.any() and not self.allow_unresolved:
+            k, column = np.unravel_index(int(np.argmax(low)), low.shape)
+            raise SimulationFailed(
+                f"{OUTPUTS[P_A + column]} must stay above vacuum ({VACUUM:g} Pa gauge: the rig's oil does not boil), "
+                f"got {rows[k, P_A + column]:.4g} Pa at t = {(first + k) / self.rate:.4g} s "
+                f"(x = {rows[k, POSITION]:.3f} m); raise fluid.p_charge, take a smaller command, start further from "
+                "the cap, let the oil boil (fluid.p_vap), or replace what leaks out (makeup.check_valves = present)"
+            )
 
 
 def refuse_long(h: float, limit: float, what: str) -> None:
@@ -393,27 +407,6 @@ def refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
         raise SimulationFailed(
             f"step must be <= {DECAY_LIMIT / rate:.2g} s for rk4 with throttles (line volumes answer within "
             f"{1 / rate:.2g} s), got {h:.3g} s; use method imex"
-        )
-
-
-def _refuse_rows(rows: Array, first: int, rate: float, allow_unresolved: bool) -> None:
-    from sealscope.physics.state import OUTPUTS, P_2, P_A
-
-    bad = ~np.isfinite(rows)
-    if bad.any():
-        k, column = np.unravel_index(int(np.argmax(bad)), bad.shape)
-        raise SimulationFailed(
-            f"the run diverged: {OUTPUTS[column]} is not finite at t = {(first + k) / rate:.4g} s; take a smaller "
-            f"step or smaller gains"
-        )
-    pressures = rows[:, P_A : P_2 + 1]
-    if not allow_unresolved and pressures.min() < VACUUM:
-        k, column = np.unravel_index(int(np.argmax(pressures < VACUUM)), pressures.shape)
-        raise SimulationFailed(
-            f"{OUTPUTS[P_A + column]} must stay above vacuum ({VACUUM:g} Pa gauge: the rig's oil does not boil), got "
-            f"{pressures[k, column]:.4g} Pa at t = {(first + k) / rate:.4g} s (x = {rows[k, 4]:.3f} m); "
-            "raise fluid.p_charge, take a smaller command, start further from the cap, let the oil boil (fluid.p_vap), "
-            "or replace what leaks out (makeup.check_valves = present)"
         )
 
 

@@ -10,7 +10,6 @@ Source: P. J. Huber, Ann. Math. Statist. 35 (1964) 73 (weights).
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +22,7 @@ from sealscope.recordings.recording import Array
 SUPPORT = 5
 #: Where Huber's function turns from square to linear, in standard deviations: 95 % efficiency for normal errors.
 HUBER = 1.345
-_RIDGE = 1e-10  # of a matrix whose diagonal is 1
+_RIDGE = 1e-10  # as a share of a matrix's diagonal
 _MOST, _TOLERANCE = 50, 1e-2  # turns to a fixed point at most, and the mean change of a weight that ends them
 _SIGMA = 1.4826  # standard deviation of normal values over the median of their size
 
@@ -32,64 +31,43 @@ _Places = NDArray[np.intp]
 
 
 class Workspace(NamedTuple):
-    """Arrays to work in, for r rows of K blocks, f fast and s slow columns.
+    """Arrays to work in, for r rows of K blocks and of c columns s slow ones.
 
-    `weights`, `residual`, `ordered` (r,); `inner` (f, f); `cross` (K, f, s + 1); `total` (s + 1, s + 1); `normal` (s,
-    s); `right` (s, 1); `scale` (f + s,).
+    `weights`, `residual`, `ordered` (r,); `reduced` (K, c, c); `fit` (K, c - 1); `normal` (s + 1, s + 1).
     """
 
     weights: Any
     residual: Any
     ordered: Any
-    inner: Any
-    cross: Any
-    total: Any
+    reduced: Any
+    fit: Any
     normal: Any
-    right: Any
-    scale: Any
 
 
-def workspace_shapes(rows: int, blocks: int, fast: int, slow: int) -> tuple[tuple[int, ...], ...]:
+def workspace_shapes(rows: int, blocks: int, columns: int, slow: int) -> tuple[tuple[int, ...], ...]:
     """Return the shapes of a `Workspace`."""
-    own = slow + 1
     by_row = (rows,), (rows,), (rows,)
-    return *by_row, (fast, fast), (blocks, fast, own), (own, own), (slow, slow), (slow, 1), (fast + slow,)
+    return *by_row, (blocks, columns, columns), (blocks, columns - 1), (slow + 1, slow + 1)
 
 
 @large_law
-def solve_in_place(matrix: Any, right: Any, scale: Any) -> None:
-    """Put matrix^-1 right into `right` (n, k), of a symmetric matrix >= 0 (n, n) that is lost, with `scale` (n,).
+def eliminate(matrix: Any, count: int) -> None:
+    """Eliminate the first `count` unknowns of a symmetric matrix >= 0 with right sides beside it (Gauss and Jordan).
 
+    Their rows then hold their coefficients in terms of the other columns, the other rows what is left without them.
     Directions that nothing is known of are left at zero.
     """
-    n, k = right.shape
-    for i in range(n):
-        scale[i] = math.sqrt(matrix[i, i]) if matrix[i, i] > 0.0 else 1.0
-    for i in range(n):
-        for j in range(i + 1):
-            matrix[i, j] /= scale[i] * scale[j]
-        matrix[i, i] += _RIDGE
-        for c in range(k):
-            right[i, c] /= scale[i]
-    for i in range(n):  # L L', and L^-1 right
-        for j in range(i):
-            for q in range(j):
-                matrix[i, j] -= matrix[i, q] * matrix[j, q]
-            matrix[i, j] /= matrix[j, j]
-            matrix[i, i] -= matrix[i, j] ** 2
-            for c in range(k):
-                right[i, c] -= matrix[i, j] * right[j, c]
-        matrix[i, i] = math.sqrt(matrix[i, i]) if matrix[i, i] > 0.0 else math.inf
-        for c in range(k):
-            right[i, c] /= matrix[i, i]
-    for i in range(n - 1, -1, -1):
-        for c in range(k):
-            right[i, c] /= matrix[i, i]
-        for j in range(i):
-            for c in range(k):
-                right[j, c] -= matrix[i, j] * right[i, c]
-        for c in range(k):
-            right[i, c] /= scale[i]
+    rows, columns = matrix.shape
+    for i in range(count):
+        matrix[i, i] *= 1.0 + _RIDGE
+    for i in range(count):
+        scale = 1.0 / matrix[i, i] if matrix[i, i] > 0.0 else 0.0
+        for q in range(i, columns):
+            matrix[i, q] *= scale
+        for j in range(rows):
+            size = matrix[j, i] if j != i else 0.0
+            for q in range(i, columns):
+                matrix[j, q] -= size * matrix[i, q]
 
 
 @law
@@ -133,42 +111,25 @@ def _sum_products(values: Any, begin: int, end: int, weights: Any, gram: Any) ->
 
 
 @large_law
-def _add_reduced(gram: Any, fast: Any, own: Any, workspace: Any, cross: Any) -> None:
-    """Add to `workspace.total` what a block says of the columns `own`, whatever the fast ones' coefficients are.
-
-    `cross` (f, s + 1): the fast ones' coefficients for each of these.
-    """
-    for i in range(len(fast)):
-        for j in range(len(fast)):
-            workspace.inner[i, j] = gram[fast[i], fast[j]]
-        for j in range(len(own)):
-            cross[i, j] = gram[fast[i], own[j]]
-    solve_in_place(workspace.inner, cross, workspace.scale)
-    for i in range(len(own)):
-        for j in range(len(own)):
-            value = gram[own[i], own[j]]
-            for k in range(len(fast)):
-                value -= gram[own[i], fast[k]] * cross[k, j]
-            workspace.total[i, j] += value
+def _reduce(gram: Any, place: Any, fast: int, reduced: Any) -> None:
+    """Put a block's sums into `reduced`, without the fast columns (`eliminate`)."""
+    for i in range(len(place)):
+        for j in range(len(place)):
+            reduced[i, j] = gram[place[i], place[j]]
+    eliminate(reduced, fast)
 
 
 @large_law
-def _reweigh(values: Any, ends: Any, fast: Any, own: Any, workspace: Any) -> bool:
+def _reweigh(values: Any, ends: Any, place: Any, workspace: Any) -> bool:
     """Put Huber's weights at a fit into the workspace; return whether they are those at which it was made."""
-    count, slow, b = len(values), len(own) - 1, 0
+    count, last, b = len(values), len(place) - 1, 0
     for r in range(count):
         while r >= ends[b]:
             b += 1
-        residual = values[r, own[slow]]
-        for k in range(len(fast)):
-            residual -= workspace.cross[b, k, slow] * values[r, fast[k]]
-        for i in range(slow):
-            of_slow = values[r, own[i]]
-            for k in range(len(fast)):
-                of_slow -= workspace.cross[b, k, i] * values[r, fast[k]]
-            residual -= workspace.right[i, 0] * of_slow
-        workspace.residual[r] = abs(residual)
-        workspace.ordered[r] = abs(residual)
+        residual = values[r, place[last]]
+        for i in range(last):
+            residual -= workspace.fit[b, i] * values[r, place[i]]
+        workspace.residual[r] = workspace.ordered[r] = abs(residual)
     size, change = HUBER * _SIGMA * median(workspace.ordered, count), 0.0
     for r in range(count):
         weight = size / workspace.residual[r] if size > 0.0 and workspace.residual[r] > size else 1.0
@@ -178,41 +139,46 @@ def _reweigh(values: Any, ends: Any, fast: Any, own: Any, workspace: Any) -> boo
 
 
 @large_law
-def weigh(values: Any, ends: Any, fast: Any, own: Any, known: Any, share: float, workspace: Any, gram: Any) -> None:
+def weigh(values: Any, ends: Any, place: Any, fast: int, known: Any, share: float, workspace: Any, gram: Any) -> None:
     """Put the sums of weighted products of rows (r, m), of K blocks that end before the rows `ends`, into `gram`.
 
-    `fast`, `own`: columns, of `own` the last is the left side. `known` (s + 1, s + 1): sums over `own` that count as
-    `SUPPORT` blocks; it moves to those of these blocks by `share`. `gram` (K, m, m).
+    `place`: columns, first those that are `fast`, the left side last. `known` (s + 1, s + 1): sums over the others that
+    count as `SUPPORT` blocks; it moves to those of these blocks by `share`. `gram` (K, m, m).
     """
-    count, slow, blocks = len(values), len(own) - 1, len(ends)
+    count, last, blocks = len(values), len(place) - 1, len(ends)
+    slow, normal, reduced = last - fast, workspace.normal, workspace.reduced
     for r in range(count):
         workspace.weights[r] = 1.0
     settled = count == 0
     for turn in range(_MOST + 1):
-        for i in range(slow + 1):
-            for j in range(slow + 1):
-                workspace.total[i, j] = 0.0
         for b in range(blocks):
             _sum_products(values, int(ends[b - 1]) if b else 0, int(ends[b]), workspace.weights, gram[b])
-            _add_reduced(gram[b], fast, own, workspace, workspace.cross[b])
-        if settled or turn == _MOST:
+            _reduce(gram[b], place, fast, reduced[b])
+        settled = settled or turn == _MOST
+        for i in range(slow + 1):
+            for j in range(slow + 1):
+                normal[i, j] = 0.0 if settled else known[i, j]
+                for b in range(blocks):
+                    normal[i, j] += reduced[b, fast + i, fast + j]
+        if settled:
             break
-        for i in range(slow):
-            workspace.right[i, 0] = workspace.total[i, slow] + known[i, slow]
-            for j in range(slow):
-                workspace.normal[i, j] = workspace.total[i, j] + known[i, j]
-        solve_in_place(workspace.normal, workspace.right, workspace.scale)
-        settled = _reweigh(values, ends, fast, own, workspace)
+        eliminate(normal, slow)
+        for b in range(blocks):
+            for i in range(last):
+                workspace.fit[b, i] = reduced[b, i, last] if i < fast else normal[i - fast, slow]
+            for i in range(fast):
+                for j in range(fast, last):
+                    workspace.fit[b, i] -= reduced[b, i, j] * workspace.fit[b, j]
+        settled = _reweigh(values, ends, place, workspace)
     for i in range(slow + 1):
         for j in range(slow + 1):
-            known[i, j] += share * (SUPPORT / blocks * workspace.total[i, j] - known[i, j])
+            known[i, j] += share * (SUPPORT / blocks * normal[i, j] - known[i, j])
 
 
 def weighted(values: Array, ends: _Places, fast: _Places, own: _Places, known: Array, share: float) -> Array:
     """Return the Gram matrices (K, m, m) of blocks, and learn from them (`weigh`)."""
-    workspace = Workspace(
-        *(np.empty(shape) for shape in workspace_shapes(len(values), len(ends), len(fast), len(own) - 1))
-    )
+    place = np.concatenate([fast, own])
+    workspace = Workspace(*map(np.empty, workspace_shapes(len(values), len(ends), len(place), len(own) - 1)))
     gram = np.empty((len(ends), values.shape[1], values.shape[1]))
-    weigh(values, ends, fast, own, known, share, workspace, gram)
+    weigh(values, ends, place, len(fast), known, share, workspace, gram)
     return gram

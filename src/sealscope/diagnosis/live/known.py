@@ -19,7 +19,7 @@ import numpy as np
 
 from sealscope.compiled import large_law, law
 from sealscope.diagnosis.beliefs import beliefs
-from sealscope.diagnosis.inference.row_weights import solve_in_place
+from sealscope.diagnosis.inference.row_weights import eliminate
 from sealscope.diagnosis.inference.weak_form import OVERLAP
 
 JUMP: float = beliefs("live")["coefficients"]["jump"]
@@ -38,7 +38,7 @@ class Known(NamedTuple):
     """The sums over n other columns, and arrays to work in.
 
     `sums` (n + 2, n + 2); `coefficients`, `along` (n,), the leak's products with the others; `numbers`; `own` (n + 2,
-    n + 2), those of the block; `matrix` (n, n); `right` (n, 3); `scale` (n,).
+    n + 2), those of the block; `matrix` (n, n + 3), the others' and their right sides.
     """
 
     sums: Any
@@ -47,13 +47,11 @@ class Known(NamedTuple):
     numbers: Any
     own: Any
     matrix: Any
-    right: Any
-    scale: Any
 
 
 def known_shapes(n: int) -> tuple[tuple[int, ...], ...]:
     """Return the shapes of a `Known`."""
-    return (n + 2, n + 2), (n,), (n,), (len(NUMBERS),), (n + 2, n + 2), (n, n), (n, 3), (n,)
+    return (n + 2, n + 2), (n,), (n,), (len(NUMBERS),), (n + 2, n + 2), (n, n + 3)
 
 
 @law
@@ -91,14 +89,14 @@ def add(known: Any, rows: float, weight: float, stepped: bool) -> None:
 
 @large_law
 def _solve(known: Any) -> None:
-    """Put the other coefficients, whatever the leak is, and C^-1 times the other right sides into `known.right`."""
+    """Put the other coefficients, whatever the leak is, and C^-1 times the other right sides in the latter's place."""
     sums, n = known.sums, len(known.matrix)
     leak = max(sums[n, n], TINY)
     for i in range(n):
-        known.right[i, 0] = sums[i, n + 1] - sums[i, n] * sums[n, n + 1] / leak
+        known.matrix[i, n] = sums[i, n + 1] - sums[i, n] * sums[n, n + 1] / leak
         for j in range(n):
             known.matrix[i, j] = sums[i, j] - sums[i, n] * sums[n, j] / leak
-    solve_in_place(known.matrix, known.right, known.scale)
+    eliminate(known.matrix, n)
 
 
 @large_law
@@ -122,12 +120,12 @@ def _left(sums: Any, right: Any) -> float:
 def begin(known: Any) -> None:
     """Take coefficients and the variance of a row from all that was added."""
     n = len(known.matrix)
-    for i in range(n):
-        known.right[i, 1] = known.right[i, 2] = 0.0
+    right = known.matrix[:, n:]
+    right[:] = 0.0
     _solve(known)
     for i in range(n):
-        known.coefficients[i] = known.right[i, 0]
-    left = _left(known.sums, known.right)
+        known.coefficients[i] = right[i, 0]
+    left = _left(known.sums, right)
     known.numbers[NOISE] = max(left, 1e-14 * known.sums[n + 1, n + 1], TINY) / known.numbers[ROWS]
 
 
@@ -138,7 +136,8 @@ def says(known: Any, rows: float, adds: bool) -> tuple[float, float, float, floa
     The precision of the leak's coefficient; that times its estimate, and times what is to be taken from it so that the
     series does not move with the other coefficients; the variance that these leave, times the precision squared.
     """
-    own, right, n, numbers = known.own, known.right, len(known.matrix), known.numbers
+    own, n, numbers = known.own, len(known.matrix), known.numbers
+    right = known.matrix[:, n:]
     energy, usual = max(own[n, n], TINY), max(numbers[ENERGY], TINY)
     for i in range(n):
         right[i, 1] = own[i, n]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from sealscope.compiled import kernel
@@ -11,7 +9,7 @@ from sealscope.physics.rig import RigNumbers, observe
 from sealscope.physics.solvers.imex import IMEX_NODES, implicit_step
 from sealscope.physics.solvers.loop import APART, Loop, sampled
 from sealscope.physics.solvers.rk4 import RK4_NODES, explicit_step
-from sealscope.physics.state import state_of, survey
+from sealscope.physics.state import state_of
 
 #: A method as compiled code takes it: a tuple, so that the code of the other is left out.
 Implicit = tuple[bool, ...]
@@ -39,13 +37,12 @@ def advance(
     euler_integral: bool,
     every: int,
     rows: np.ndarray,
-) -> tuple[bool, float, float]:
+) -> None:
     """Advance `y` (14,) in place by n steps of h [s]; every `every` steps, before the step, write a row of outputs.
 
     `u`, `G`, `C`: (n, nodes) command [V] and leakage coefficients at the nodes of each step (`nodes_of`); `F`: (n,
     nodes) load [N] beside the rig's own, (0, 0) without one; `rows`: (n // every, 21). `euler_integral` takes eq. (4.2)
-    literally: I is held within an explicit step and grows by h (omega_d - omega) once after it. Returns the `survey` of
-    the rows.
+    literally: I is held within an explicit step and grows by h (omega_d - omega) once after it.
     """
     z = state_of(y)
     for step in range(u.shape[0]):
@@ -57,7 +54,6 @@ def advance(
             z = explicit_step(z, h, u, G, C, F, step, p, euler_integral)
     for m in range(len(z)):
         y[m] = z[m]
-    return survey(rows)
 
 
 @kernel
@@ -74,15 +70,15 @@ def advance_closed(
     start: int,
     rows: np.ndarray,
     loop: Loop,
-) -> tuple[int, bool, float, float]:
+) -> int:
     """Advance as `advance` over the outputs `rows` from `start` on, under a controller.
 
-    Return how many outputs there are and their `survey`: fewer than rows where a state or a voltage is not finite.
+    Return how many outputs there are: fewer than rows where a voltage is not finite.
     """
     apart, n = loop.whole[APART], rows.shape[0]
     u = np.empty((apart * every, G.shape[1]))
-    first, finite, reach, least = 0, True, 0.0, math.inf
-    while first < n and finite:
+    first = 0
+    while first < n:
         k = (start + first) // apart
         if (start + first) % apart == 0 and not sampled(loop, k, y):
             break
@@ -91,8 +87,6 @@ def advance_closed(
         begin, end = first * every, last * every
         load = F[begin:end] if F.shape[0] > 0 else F
         volts, part = u[: end - begin], rows[first:last]
-        finite, far, low = advance(
-            implicit, y, h, volts, G[begin:end], C[begin:end], load, p, euler_integral, every, part
-        )
-        first, reach, least = last, max(reach, far), min(least, low)
-    return first, finite, reach, least
+        advance(implicit, y, h, volts, G[begin:end], C[begin:end], load, p, euler_integral, every, part)
+        first = last
+    return first

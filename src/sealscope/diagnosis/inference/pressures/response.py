@@ -17,6 +17,7 @@ Source: B. M. Bell and F. W. Cathey, IEEE Trans. Autom. Control 38 (1993) 294 (i
 from __future__ import annotations
 
 import math
+from collections import namedtuple
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,8 +25,9 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.linalg.lapack import dtbtrs
 from scipy.ndimage import gaussian_filter1d
-from scipy.signal import find_peaks, lfilter, welch
 
 from sealscope.compiled import contracted, kernel
 from sealscope.diagnosis.inference.pressures.evidence import (
@@ -44,7 +46,7 @@ from sealscope.physics.lanes import SINGLE_WIDTH, load, select, store
 from sealscope.physics.leakage import laminar_leakage
 from sealscope.physics.motor import controller_voltage, shaft_acceleration, winding_current_rate
 from sealscope.physics.pump import pump_flow, pump_torque
-from sealscope.physics.rig import RigNumbers, rig_numbers
+from sealscope.physics.rig import rig_numbers
 from sealscope.recordings.recording import Array, Recording, remembered
 
 if TYPE_CHECKING:
@@ -63,6 +65,8 @@ GAIN, BIAS, K_OIL, F_C, F_V, K_BRK, C_C, SIDE, G, GIVE, SPRING, LEAD, LAG, SCALE
 _POSITIVE, _POSITION = [GAIN, K_OIL, F_C, K_BRK, C_C], 5
 State = tuple[float, float, float, float, float, float]
 Parameters = tuple[float, float, float, float, float, float, float, float, float, float, float, float, float]
+#: What the rig that is reduced to p_A - p_B has of the whole one's numbers, A_A the mean of both areas.
+Reduced = namedtuple("Reduced", "A_A V M_eq v_th q_b k_p K_i V_max C_m B_M J_M R_c L_c C_e i_max")
 #: Laws of the friction, two hypotheses: Stribeck's of the rig; and LuGre's, whose contact does not creep.
 LAWS = STRIBECK, BRISTLES = "stribeck", "bristles"
 _FOLLOW = BELIEVED["follow"]
@@ -78,7 +82,7 @@ def _of_way(v: float, now: Parameters) -> float:
 
 
 @contracted
-def _steady(v: float, now: Parameters, m: RigNumbers) -> tuple[float, float, float]:
+def _steady(v: float, now: Parameters, m: Reduced) -> tuple[float, float, float]:
     """Return the friction of steady sliding [N], its level [N], and the speed at which the contact slips [m/s]."""
     speed = max(abs(v), m.v_th)
     level = stribeck_level(speed, now[F_C], now[K_BRK], now[C_C]) * _of_way(v, now)
@@ -86,7 +90,7 @@ def _steady(v: float, now: Parameters, m: RigNumbers) -> tuple[float, float, flo
 
 
 @contracted
-def _held_by(friction: float, before: float, v: float, h: float, now: Parameters, m: RigNumbers) -> tuple[float, float]:
+def _held_by(friction: float, before: float, v: float, h: float, now: Parameters, m: Reduced) -> tuple[float, float]:
     """Return the friction F [N] after h seconds in which that of steady sliding went from `before` to that at v.
 
     give dF/dt = v - speed F/level: LuGre's law without its damping, which dies out as the contact slides. With a = h
@@ -100,7 +104,7 @@ def _held_by(friction: float, before: float, v: float, h: float, now: Parameters
 
 
 @contracted
-def _rates(y: State, friction: float, spin: float, now: Parameters, m: RigNumbers) -> State:
+def _rates(y: State, friction: float, spin: float, now: Parameters, m: Reduced) -> State:
     """Return dy/dt of y = (p, v, omega, i, I, x) under the speed `spin` [rad/s] that the command asks for."""
     p, v, omega, i, integral, x = y
     past, viscous = m.A_A * v + laminar_leakage(p, now[G]), now[F_V] * v * _of_way(v, now)
@@ -128,7 +132,7 @@ def _six(rows: Array, k: int) -> State:
 
 @kernel
 def simulate_response(
-    command: np.ndarray, rate: float, every: int, theta: np.ndarray, states: np.ndarray, m: RigNumbers, out: np.ndarray
+    command: np.ndarray, rate: float, every: int, theta: np.ndarray, states: np.ndarray, m: Reduced, out: np.ndarray
 ) -> None:
     """Write p_A - p_B [Pa] of all lanes at each sample into `out` (n, lanes), by RK4, `every` steps a sample.
 
@@ -184,7 +188,7 @@ def _tried(table: str, parameter: int, count: int) -> Array:
 class Machine(NamedTuple):
     """The reduced rig of the simulation, at a rate [Hz] in `every` steps a sample."""
 
-    numbers: RigNumbers
+    numbers: Reduced
     rate: float
     every: int
     law: str
@@ -192,10 +196,10 @@ class Machine(NamedTuple):
     @staticmethod
     def of(rig: Rig, rate: float, law: str = STRIBECK) -> Machine:
         """Return that of a rig's kind."""
-        numbers = rig_numbers(rig)
-        area = 0.5 * (numbers.A_A + numbers.A_B)
-        creep = BELIEVED[law].get("creep", numbers.v_th)
-        return Machine(numbers._replace(A_A=area, A_B=area, v_th=creep), rate, math.ceil(1.0 / rate / _STEP), law)
+        whole = rig_numbers(rig)
+        own = whole._replace(A_A=0.5 * (whole.A_A + whole.A_B), v_th=BELIEVED[law].get("creep", whole.v_th))
+        reduced = Reduced(*(getattr(own, name) for name in Reduced._fields))
+        return Machine(reduced, rate, math.ceil(1.0 / rate / _STEP), law)
 
     def run(self, command: Array, paths: Array, states: Array) -> tuple[Array, Array]:
         """Return p_A - p_B (m, n) [Pa] of up to 16 sets (m, p) from their states (8, m), and the states at the end."""
@@ -226,9 +230,11 @@ class Machine(NamedTuple):
         k = np.arange(math.ceil(middle * math.exp(-2.0 * share)), min(2 * _SEGMENT, int(middle * math.exp(share))))
         if not k.size:
             return np.full(2, beliefs.centre[K_OIL])
-        powers = welch(np.stack([dp, total]), nperseg=_SEGMENT, nfft=4 * _SEGMENT, detrend=False)[1]
+        segments = sliding_window_view([dp, total], min(_SEGMENT, dp.size), axis=1)[:, :: _SEGMENT // 2]
+        spectra = np.fft.rfft(segments * np.hanning(segments.shape[2] + 1)[:-1], 4 * _SEGMENT)
+        powers = np.mean(np.abs(spectra) ** 2, axis=1)  # Welch's
         beyond = np.pad((powers[0] - powers[1])[k], 1, constant_values=-np.inf)
-        peaks = find_peaks(beyond)[0] - 1
+        peaks = np.flatnonzero((beyond[1:-1] > beyond[:-2]) & (beyond[1:-1] >= beyond[2:]))
         chosen = np.resize(peaks[np.argsort(-beyond[1 + peaks])], 2)
         return np.asarray(beliefs.centre[K_OIL] * (k[chosen] / middle) ** 2)
 
@@ -304,7 +310,8 @@ class Stretch:
         change[1:-1] -= np.diff(change, 2) / 6.0  # to fourth order: that of a ring is one of its fastest
         earlier = theta[SCALE] * self.machine.rate * change
         kept = math.exp(-1.0 / (self.machine.rate * max(theta[LAG], _LEAST)))
-        rest = np.array([earlier, lfilter([kept - 1.0], [1.0, -kept], earlier), shown])
+        late = dtbtrs(np.tile([[1.0], [-kept]], earlier.size), (kept - 1.0) * earlier, uplo="L")[0]
+        rest = np.array([earlier, late, shown])
         return rest * self.unit[LEAD:OFFSET, None]
 
     def bounds(self, theta: Array) -> tuple[Array, Array]:
