@@ -17,6 +17,7 @@ from sealscope.diagnosis.inference.decision import WITHIN, Question, asked, is_l
 from sealscope.diagnosis.inference.onset import StepTest, course, two_sided
 from sealscope.diagnosis.inference.other_steps.causes import StepHypothesis, probabilities
 from sealscope.diagnosis.inference.other_steps.causes import stepped as stepped_cause
+from sealscope.diagnosis.inference.other_steps.step import OtherStep, other_step
 from sealscope.diagnosis.inference.pressures import response
 from sealscope.diagnosis.inference.pressures.evidence import BELIEVED, PressureEvidence, flow_scale, unusable
 from sealscope.diagnosis.inference.scatter import Rise, student
@@ -69,7 +70,8 @@ class PressureResponse:
             return Evidence("cannot tell", why, usable=False)
         levels = [lesson["level"] for lesson in lessons_of(self, baseline)]
         whole = 1.0 if recording.bridged is None else float(np.mean(~recording.bridged))
-        return replace(judge(own, false_alarm_probability, levels), share=whole)
+        beside = other_step(recording, RAREST)  # it takes a leak away
+        return replace(judge(own, false_alarm_probability, levels, beside), share=whole)
 
 
 def hypotheses(own: PressureEvidence) -> tuple[StepHypothesis, ...]:
@@ -82,14 +84,19 @@ def hypotheses(own: PressureEvidence) -> tuple[StepHypothesis, ...]:
     return tuple(sorted(tested, key=lambda each: -each.score))
 
 
-def judge(own: PressureEvidence, probability: float, levels: Sequence[float] = ()) -> Evidence:
-    """Return the evidence of a reading at a false-alarm probability, against the levels of healthy recordings."""
+def judge(
+    own: PressureEvidence, probability: float, levels: Sequence[float] = (), beside: OtherStep | None = None
+) -> Evidence:
+    """Return the evidence of a reading at a false-alarm probability, against the levels of healthy recordings.
+
+    `beside`: what stepped of what a leak does not move.
+    """
     test, against = own.test, _rise(own, levels) if levels else None
     if test is None and against is None:
         return Evidence("cannot tell", "too little moves: no leak would show")
     possible, tested = questions(test, against, probability), hypotheses(own)
     answered = next((each for each in possible if each.chance < each.probability), None)
-    causes = probabilities(tested) if answered is not None and answered.name == WITHIN else {}
+    causes = probabilities(tested, beside) if answered is not None and answered.name == WITHIN else {}
     if causes and not is_leak(causes):
         answered = None
     bound = max(against.interval(0.9)[1], 0.0) if against is not None else (test.bound() if test is not None else 0.0)
