@@ -274,13 +274,10 @@ def _cached(function: _F, own: dict[str, Any]) -> _F:
 
 
 class _LawLibrary(JITCodeLibrary):  # type: ignore[misc]
-    """The code of a law, which kernels are linked with and optimised as a whole: no address of it is asked for."""
+    """The code of a law, which kernels are linked with: without machine code, for no address of it is asked for.
 
-    def _optimize_functions(self, module: Any) -> None:
-        module.data_layout = self._codegen._data_layout
-
-    def _optimize_final_module(self) -> None:
-        pass
+    It is optimised here, not anew within each kernel: a law gives the same bits in all of them.
+    """
 
     def _finalize_final_module(self) -> None:
         self._finalized = True
