@@ -195,7 +195,7 @@ def _parts(file: Path, every: float, wanted: Wanted) -> Iterator[Recording]:
                 yield whole_file.samples(slice(first, first + size))
             return
         with whole("a text file", inner):
-            for fields in read_text_parts(inner, wanted, lambda beginning: max(1, round(every * beginning.rate))):
+            for fields in read_text_parts(inner, wanted, every):
                 yield Recording(*fields[:-1])
 
 
