@@ -477,21 +477,16 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"got a {type(value).__name__}")
 
 
-def parse_description(text: str | bytes) -> dict[str, Any]:
-    """Parse the JSON text of a `description_of`; raise InputError where it is damaged."""
+def parse_description(said: str | bytes | Mapping[str, Any]) -> dict[str, Any]:
+    """Return what `description_of` made, of its JSON text or its values; raise InputError where it is damaged."""
     try:
-        parsed = json.loads(text)
-        description: dict[str, Any] = {
-            "rate": float(parsed["rate"]),
-            "provenance": dict(parsed["provenance"]),
-            "history": [str(line) for line in parsed["history"]],
-            "format": int(parsed["format"]),
-        }
-    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
+        parsed = said if isinstance(said, Mapping) else json.loads(said)
+        version, rate = int(parsed["format"]), float(parsed["rate"])
+        provenance, history = dict(parsed["provenance"]), [str(line) for line in parsed["history"]]
+    except (ValueError, TypeError, KeyError, IndexError, OverflowError, RecursionError) as error:
         raise InputError("the recording's description must be whole, got damaged JSON") from error
-    version, rate = description["format"], description["rate"]
     if version > FORMAT_VERSION:
         raise InputError(f"format must be at most {FORMAT_VERSION}, got {version}: newer software")
     if not (np.isfinite(rate) and rate > 0):
         raise InputError(f"rate must be > 0 Hz, got {rate}")
-    return description
+    return {"rate": rate, "provenance": provenance, "history": history}
