@@ -17,7 +17,7 @@ from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.apart import file_apart
 from sealscope.recordings.archives import is_workbook, unpacked
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
-from sealscope.recordings.formats.columns import ChannelMap, Wanted, check_call
+from sealscope.recordings.formats.columns import ChannelMap, Wanted
 from sealscope.recordings.formats.matlab import is_matlab_4
 from sealscope.recordings.formats.structured.json_log import is_json
 from sealscope.recordings.formats.structured.lvm import is_lvm
@@ -139,9 +139,9 @@ def read(
     [300000.0, 350000.0, 300000.0]
     """
     file = Path(path)
-    check_call(map or {}, rate)
+    wanted = Wanted(map or {}, rate, file.name)
     with _inner(file) as (inner, kind):
-        return _read(inner, kind, Wanted(map or {}, rate, file.name))
+        return _read(inner, kind, wanted)
 
 
 @checked_call
@@ -189,10 +189,10 @@ def read_parts(
     [0.8, 0.8, 0.4]
     """
     file = Path(path)
-    check_call(map or {}, rate)
+    wanted = Wanted(map or {}, rate, file.name)
     if not (isfinite(every) and every > 0):
         raise InputError(f"every must be > 0 s and finite, got {every:g}")
-    return _parts(file, every, Wanted(map or {}, rate, file.name))
+    return _parts(file, every, wanted)
 
 
 def _parts(file: Path, every: float, wanted: Wanted) -> Iterator[Recording]:
