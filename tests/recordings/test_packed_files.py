@@ -77,6 +77,17 @@ def test_archives_in_archives_are_bounded_by_the_outermost(tmp_path: Path) -> No
     assert f"at most {SMALL} bytes" in refused(path, rate=500)
 
 
+def test_archives_lie_three_deep_in_each_other_at_most(tmp_path: Path) -> None:
+    content = b"t [s],p_A [bar]\n0,1\n1,2\n2,3\n"
+    for _ in range(3):
+        content = gzip.compress(content)
+    path = tmp_path / "log.csv.gz"
+    path.write_bytes(content)
+    assert len(read(path)) == 3
+    path.write_bytes(gzip.compress(content))
+    assert refused(path).startswith("at most 3 archives may lie in each other")
+
+
 def test_a_sparse_archive_that_claims_12_gib(tmp_path: Path) -> None:
     path, size = tmp_path / "log.zip", 12 * 2**30
     name = b"log.csv"

@@ -18,15 +18,11 @@ from typing import IO, Any, TypeVar
 from sealscope.errors import UnreadableFile
 from sealscope.recordings.apart import file_apart
 from sealscope.recordings.formats.libraries import library
-from sealscope.storage.opening import open_regular, whole
+from sealscope.storage.opening import whole
 from sealscope.storage.unpacking import check_unpacked
 
 T = TypeVar("T")
-#: First bytes -> archive.
-_MAGIC = {b"\x1f\x8b": "gzip", b"BZh": "bz2", b"\xfd7zXZ\x00": "xz", b"\x28\xb5\x2f\xfd": "zstd", b"PK\x03\x04": "zip"}
 _SUFFIXES = (".gz", ".bz2", ".xz", ".zst", ".zip", ".tar", ".tgz")
-#: Where a tar archive says that it is one.
-_TAR_AT, _TAR = 257, b"ustar"
 #: What lies beside a recording in an archive and is none.
 _DOCUMENTS = (".pdf", ".md", ".png", ".jpg", ".jpeg", ".doc", ".docx", ".html", ".xml", ".json", ".toml", ".ini")
 #: A workbook is a ZIP archive with one of these members.
@@ -36,17 +32,10 @@ _LONGEST, _SLOWEST = 20.0, 1e6
 _CHUNK, _MEMORY = 2**20, 2**30
 
 
-def archive_of(path: Path) -> str | None:
-    """Return the kind of archive that a file is by its first bytes; None for a workbook and any other file."""
-    with open_regular(path, "a recording") as file:
-        head = file.read(512)
-    if head[_TAR_AT : _TAR_AT + len(_TAR)] == _TAR:
-        return "tar"
-    kind = next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), None)
-    if kind == "zip":
-        with whole("a zip archive", path):
-            return None if _apart(_is_workbook, path) else kind
-    return kind
+def is_workbook(path: Path) -> bool:
+    """Return whether a ZIP archive is a spreadsheet."""
+    with whole("a zip archive", path):
+        return _apart(_is_workbook, path)
 
 
 def _apart(work: Callable[..., T], path: Path, *arguments: Any) -> T:

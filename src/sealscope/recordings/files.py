@@ -15,9 +15,9 @@ from typing import Any
 from sealscope.calls import checked_call
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.apart import file_apart
-from sealscope.recordings.archives import archive_of, unpacked
+from sealscope.recordings.archives import is_workbook, unpacked
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
-from sealscope.recordings.formats.columns import ChannelMap, Wanted, check_call
+from sealscope.recordings.formats.columns import ChannelMap, Wanted
 from sealscope.recordings.formats.matlab import is_matlab_4
 from sealscope.recordings.formats.structured.json_log import is_json
 from sealscope.recordings.formats.structured.lvm import is_lvm
@@ -33,6 +33,7 @@ from sealscope.storage.unpacking import most_unpacked
 _TABLES: dict[str, dict[str, Any]] = tomllib.loads(Path(__file__).with_name("formats.toml").read_text("utf-8"))
 _FORMATS, _PROPRIETARY = _TABLES["read"], _TABLES["proprietary"]
 _BEGINS = {kind: re.compile(own["begins"].encode()) for kind, own in _FORMATS.items() if "begins" in own}
+_ARCHIVES = {kind: re.compile(begins.encode()) for kind, begins in _TABLES["archives"].items()}
 _FOREIGN = {re.compile(begins.encode()): words for begins, words in _TABLES["foreign"].items()}
 #: Suffix -> format of any file, and of a file to write.
 _SUFFIXES = {suffix: kind for kind, own in _FORMATS.items() for suffix in own["suffixes"]}
@@ -48,15 +49,23 @@ _DEEPEST_ARCHIVE = 3
 
 
 def _format_of(path: Path) -> str:
-    """Return the format of a file by its content; raise UnreadableFile where it is none that is read."""
-    with open_regular(path, "a recording") as file:
-        head = file.read(SNIFF)
-        if known := next((kind for kind, begins in _BEGINS.items() if begins.match(head)), None):
-            return known
-        for offset in (512, 1024, 2048, 4096):  # HDF5 may begin after a block of the user's
-            file.seek(offset)
-            if _BEGINS["netcdf"].match(file.read(8)):
-                return "netcdf"
+    """Return the format of a file, or kind of archive, by its content; raise UnreadableFile where none is read."""
+    try:
+        with open_regular(path, "a recording") as file:
+            head = file.read(SNIFF)
+    except FileNotFoundError:
+        raise UnreadableFile(f"a recording must exist, got no such file ({path})") from None
+    except InputError as error:
+        raise UnreadableFile(str(error)) from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UnreadableFile(f"a recording must be readable, got: {reason} ({path})") from error
+    if archive := next((kind for kind, begins in _ARCHIVES.items() if begins.match(head)), None):
+        return "spreadsheet" if archive == "zip" and is_workbook(path) else archive
+    if known := next((kind for kind, begins in _BEGINS.items() if begins.match(head)), None):
+        return known
+    if any(_BEGINS["netcdf"].match(head, offset) for offset in (512, 1024, 2048, 4096)):  # after a block of the user's
+        return "netcdf"
     foreign: str | None = next((words for begins, words in _FOREIGN.items() if begins.match(head)), None)
     if foreign is None and is_matlab_4(head):
         return "matlab"
@@ -130,9 +139,9 @@ def read(
     [300000.0, 350000.0, 300000.0]
     """
     file = Path(path)
-    check_call(map or {}, rate)
-    with _inner(file) as inner:
-        return _read(inner, Wanted(map or {}, rate, file.name))
+    wanted = Wanted(map or {}, rate, file.name)
+    with _inner(file) as (inner, kind):
+        return _read(inner, kind, wanted)
 
 
 @checked_call
@@ -180,54 +189,47 @@ def read_parts(
     [0.8, 0.8, 0.4]
     """
     file = Path(path)
-    check_call(map or {}, rate)
+    wanted = Wanted(map or {}, rate, file.name)
     if not (isfinite(every) and every > 0):
         raise InputError(f"every must be > 0 s and finite, got {every:g}")
-    return _parts(file, every, Wanted(map or {}, rate, file.name))
+    return _parts(file, every, wanted)
 
 
 def _parts(file: Path, every: float, wanted: Wanted) -> Iterator[Recording]:
-    with _inner(file) as inner:
-        if _format_of(inner) != "text":
-            whole_file = _read(inner, wanted)
+    with _inner(file) as (inner, kind):
+        if kind != "text":
+            whole_file = _read(inner, kind, wanted)
             size = max(1, round(every * whole_file.rate))
             for first in range(0, len(whole_file), size):
                 yield whole_file.samples(slice(first, first + size))
             return
         with whole("a text file", inner):
-            for fields in read_text_parts(inner, wanted, lambda beginning: max(1, round(every * beginning.rate))):
+            for fields in read_text_parts(inner, wanted, every):
                 yield Recording(*fields[:-1])
 
 
 @contextmanager
-def _inner(file: Path) -> Iterator[Path]:
-    """Yield the file, or what is packed in it; what is wrong with either is an UnreadableFile."""
-    try:
-        archive = archive_of(file)
-    except FileNotFoundError:
-        raise UnreadableFile(f"a recording must exist, got no such file ({file})") from None
-    except InputError as error:
-        raise UnreadableFile(str(error)) from None
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise UnreadableFile(f"a recording must be readable, got: {reason} ({file})") from error
+def _inner(file: Path) -> Iterator[tuple[Path, str]]:
+    """Yield the file, or what is packed in it, and its format; what is wrong with either is an UnreadableFile."""
     with ExitStack() as folders:
-        inner, most = file, 0 if archive is None else most_unpacked(file)
+        inner, kind = file, _format_of(file)
+        most = most_unpacked(file) if kind in _ARCHIVES else 0
         try:
             for _ in range(_DEEPEST_ARCHIVE):  # a .tar.gz is an archive in an archive
-                if archive is not None:
-                    inner = folders.enter_context(unpacked(inner, archive, most))
-                    archive = archive_of(inner)
-            yield inner
+                if kind in _ARCHIVES:
+                    inner = folders.enter_context(unpacked(inner, kind, most))
+                    kind = _format_of(inner)
+            if kind in _ARCHIVES:
+                raise UnreadableFile(f"at most {_DEEPEST_ARCHIVE} archives may lie in each other, got more ({inner})")
+            yield inner, kind
         except UnreadableFile as error:
             if inner == file:
                 raise
             raise UnreadableFile(str(error).replace(str(inner), f"{inner.name} in {file}")) from error
 
 
-def _read(file: Path, wanted: Wanted) -> Recording:
+def _read(file: Path, kind: str, wanted: Wanted) -> Recording:
     """Read a file that is no archive: by a process of its own where the format is none of text."""
-    kind = _format_of(file)
     with whole(f"{_FORMATS[kind]['words']} file", file):
         if kind in _TEXTS:
             fields = _read_here(file, kind, wanted)

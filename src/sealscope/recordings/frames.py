@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -53,8 +52,8 @@ def read_pandas(frame: pandas.DataFrame, wanted: Wanted) -> RecordingFields:
         label = Label.parse(name, unit if isinstance(unit, str) else elapsed)
         series.append(Series("", label, len(frame), partial(_values, pandas.api.types, column, name)))
     try:
-        own = parse_description(json.dumps({"format": FORMAT_VERSION, **frame.attrs}))
-    except (InputError, ValueError, TypeError, RecursionError):  # it is not of our making
+        own = parse_description({"format": FORMAT_VERSION, **frame.attrs})
+    except InputError:  # it is not of our making
         own = None
     return table_of(series, wanted, "pandas", own=own)
 

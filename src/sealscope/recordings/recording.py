@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from sealscope.calls import checked_call
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, LONG_NAMES, Array
-from sealscope.recordings.formats.columns import ChannelMap, Wanted, check_call, counted
+from sealscope.recordings.formats.columns import ChannelMap, Wanted, counted
 from sealscope.storage.opening import whole
 
 if TYPE_CHECKING:
@@ -254,10 +254,10 @@ class Recording:
         """
         from sealscope.recordings.frames import read_pandas
 
-        check_call(map or {}, rate)
+        wanted = Wanted(map or {}, rate)
         try:
             with whole("a data frame", "data frame"):
-                return cls(*read_pandas(frame, Wanted(map or {}, rate))[:-1])
+                return cls(*read_pandas(frame, wanted)[:-1])
         except UnreadableFile as error:
             raise InputError(str(error)) from None
 

@@ -5,18 +5,15 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sealscope.errors import InputError
 from sealscope.recordings.channels import Array
 from sealscope.recordings.formats.headings.labels import Label, is_unit
 from sealscope.recordings.formats.headings.words import WORDS
-from sealscope.recordings.formats.timebase import is_stamp, stamps
+from sealscope.recordings.formats.timebase import is_stamp
 from sealscope.units import parse_unit
 
 #: What loggers write where a sample is missing, in lower case.
@@ -86,17 +83,6 @@ def _number(cell: str, decimal: str) -> float:
     if not is_number(text, decimal):
         return np.nan
     return float(text.replace(",", ".").lower().replace("d", "e"))  # a Fortran exponent, 1.5D+03
-
-
-def from_text(cells: Sequence[str], time: bool, name: str) -> NDArray[Any]:
-    """Convert cells of text to doubles, or to stamps for the `time`; an empty cell is missing, and a few words are."""
-    with suppress(ValueError):
-        if time:
-            return stamps(cells)
-    values, words = numbers(cells, ".", lambda index: f"(row {index + 1}, {name})")
-    if len(words) > MOST_WORDS * len(cells):
-        raise InputError(f"{name} must hold numbers, got text")
-    return values
 
 
 def _unit_behind(cell: str) -> str | None:

@@ -36,11 +36,14 @@ REST = "*"
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a caller asks of a table: a map and a rate [Hz]; `file`: how the provenance calls it."""
+    """What a caller asks of a table, checked: a map and a rate [Hz]; `file`: how the provenance calls it."""
 
     map: ChannelMap
     rate: float | None = None
     file: str = ""
+
+    def __post_init__(self) -> None:
+        check_call(self.map, self.rate)
 
     @property
     def infers_rate(self) -> bool:

@@ -142,17 +142,13 @@ def _texts(data: Any, name: str, size: int) -> list[str]:
 
 
 def _description(file: Any) -> dict[str, Any]:
+    history, provenance = (_text(file.attrs[name]) for name in ("history", "provenance"))
+    said = {"format": _number(file.attrs[OWN]), "rate": _number(file.attrs["rate"])}
     try:
-        history, provenance = (_text(file.attrs[name]) for name in ("history", "provenance"))
-        description: dict[str, Any] = {"format": int(_number(file.attrs[OWN])), "rate": _number(file.attrs["rate"])}
-        description["provenance"] = json.loads(provenance or "{}")
-        try:
-            description["history"] = json.loads(history or "[]")
-        except ValueError:  # another tool has added its own line, as the CF conventions ask
-            description["history"] = (history or "").splitlines()
-    except (KeyError, IndexError, ValueError, TypeError, OverflowError) as error:
-        raise InputError("the recording's description must be whole, got damaged attributes") from error
-    return parse_description(json.dumps(description))
+        lines = json.loads(history or "[]")
+    except ValueError:  # another tool has added its own line, as the CF conventions ask
+        lines = (history or "").splitlines()
+    return parse_description({**said, "provenance": json.loads(provenance or "{}"), "history": lines})
 
 
 def attributes(description: Mapping[str, Any]) -> dict[str, Any]:

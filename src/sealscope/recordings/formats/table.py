@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any, NamedTuple
@@ -22,14 +23,14 @@ from numpy.typing import NDArray
 
 from sealscope.errors import InputError
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, Array
-from sealscope.recordings.formats.cells import MOST_WORDS, from_text
+from sealscope.recordings.formats.cells import MOST_WORDS, numbers
 from sealscope.recordings.formats.columns import ColumnMap, Wanted, choose_columns, counted, listed
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.preamble import exported_from
 from sealscope.recordings.formats.headings.proposal import is_time, unit_of_time
 from sealscope.recordings.formats.headings.split_time import joined_time
 from sealscope.recordings.formats.headings.words import WORDS
-from sealscope.recordings.formats.timebase import falling, nominal_rate, time_base
+from sealscope.recordings.formats.timebase import falling, nominal_rate, stamps, time_base
 from sealscope.units import to_si
 
 #: Most values that one file may hold in the columns used: 2 GiB of doubles, 16 hours of 9 channels at 500 Hz.
@@ -294,10 +295,17 @@ def _distinct(series: Sequence[Series]) -> tuple[list[Series], list[str]]:
 
 
 def _samples(series: Series, time: bool = False) -> NDArray[Any]:
-    """Return a series' samples (n,) as doubles, or its `time` as datetime64."""
+    """Return a series' samples (n,) as doubles, or its `time` as datetime64; in texts, a few words are missing."""
     values = series.values()
     if values.dtype.kind in "OSU":
-        return from_text([str(cell) for cell in values.tolist()], time, series.path)
+        cells = [str(cell) for cell in values.tolist()]
+        with suppress(ValueError):
+            if time:
+                return stamps(cells)
+        values, words = numbers(cells, ".", lambda index: f"(row {index + 1}, {series.path})")
+        if len(words) > MOST_WORDS * len(cells):
+            raise InputError(f"{series.path} must hold numbers, got text")
+        return values
     if values.dtype.kind == "M" and time:
         return values.astype("datetime64[ns]")
     if values.dtype.kind == "m":
@@ -477,21 +485,16 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"got a {type(value).__name__}")
 
 
-def parse_description(text: str | bytes) -> dict[str, Any]:
-    """Parse the JSON text of a `description_of`; raise InputError where it is damaged."""
+def parse_description(said: str | bytes | Mapping[str, Any]) -> dict[str, Any]:
+    """Return what `description_of` made, of its JSON text or its values; raise InputError where it is damaged."""
     try:
-        parsed = json.loads(text)
-        description: dict[str, Any] = {
-            "rate": float(parsed["rate"]),
-            "provenance": dict(parsed["provenance"]),
-            "history": [str(line) for line in parsed["history"]],
-            "format": int(parsed["format"]),
-        }
-    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
+        parsed = said if isinstance(said, Mapping) else json.loads(said)
+        version, rate = int(parsed["format"]), float(parsed["rate"])
+        provenance, history = dict(parsed["provenance"]), [str(line) for line in parsed["history"]]
+    except (ValueError, TypeError, KeyError, IndexError, OverflowError, RecursionError) as error:
         raise InputError("the recording's description must be whole, got damaged JSON") from error
-    version, rate = description["format"], description["rate"]
     if version > FORMAT_VERSION:
         raise InputError(f"format must be at most {FORMAT_VERSION}, got {version}: newer software")
     if not (np.isfinite(rate) and rate > 0):
         raise InputError(f"rate must be > 0 Hz, got {rate}")
-    return description
+    return {"rate": rate, "provenance": provenance, "history": history}

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from importlib.util import find_spec
 from itertools import accumulate, chain
-from math import isnan
+from math import inf, isnan
 from os import SEEK_CUR
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -77,42 +77,69 @@ _NUMBER = re.compile(r"[\s._(-]{0,4}\d{1,4}\b.{0,60}")
 
 
 def read_text(path: Path, wanted: Wanted) -> RecordingFields:
-    """Read the wanted columns of a text log: a table with one time, or a time for each channel, or a long table."""
+    """Read the wanted columns of a text log."""
+    return next(read_text_parts(path, wanted, inf))
+
+
+def read_text_parts(path: Path, wanted: Wanted, every: float) -> Iterator[RecordingFields]:
+    """Yield the wanted columns of a text log in parts of `every` seconds at its first rate, in bounded memory.
+
+    A log with a time for each channel and a long table are one part.
+    """
     layout = look_at(path)
     own = None if layout.own is None else parse_description(layout.own)
-    held: dict[int, NDArray[Any]] = {}
     times = _times_of_channels(layout.labels)
-    table = partial(table_of, wanted=wanted, kind=layout.kind, about=layout.about, rate=layout.rate)
+    choice = None
+    with suppress(InputError):
+        choice = choose_columns(layout.labels, wanted, layout.rate)
+    if choice is None or times:
+        try:
+            table = _several_clocks(path, layout, times, wanted)
+        except InputError:
+            if choice is None:
+                raise
+        else:
+            yield table
+            return
+    log = _Log(path, layout, choice.columns, choice.date)
+
+    def part(blocks: list[_Block], more: Sequence[str] = ()) -> RecordingFields:
+        columns, notes = log.joined(blocks)
+        return converted(choice, columns, layout.kind, wanted, [*layout.notes, *notes, *more], layout.about, own)
+
+    blocks = log.blocks()
+    first = next(blocks, None)
+    size = inf if first is None or every == inf else max(1, round(every * part([first[:]]).rate))
+    before: list[_Block] = []
+    for blocks_of_part in _cut([] if first is None else chain([first], blocks), size):
+        if before:
+            yield part(before)
+        before = blocks_of_part
+    yield part(before, log.remarks_and_headings())
+
+
+def _several_clocks(path: Path, layout: Layout, times: Sequence[int], wanted: Wanted) -> RecordingFields:
+    """Read a log in which each channel follows its own one of the columns `times`, or a long table."""
+    held: dict[int, NDArray[Any]] = {}
+    columns = [column for column in range(len(layout.labels)) if column not in times]
+    owner = {column: max(time for time in times if time < column) for column in columns} if times else {}
 
     def prepare(kinds: Mapping[int, str], date: int | None) -> Sequence[str]:
-        log = _Log(path, layout, kinds, date)
-        columns, notes = log.joined([*log.blocks()])
-        held.update(columns)
-        return [*layout.notes, *notes, *log.remarks_and_headings()]
+        used = {columns[number]: kind for number, kind in kinds.items()}
+        read = {owner[column]: "time" for column in used if times}
+        log = _Log(path, layout, used | read, None if times else date)
+        cells, notes = log.joined([*log.blocks()])
+        held.update(cells)
+        each = [f"{len(read)} columns of times, one for each channel"] if times else []
+        return [*layout.notes, *notes, *log.remarks_and_headings(), *each]
 
     def series(column: int, clock: Clock | None = None) -> Series:
         return Series("", layout.labels[column], 0, partial(held.__getitem__, column), clock)
 
-    if times:
-        values = [column for column in range(len(layout.labels)) if column not in times]
-        owner = {column: max(time for time in times if time < column) for column in values}
-        start = exported_from(layout.about)
-
-        def prepare_each(kinds: Mapping[int, str], date: int | None) -> Sequence[str]:
-            columns = {values[column]: kind for column, kind in kinds.items()}
-            read = {owner[column]: "time" for column in columns}
-            return [*prepare(columns | read, None), f"{len(read)} columns of times, one for each channel"]
-
-        clocks = {time: Clock(time, partial(seconds_of_series, series(time), start)) for time in times}
-        try:
-            return table([series(column, clocks[owner[column]]) for column in values], prepare=prepare_each)
-        except InputError:
-            with suppress(InputError):
-                choose_columns(layout.labels, wanted, layout.rate)
-                times = []
-            if times:
-                raise
-    return table([series(column) for column in range(len(layout.labels))], own=own, prepare=prepare)
+    start = exported_from(layout.about)
+    clocks = {time: Clock(time, partial(seconds_of_series, series(time), start)) for time in times}
+    members = [series(column, clocks[owner[column]] if times else None) for column in columns]
+    return table_of(members, wanted, layout.kind, layout.about, layout.rate, prepare=prepare)
 
 
 def _times_of_channels(labels: Sequence[Label]) -> list[int]:
@@ -125,47 +152,15 @@ def _times_of_channels(labels: Sequence[Label]) -> list[int]:
     return times if len({names[column] for column in times}) == 1 and len(times) > 1 and apart else []
 
 
-def read_text_parts(path: Path, wanted: Wanted, rows_of: Callable[[RecordingFields], int]) -> Iterator[RecordingFields]:
-    """Yield the wanted columns of a text log part by part, in bounded memory.
-
-    `rows_of`: returns how many rows a part shall have, from the beginning of the log. Where the log has several clocks
-    or is a long table, the whole of it is the only part.
-    """
-    layout = look_at(path)
-    try:
-        choice = choose_columns(layout.labels, wanted, layout.rate)
-    except InputError:
-        choice = None
-    if choice is None or _times_of_channels(layout.labels):
-        yield read_text(path, wanted)
-        return
-    own = None if layout.own is None else parse_description(layout.own)
-    log = _Log(path, layout, choice.columns, choice.date)
-
-    def part(blocks: list[_Block], more: Sequence[str] = ()) -> RecordingFields:
-        columns, notes = log.joined(blocks)
-        return converted(choice, columns, layout.kind, wanted, [*layout.notes, *notes, *more], layout.about, own)
-
-    blocks = log.blocks()
-    first = next(blocks, None)
-    size = 1 if first is None else rows_of(part([first[:]]))
-    before: list[_Block] = []
-    for blocks_of_part in _cut([] if first is None else chain([first], blocks), size):
-        if before:
-            yield part(before)
-        before = blocks_of_part
-    yield part(before, log.remarks_and_headings())
-
-
-def _cut(blocks: Iterable[_Block], size: int) -> Iterator[list[_Block]]:
+def _cut(blocks: Iterable[_Block], size: float) -> Iterator[list[_Block]]:
     """Yield blocks that together have `size` rows, the last ones fewer."""
     held: list[_Block] = []
     room = size
     for block in blocks:
         rest = block
         while len(rest) >= room:
-            yield [*held, rest[:room]]
-            held, room, rest = [], size, rest[room:]
+            yield [*held, rest[: int(room)]]
+            held, room, rest = [], size, rest[int(room) :]
         if len(rest):
             held.append(rest)
             room -= len(rest)

@@ -72,13 +72,9 @@ def _parsed_stamp(text: str) -> dict[str, str | None] | None:
     if match["clock"] and ":" not in match["clock"] and "plain" not in parts:
         return None  # six digits are a clock behind a date of eight alone
     if month and not month.isdecimal():
-        parts["month"] = _month(month)
+        name = month.casefold()
+        parts["month"] = _MONTHS.get(name[:4], _MONTHS.get(name[:3]))
     return None if month and parts["month"] is None else parts
-
-
-def _month(name: str) -> str | None:
-    name = name.casefold()
-    return _MONTHS.get(name[:4], _MONTHS.get(name[:3]))
 
 
 def is_stamp(text: str) -> bool:

@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -101,58 +102,57 @@ def _is_cell(value: object) -> bool:
     return isinstance(value, str | int | float | None)
 
 
+def _cells(group: str, name: str, value: Any, depth: int) -> Iterator[tuple[str, str, Any, str | None]]:
+    """Yield (group, name, cell, unit) of a value of a record, or of what is in it, called by the names on the way."""
+    if isinstance(value, Mapping) and depth < _DEEPEST:
+        unit = value.get("unit")
+        if name and set(value) == {"value", "unit"} and _is_cell(value["value"]) and isinstance(unit, str):
+            yield group, name, value["value"], unit
+            return
+        for inner, cell in value.items():
+            yield from _cells(f"{group}/{name}" if group and name else group or name, inner, cell, depth + 1)
+    elif isinstance(value, list) and depth < _DEEPEST and len(value) <= _LONGEST_VECTOR:
+        for number, cell in enumerate(value, start=1):
+            yield from _cells(group, f"{name}({number})", cell, depth + 1)
+    elif _is_cell(value):
+        yield group, name, value, None
+    else:
+        raise InputError(f"{name} must be a number or a text, got {type(value).__name__}")
+
+
 def _records(members: Sequence[Any], place: str) -> list[Series]:
     """Return a series a name of records, of rows under a first row of names, or of blocks of columns."""
     columns: dict[tuple[str, str], dict[int, Any]] = {}
     units: dict[tuple[str, str], str] = {}
     heads: list[str] | None = None
     rows = 0
-
-    def add(group: str, name: str, value: Any, depth: int) -> None:
-        """Add a value of a record, or what is in it, called by the names on the way to it."""
-        key = (group, name)
-        if isinstance(value, Mapping) and depth < _DEEPEST:
-            if name and set(value) == {"value", "unit"} and _is_cell(value["value"]) and isinstance(value["unit"], str):
-                unit = value["unit"]
-                if units.setdefault(key, unit) != unit:
-                    raise refusal(f"{name} must have one unit, got {units[key][:40]} and {unit[:40]}")
-                columns.setdefault(key, {})[rows] = value["value"]
-                return
-            for inner, cell in value.items():
-                add(f"{group}/{name}" if group and name else group or name, inner, cell, depth + 1)
-        elif isinstance(value, list) and depth < _DEEPEST and len(value) <= _LONGEST_VECTOR:
-            for number, cell in enumerate(value, start=1):
-                add(group, f"{name}({number})", cell, depth + 1)
-        elif _is_cell(value):
-            columns.setdefault(key, {})[rows] = value
-            if len(columns) > _MOST_NAMES:
-                raise InputError(f"records must have at most {_MOST_NAMES} names, got more")
-        else:
-            raise InputError(f"{name} must be a number or a text, got {type(value).__name__}")
-
-    def refusal(rule: str) -> InputError:
-        return InputError(f"{rule} (row {rows + 1}, {place})")
-
     for member in members:
         if isinstance(member, Mapping) and (length := _block_length(member)) is not None:
             for name, cells in member.items():
                 columns.setdefault(("", name), {}).update(enumerate(cells, start=rows))
             rows += length
             continue
-        if isinstance(member, Mapping):
-            add("", "", member, 0)
-        elif isinstance(member, list):
+        where = f"(row {rows + 1}, {place})"
+        if isinstance(member, list):
             if heads is None:
                 texts = bool(member) and all(isinstance(cell, str) for cell in member)
                 heads = member if texts else [str(number + 1) for number in range(len(member))]
                 if texts:
                     continue
             if len(member) > len(heads):
-                raise refusal(f"a row must have {len(heads)} values, got {len(member)}")
-            for name, value in zip(heads, member, strict=False):
-                add("", name, value, 1)
+                raise InputError(f"a row must have {len(heads)} values, got {len(member)} {where}")
+            parts = [_cells("", name, value, 1) for name, value in zip(heads, member, strict=False)]
+        elif isinstance(member, Mapping):
+            parts = [_cells("", "", member, 0)]
         else:
-            raise refusal(f"JSON must hold objects or arrays, got {str(member)[:40]!r}")
+            raise InputError(f"JSON must hold objects or arrays, got {str(member)[:40]!r} {where}")
+        for group, name, cell, unit in chain.from_iterable(parts):
+            key = (group, name)
+            columns.setdefault(key, {})[rows] = cell
+            if unit is not None and units.setdefault(key, unit) != unit:
+                raise InputError(f"{name} must have one unit, got {units[key][:40]} and {unit[:40]} {where}")
+            if len(columns) > _MOST_NAMES:
+                raise InputError(f"records must have at most {_MOST_NAMES} names, got more")
         rows += 1
     check_size(rows, len(columns))
 

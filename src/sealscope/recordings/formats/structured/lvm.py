@@ -26,36 +26,34 @@ _END = "***End_of_Header***"
 
 @dataclass
 class _Packet:
-    """`head`: rows of the channels' header; `names`: of the columns; `rows`: samples; `line`: number of the first."""
+    """`head`: rows of the channels' header; `names`: of the columns; `rows`: samples, NaN where a row is shorter."""
 
     head: Mapping[str, list[str]]
     names: list[str]
-    line: int
     rows: list[Array] = field(default_factory=list)
 
-    def column(self, index: int, whole: bool) -> Array:
-        """Return a column (n,); one that is not `whole` ends in blanks where others go on."""
-        values = np.array([row[index] if index < len(row) else np.nan for row in self.rows])
-        known = np.flatnonzero(np.isfinite(values))
-        return values if whole else values[: known[-1] + 1 if known.size else 0]
+    def entry(self, name: str, index: int) -> str:
+        """Return a channel's entry of the header; empty where there is none."""
+        own = self.head.get(name, [])
+        return own[index] if index < len(own) else ""
 
     def number(self, name: str, index: int) -> float:
-        """Return a channel's entry of the header; NaN where there is none."""
         try:
-            return float(self.head[name][index].replace(",", "."))
-        except (KeyError, IndexError, ValueError):
+            return float(self.entry(name, index).replace(",", "."))
+        except ValueError:
             return np.nan
 
     def moment(self, index: int) -> np.datetime64 | None:
         """Return when a channel's first sample was taken; None where the header does not say."""
+        day, time = self.entry("date", index), self.entry("time", index).replace(",", ".")
+        seconds, _, fraction = time.partition(".")
         try:
-            day, (seconds, _, fraction) = (
-                self.head["date"][index],
-                self.head["time"][index].replace(",", ".").partition("."),
-            )
             return stamps([f"{day} {seconds}.{fraction[:9] or '0'}"])[0] if day else None
-        except (KeyError, IndexError, ValueError):
+        except ValueError:
             return None
+
+    def column(self, index: int) -> Array:
+        return np.array([row[index] for row in self.rows])
 
 
 def is_lvm(head: bytes) -> bool:
@@ -96,7 +94,6 @@ def _packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str, pla
         elif not any(cells):
             continue
         elif packet is not None and cells[0].casefold() == "channels":
-            yield packet
             head, packet, in_head = {}, None, True
         elif packet is not None:
             names = packet.names
@@ -104,7 +101,7 @@ def _packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str, pla
             def where(index: int, number: int = number, names: Sequence[str] = names) -> str:
                 return f"(line {number}, column {names[index]}, {place})"
 
-            values, words = numbers(cells[: len(names)], decimal, where)
+            values, words = numbers(cells[: len(names)] + [""] * (len(names) - len(cells)), decimal, where)
             if words:
                 raise InputError(f"a sample must be a number, got {cells[words[0]][:40]!r} {where(words[0])}")
             packet.rows.append(values)
@@ -114,41 +111,46 @@ def _packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str, pla
             own = cells[1:]  # every second cell is empty where each channel has a time
             head[cells[0].casefold()] = own[::2] if len(own) > 2 and own[2] and not any(own[1::2]) else own
         else:
-            packet = _Packet(head, cells[:-1] if cells[-1].casefold() == "comment" else cells, number + 1)
-    if packet is not None:
-        yield packet
+            packet = _Packet(head, cells[:-1] if cells[-1].casefold() == "comment" else cells)
+            yield packet
 
 
 def _series(packets: Sequence[_Packet], x_columns: str) -> list[Series]:
     """Return a series a channel, of all packets that have its columns; `x_columns`: one, multi or no."""
-    names = packets[0].names
+    first, names = packets[0], packets[0].names
     times = [column for column, name in enumerate(names) if name.casefold().startswith("x_value")]
     if not times:
         raise InputError(f"a LabVIEW measurement file must have a column X_Value, got {', '.join(names)}")
     same = [packet for packet in packets if packet.names == names]
     check_size(sum(len(packet.rows) for packet in same), len(names))
-    moments, firsts = [packet.moment(0) for packet in same], [packet.number("x0", 0) for packet in same]
-    begins = [0.0] * len(same)  # added to the times of each packet, where its own do not go on
-    known = [moment for moment in moments if moment is not None]
-    if len(known) == len(same) and not all(after > before for before, after in pairwise(firsts)):
-        begins = [float((moment - known[0]) / np.timedelta64(1, "ns")) / 1e9 for moment in known]
+    begins = _begins(same)
     multiple, series = x_columns == "multi", []
     for index, column in enumerate(column for column in range(len(names)) if column not in times):
         time = max((before for before in times if before < column), default=times[0]) if multiple else times[0]
         values, seconds = [], []
         for packet, begin in zip(same, begins, strict=True):
-            values.append(packet.column(column, not multiple))
-            count = values[-1].size
+            own = packet.column(column)
+            if multiple:  # it ends in blanks where others go on
+                own = own[: np.flatnonzero(np.isfinite(own)).max(initial=-1) + 1]
+            own_times = packet.column(time)[: own.size]
             if x_columns == "no":
-                step, first = packet.number("delta_x", index), packet.number("x0", index)
+                step = packet.number("delta_x", index)
                 if not step > 0:
                     raise InputError(f"Delta_X must be > 0 s, got {packet.head.get('delta_x')}")
-                seconds.append(begin + np.nan_to_num(first) + step * np.arange(count))
-            else:
-                seconds.append(begin + packet.column(time, True)[:count])
+                own_times = np.nan_to_num(packet.number("x0", index)) + step * np.arange(own.size)
+            values.append(own)
+            seconds.append(begin + own_times)
         joined, t = np.concatenate(values), np.concatenate(seconds)
-        units = same[0].head.get("y_unit_label", [])
-        label = Label.parse(names[column], (units[index] or None) if index < len(units) else None)
-        clock = Clock(time, partial(lambda *given: given, t, same[0].moment(index)))
+        label = Label.parse(names[column], first.entry("y_unit_label", index) or None)
+        clock = Clock(time, partial(lambda *given: given, t, first.moment(index)))
         series.append(Series("", label, t.size, partial(np.asarray, joined), clock))
     return series
+
+
+def _begins(packets: Sequence[_Packet]) -> list[float]:
+    """Return what is added to the times of each packet [s], where its own do not go on and the moments are known."""
+    moments, firsts = [packet.moment(0) for packet in packets], [packet.number("x0", 0) for packet in packets]
+    known = [moment for moment in moments if moment is not None]
+    if len(known) < len(packets) or all(after > before for before, after in pairwise(firsts)):
+        return [0.0] * len(packets)
+    return [float((moment - known[0]) / np.timedelta64(1, "ns")) / 1e9 for moment in known]

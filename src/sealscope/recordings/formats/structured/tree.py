@@ -73,17 +73,15 @@ def _group(group: str, name: str, fields: Mapping[str, Any], clock: Clock | None
             unit = _text((_fields(by_name.get("datainfo")) or {}).get("Units")) or unit
             yield from _columns(group, _text(by_name.get("name")) or name, data, unit or None, clock)
             return
-        if "data" in by_name:  # a struct of vectors that share the time beside it
-            yield from _walk(group, "data", data, clock, depth + 1)
-            return
-        clock = None  # a struct of vectors beside a vector called time: that is a column like the others
-    elif samples is not None and unit is not None:  # a signal with its name and unit beside its samples
+        yield from _walk(group, "data", data, clock, depth + 1)  # vectors that share the time beside them
+        return
+    if samples is not None and unit is not None:  # a signal with its name and unit beside its samples
         own = by_name.get("time", by_name.get("t"))
         if isinstance(own, np.ndarray) and own.dtype.kind in "fiu" and own.size == samples.size:
             clock = _clock((group, name, depth), own.reshape(-1).astype(np.float64))
         yield from _columns(group, _first_text(by_name, _NAME_FIELDS) or name, samples, unit or None, clock)
         return
-    elif "values" in by_name and _text(by_name.get("name")):  # a signal of a Simulink log, named by the log
+    if "values" in by_name and _text(by_name.get("name")):  # a signal of a Simulink log, named by the log
         yield from _walk(group, _text(by_name["name"]), by_name["values"], clock, depth + 1)
         return
     inner = f"{group}/{name}" if group else name
