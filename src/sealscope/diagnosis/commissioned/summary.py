@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.beliefs import beliefs
+from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY
 from sealscope.diagnosis.inference.blocks import Columns, solve
 from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.inference.terms import ATMOSPHERE, equations
@@ -18,7 +19,7 @@ from sealscope.diagnosis.inspection import Inspection
 from sealscope.diagnosis.verdict.machine import unstated
 from sealscope.recordings.oil import oil_temperature
 from sealscope.recordings.recording import Array, Recording
-from sealscope.units import LITRE_PER_MINUTE
+from sealscope.units import BAR, LITRE_PER_MINUTE, from_si
 
 if TYPE_CHECKING:
     from sealscope.diagnosis.learnt import Learnt
@@ -76,8 +77,9 @@ class Summary:
         span = "" if not dates else f", {first}" if first == last else f", {first} to {last}"
         noise = []
         for name, value in self.noise.items():
-            unit, size = _SHOWN.get(healthy[0].units.get(name, ""), (healthy[0].units.get(name, ""), 1.0))
-            noise.append(f"{name} {value / size:.2g} {unit}")
+            unit = healthy[0].units.get(name, "")
+            shown = {"Pa": "bar", "m": "mm"}.get(unit, unit)
+            noise.append(f"{name} {from_si(value, shown, unit):.2g} {shown}")
         rows = [
             ("recordings", f"{len(healthy)} healthy, {sum(own.seconds for own in healthy):.4g} s in all{span}"),
             ("channels", ", ".join(f"{name} [{unit}]" for name, unit in healthy[0].units.items())),
@@ -99,10 +101,6 @@ class Summary:
             for name, text in rows
             if text
         )
-
-
-#: Units in which people read others, and their sizes.
-_SHOWN = {"Pa": ("bar", 1e5), "m": ("mm", 1e-3)}
 
 
 def _stated(rig: Rig | None) -> str:
@@ -140,7 +138,7 @@ def about_recording(recording: Recording, inspection: Inspection) -> dict[str, A
     """Return what people read of a healthy recording, and what looks wrong with it."""
     part, about = inspection.part, dict[str, Any]()
     if {"p_A", "p_B"} <= set(part.channels) and part.units["p_A"] == "Pa":
-        about["pressure_bar"] = _rounded(float(np.mean(np.abs(part["p_A"] - part["p_B"]))) / 1e5)
+        about["pressure_bar"] = _rounded(float(np.mean(np.abs(part["p_A"] - part["p_B"]))) / BAR)
     if (oil := oil_temperature(recording)) is not None:
         about["oil_degC"] = _rounded(oil)
     about["noise"] = {name: noise for name in part.channels if (noise := _noise(part[name])) > 0.0}
@@ -172,7 +170,7 @@ def summarised(healthy: Sequence[Learnt], rig: Rig | None, left_out: Sequence[st
     problems += [
         f"{own.file} is not like the others: its leakage differs from theirs by {abs(rise.score):.2g} deviations"
         for own, rise in zip(alike, rises, strict=True)
-        if len(rises) > 2 and 2.0 * min(rise.chance, 1.0 - rise.chance) < _ASKED["false_alarm"]
+        if len(rises) > 2 and 2.0 * min(rise.chance, 1.0 - rise.chance) < FALSE_ALARM_PROBABILITY
     ]
     return Summary(terms, noise, _smallest(balance, lessons, channels), problems)
 
@@ -206,7 +204,7 @@ def _smallest(balance: VolumeBalance, lessons: Sequence[Mapping[str, Any]], chan
 
     def findable(repeated: int) -> float:
         coming = balance.next_rise(lessons, channels, repeated)
-        return float((coming.threshold(_ASKED["false_alarm"]) + ndtri(_ASKED["power"])) * coming.deviation)
+        return float((coming.threshold(FALSE_ALARM_PROBABILITY) + ndtri(_ASKED["power"])) * coming.deviation)
 
     pressure, flow = (float(np.median([own[name] for own in lessons])) for name in ("pressure", "flow"))
     scale, own = float(np.median([lesson["scale"] for lesson in lessons])), findable(1)
@@ -236,7 +234,7 @@ def _noise(values: Array) -> float:
 def _below_vacuum(part: Recording, name: str) -> str:
     if part.units[name] != "Pa" or not (least := float(np.quantile(part[name], 0.01))) < -ATMOSPHERE:
         return ""
-    off = (-ATMOSPHERE - least) / 1e5
+    off = (-ATMOSPHERE - least) / BAR
     return f"{name} reads below vacuum: its zero is at least {off:.1g} bar too low"
 
 

@@ -41,7 +41,7 @@ SIZES = np.array(_BELIEVED["sizes"])
 PARTS = np.array(_BELIEVED["parts"])
 JUMP, MEMORY = beliefs("live")["coefficients"]["jump"], _BELIEVED["memory"]
 #: Onsets are all kept for `RECENT` blocks, then `RECENT / 4` of every doubling of age, up to `HORIZON` blocks.
-RECENT, HORIZON = 32, 4096
+RECENT, HORIZON = _BELIEVED["recent"], _BELIEVED["horizon"]
 #: What is kept of each onset and walk, and of each onset.
 _FIELDS = ("answer", "along", "square", "total", "lead")
 _PLACES = ("number", "born", "onset", "begin")

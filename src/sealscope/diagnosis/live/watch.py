@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 
 #: Format of the saved state.
 STATE_VERSION = 10
-#: Blocks of one mean that is compared with the baseline, and of the mean that is the leak after an alarm.
-GROUP, _RECENT = 16, 8
 _BELIEVED = beliefs("live")["watch"]
+#: Blocks of one mean that is compared with the baseline, and of the mean that is the leak after an alarm.
+GROUP, _RECENT = _BELIEVED["group"], _BELIEVED["recent"]
 #: Ways of watching, each a stream of conductances.
 _KINDS: dict[str, type[LiveBalance | PressureEstimator]] = {of.method: of for of in (LiveBalance, PressureEstimator)}
 
