@@ -68,13 +68,9 @@ class Summary:
 
     def text(self, healthy: Sequence[Learnt], rig: Rig | None) -> str:
         """Return it in some ten lines."""
-        dates = sorted(own.start_s for own in healthy if own.start_s is not None)
-        first, last = (
-            (datetime.fromtimestamp(at, UTC).date().isoformat() for at in (min(dates), max(dates)))
-            if dates
-            else ("", "")
-        )
-        span = "" if not dates else f", {first}" if first == last else f", {first} to {last}"
+        starts = [own.start_s for own in healthy if own.start_s is not None]
+        dates = sorted(datetime.fromtimestamp(at, UTC).date().isoformat() for at in starts)
+        span = f", {' to '.join(dict.fromkeys((dates[0], dates[-1])))}" if dates else ""
         noise = []
         for name, value in self.noise.items():
             unit = healthy[0].units.get(name, "")
@@ -105,13 +101,14 @@ class Summary:
 
 def _stated(rig: Rig | None) -> str:
     """Return what is stated of the machine, in words."""
-    parts = []
-    if rig is not None and rig.states("cylinder.M_eq"):
+    rig = rig or unstated()
+    if rig.states("cylinder.M_eq"):
         return rig.title or rig.name
-    if rig is not None and rig.states("cylinder.A_A", "cylinder.A_B"):
+    parts = []
+    if rig.states("cylinder.A_A", "cylinder.A_B"):
         areas = dict.fromkeys(f"{1e6 * area:.4g}" for area in (rig.cylinder.A_A, rig.cylinder.A_B))
         parts.append(f"piston {' and '.join(areas)} mm^2")
-    if rig is not None and rig.states("pump.q_b"):
+    if rig.states("pump.q_b"):
         parts.append(f"pump {1e6 * rig.pump.q_b:.3g} cm^3/rev")
     return ", ".join(parts) or "size not stated: L/min needs a rig, an area or a displacement"
 
@@ -120,17 +117,16 @@ def _duty(healthy: Sequence[Learnt]) -> str:
     """Return the ranges of the pump's mean flow, where the machine's size is stated, of pressure and temperature."""
     lessons = [own.lessons.get(_BALANCE, {}) for own in healthy]
     flows = [lesson.get("flow", 0.0) * lesson.get("scale", 0.0) / LITRE_PER_MINUTE for lesson in lessons]
-    pressures, oils = (
-        [own.about[name] for own in healthy if name in own.about] for name in ("pressure_bar", "oil_degC")
-    )
+    ranges = {
+        "L/min": [flow for flow in flows if flow > 0.0],
+        "bar between the chambers": [own.about["pressure_bar"] for own in healthy if "pressure_bar" in own.about],
+        "deg C": [own.about["oil_degC"] for own in healthy if "oil_degC" in own.about],
+    }
     texts = []
-    for values, unit in (
-        ([flow for flow in flows if flow > 0.0], "L/min"),
-        (pressures, "bar between the chambers"),
-        (oils, "deg C"),
-    ):
-        ends = dict.fromkeys(f"{end:.3g}" for end in (min(values), max(values))) if values else ()
-        texts += [f"{' to '.join(ends)} {unit}"] if ends else []
+    for unit, values in ranges.items():
+        if values:
+            ends = dict.fromkeys(f"{end:.3g}" for end in (min(values), max(values)))
+            texts.append(f"{' to '.join(ends)} {unit}")
     return ", ".join(texts)
 
 

@@ -49,17 +49,6 @@ _SAVED = tuple(f"_{name}" for name in ("level", "spread", "total", "weight", "wi
                                        "known", "blocks", "last"))  # fmt: skip
 
 
-def probability_of(rate: float, hours: float, seconds: float, name: str) -> float:
-    """Return the probability of a false alarm of a look every `seconds`, at a `rate` of alarms in so many hours.
-
-    `name`: of the rate, in the InputError that is raised where no threshold can be set for it.
-    """
-    looks, (least, most) = hours * 3600.0 / seconds, (1e-12, 0.05)
-    if not least * looks <= rate <= most * looks:
-        raise InputError(f"{name} must be {least * looks:.2g} to {most * looks:.3g}, got {rate:g}")
-    return rate / looks
-
-
 class Rise(NamedTuple):
     """A rise of a coefficient that a `test` shows, by a `score` over a `threshold` for a `reason`.
 

@@ -17,7 +17,7 @@ from sealscope.diagnosis.live.balance import LEARNED, BlockConductance, LiveBala
 from sealscope.diagnosis.live.estimates import BaselineLearning, BlockEstimate, WatchBaseline, WatchedLeak, within
 from sealscope.diagnosis.live.joining import SampleJoiner
 from sealscope.diagnosis.live.pressures import PressureEstimator
-from sealscope.diagnosis.live.sequential import RECENT, Rise, StepDetector, probability_of
+from sealscope.diagnosis.live.sequential import RECENT, Rise, StepDetector
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
@@ -32,6 +32,8 @@ STATE_VERSION = 10
 _BELIEVED = beliefs("live")["watch"]
 #: Blocks of one mean that is compared with the baseline, and of the mean that is the leak after an alarm.
 GROUP, _RECENT = _BELIEVED["group"], _BELIEVED["recent"]
+#: What a watched leak and the evidence of it call alike.
+_FIGURES = ("score", "threshold", "onset_s", "onset_interval_s", "leak_lpm", "leak_interval_lpm")
 #: Ways of watching, each a stream of conductances.
 _KINDS: dict[str, type[LiveBalance | PressureEstimator]] = {of.method: of for of in (LiveBalance, PressureEstimator)}
 
@@ -90,9 +92,16 @@ class Watch:
         self._last, self._group = np.empty((0, 6)), np.empty((0, 4))
 
     def _probability(self, test: str, seconds: float) -> float:
-        """Return the probability of a false alarm of one look of a test, with so many seconds between looks."""
-        hours = 1000.0 / _BELIEVED[test]
-        return probability_of(self.false_alarms_per_1000_h, hours, seconds, "false_alarms_per_1000_h")
+        """Return the probability of a false alarm of one look of a test, with so many seconds between looks.
+
+        Raises InputError where no threshold can be set for it.
+        """
+        rate: float = self.false_alarms_per_1000_h
+        looks: float = 1000.0 / _BELIEVED[test] * 3600.0 / seconds
+        least, most = 1e-12 * looks, 0.05 * looks
+        if not least <= rate <= most:
+            raise InputError(f"false_alarms_per_1000_h must be {least:.2g} to {most:.3g}, got {rate:g}")
+        return rate / looks
 
     @cached_property
     def _rig_text(self) -> str:
@@ -118,17 +127,9 @@ class Watch:
         """Verdict of now, with the leak that the tests show, else with the 95 % bound of one that they do not."""
         leak, own = self.leak, self._estimator
         if leak is not None:
-            return Evidence(
-                "leak",
-                leak.reason,
-                score=leak.score,
-                threshold=leak.threshold,
-                onset_s=leak.onset_s,
-                onset_interval_s=leak.onset_interval_s,
-                leak_lpm=leak.leak_lpm,
-                leak_interval_lpm=leak.leak_interval_lpm,
-                cause=None if leak.cause == PressureEstimator.cause else leak.cause,  # type: ignore[arg-type]
-            )
+            figures: dict[str, Any] = {name: getattr(leak, name) for name in _FIGURES}
+            cause: Any = None if leak.cause == PressureEstimator.cause else leak.cause
+            return Evidence("leak", leak.reason, cause=cause, **figures)
         bound = self._detector.bound() if own is not None and len(self._last) else math.inf
         if own is None or not math.isfinite(bound):
             why = f": {', '.join(self.counters)}" if self.counters else ""
@@ -171,9 +172,7 @@ class Watch:
             if self._estimator is not None:
                 self._estimator.interrupt()
         for t, channels in self._samples.runs(samples):
-            if (
-                self._estimator is None or self._estimator.method != self.method
-            ):  # a position came with the second piece
+            if self._estimator is None or self._estimator.method != self.method:  # a position came later
                 self._estimator = self._estimator_by()
             with np.errstate(all="ignore"):  # a block whose sums overflow says nothing
                 every = self._estimator.take(t, channels, self._samples.rate)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
 from sealscope.diagnosis.beliefs import beliefs
@@ -186,15 +186,3 @@ class Evidence:
             return "more than 1 in 5 healthy recordings look like this"
         times = f"{float(f'{1.0 / self.stated_chance:.2g}'):,.0f}".replace(",", " ")
         return f"{'fewer than ' if self.stated_chance == RAREST else ''}1 in {times} healthy recordings looks like this"
-
-
-def without_flow(evidence: Evidence, why: str) -> Evidence:
-    """Return the evidence without L/min, which is refused, and with the reason for that."""
-    return replace(
-        evidence,
-        reason=f"{evidence.reason}; {why}",
-        leak_lpm=None,
-        leak_interval_lpm=None,
-        course=None,
-        refuses=evidence.refuses | {"leak_lpm"},
-    )
