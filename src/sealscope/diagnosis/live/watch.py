@@ -13,7 +13,7 @@ import numpy as np
 
 from sealscope.calls import checked_call
 from sealscope.diagnosis.beliefs import beliefs
-from sealscope.diagnosis.live.balance import LEARNED, BlockConductance, LiveBalance, NotJudged, Shown
+from sealscope.diagnosis.live.balance import LEARNED, BlockConductance, LiveBalance, NotJudged
 from sealscope.diagnosis.live.estimates import BaselineLearning, BlockEstimate, WatchBaseline, WatchedLeak, within
 from sealscope.diagnosis.live.joining import SampleJoiner
 from sealscope.diagnosis.live.pressures import PressureEstimator
@@ -35,7 +35,9 @@ GROUP, _RECENT = _BELIEVED["group"], _BELIEVED["recent"]
 #: What a watched leak and the evidence of it call alike.
 _FIGURES = ("score", "threshold", "onset_s", "onset_interval_s", "leak_lpm", "leak_interval_lpm")
 #: Ways of watching, each a stream of conductances.
-_KINDS: dict[str, type[LiveBalance | PressureEstimator]] = {of.method: of for of in (LiveBalance, PressureEstimator)}
+Estimator = LiveBalance | PressureEstimator
+_WithInterval = tuple[float, float, float]
+_KINDS: dict[str, type[Estimator]] = {of.method: of for of in (LiveBalance, PressureEstimator)}
 
 
 class Watch:
@@ -82,7 +84,7 @@ class Watch:
         self._rig = rig
         self._litres = {by: kind.states_flow(rig) for by, kind in _KINDS.items()} if litres is None else litres
         self._samples = SampleJoiner(valved=rig.valve.spool == "present")
-        self._estimator: LiveBalance | PressureEstimator | None = None
+        self._estimator: Estimator | None = None
         self.baseline: WatchBaseline | None = None
         self.leak: WatchedLeak | None = None
         self.blocks, self.baseline_version = 0, 1
@@ -178,12 +180,21 @@ class Watch:
                 every = self._estimator.take(t, channels, self._samples.rate)
             self._samples.settled = self._estimator.begun
             for shown in every:
-                if isinstance(shown, NotJudged) and not shown.status:
+                if not isinstance(shown, NotJudged):
+                    self.blocks += 1
+                    for block in shown:
+                        estimate = self._judge(self._estimator, block)
+                    yield estimate, self.leak
+                    continue
+                if shown.apart:
+                    self._forget()
+                if shown.counted:
                     self._samples.count(shown.counted)
-                else:
-                    yield self.judged(shown), self.leak
+                if shown.status:
+                    self.blocks += 1
+                    yield BlockEstimate(self.blocks, shown.end, shown.status), self.leak
 
-    def _estimator_by(self) -> LiveBalance | PressureEstimator:
+    def _estimator_by(self) -> Estimator:
         return _KINDS[self.method](self._rig, self._samples.names, self._litres.get(self.method, False))
 
     def continue_from(self, blocks: int, baseline_version: int) -> None:
@@ -207,21 +218,8 @@ class Watch:
         self._detector.forget()
         self._last, self._group = self._last[:0], self._group[:0]
 
-    def judged(self, shown: Shown) -> BlockEstimate:
-        """Return the estimate of a block, from what is shown of it."""
-        self.blocks += 1
-        if isinstance(shown, NotJudged):
-            if shown.apart:
-                self._forget()
-            if shown.counted:
-                self._samples.count(shown.counted)
-            return BlockEstimate(self.blocks, shown.end, shown.status)
-        for block in shown:
-            estimate = self._judge(block)
-        return estimate
-
-    def _judge(self, block: BlockConductance) -> BlockEstimate:
-        assert self._estimator is not None
+    def _judge(self, own: Estimator, block: BlockConductance) -> BlockEstimate:
+        """Test a block by all that came before, and return its estimate."""
         if self.baseline is not None and not within(block.duty, self.baseline.duty_low, self.baseline.duty_high):
             self._samples.count("blocks: another duty")
             return BlockEstimate(self.blocks, block.end, "another duty")
@@ -230,21 +228,20 @@ class Watch:
         self._detector.take(block.begin, block.end, block.g, block.sd)
         row = block.end, block.g, block.sd, block.flow, *block.duty
         self._last = np.vstack([self._last[1 - RECENT :], row])
-        self._test_step(block)
-        self._test_level(block)
+        self._test_step(own, block)
+        self._test_level(own, block)
         if self.baseline is None and self.leak is None:
             self._learning.add(block.g, block.flow, block.duty, GROUP)
             hours = self._learning.blocks * self.block_seconds / 3600.0
             if self._learning.blocks >= LEARNED and hours >= self.learn_hours * (1.0 - 1e-12):
-                litres = self._estimator.litres and self._estimator.levels
-                self.baseline = self._learning.frozen(self.baseline_version, block.end, hours, litres)
+                self.baseline = self._learning.frozen(
+                    self.baseline_version, block.end, hours, own.litres and own.levels
+                )
                 self._learning = BaselineLearning()
         status = "alarm" if self.leak is not None else "learning" if self.baseline is None else "watched"
-        if not self._estimator.litres:
-            return BlockEstimate(self.blocks, block.end, status)
-        return self._estimate(self._estimator, status, block)
+        return self._estimate(own, status, block) if own.litres else BlockEstimate(self.blocks, block.end, status)
 
-    def _test_step(self, block: BlockConductance) -> None:
+    def _test_step(self, own: Estimator, block: BlockConductance) -> None:
         """Test for a step; an alarm that stands is stated anew while more blocks sharpen it."""
         leak = self.leak
         if leak is not None and (leak.test != "step" or block.end - leak.raised_s > RECENT * self.block_seconds):
@@ -254,7 +251,7 @@ class Watch:
         if not self._detector.log_e(least) > least:
             return
         rise = self._detector.rise()
-        if leak is None and self._other_duty(rise.onset[0], rise.size):
+        if leak is None and self._other_duty(own, rise):
             self._samples.count("blocks not compared: changed duty")
             self._forget()
             return
@@ -262,22 +259,21 @@ class Watch:
             f"the leakage conductance rises at {rise.onset[0]:.0f} s beyond its random walk (score {rise.score:.1f}, "
             f"threshold {2.0 * threshold:.1f})"
         )
-        self._raise(rise._replace(threshold=2.0 * threshold, reason=reason), block)
+        self._raise(own, rise._replace(threshold=2.0 * threshold, reason=reason), block)
 
-    def _other_duty(self, onset: float, size: float) -> bool:
+    def _other_duty(self, own: Estimator, rise: Rise) -> bool:
         """Return whether the duty changed with a rise, beyond what it was before and what a leak makes of it."""
-        assert self._estimator is not None
         ends, *_, pressure, motion = self._last.T
-        after = ends > onset
+        after = ends > rise.onset[0]
         if np.count_nonzero(~after) < _RECENT or not after.any():
             return False
         low, high = ((float(f(pressure[~after])), float(f(motion[~after]))) for f in (np.min, np.max))
         now = float(np.median(pressure[after])), float(np.median(motion[after]))
-        lost = 1.0 - size * math.exp(now[0] - now[1]) if self._estimator.levels else 1.0
+        lost = 1.0 - rise.size * math.exp(now[0] - now[1]) if own.levels else 1.0
         net = now[0], now[1] + math.log(max(lost, np.finfo(float).tiny))  # the pump may give what leaks
         return not (within(now, low, high) or within(net, low, high))
 
-    def _test_level(self, block: BlockConductance) -> None:
+    def _test_level(self, own: Estimator, block: BlockConductance) -> None:
         """Gather blocks to means, and compare these with the baseline."""
         self._group = np.vstack([self._group, (block.end, block.g, block.sd, block.offset)])
         if len(self._group) < GROUP:
@@ -291,11 +287,10 @@ class Watch:
         deviation = math.hypot(sd, offset * (beliefs("inference")["oil"]["warmest"] - 1.0))
         rise = self.baseline.rise(at, g, deviation, self._probability("level", GROUP * self.block_seconds))
         if rise is not None:
-            self._raise(rise, block, self.baseline.level)
+            self._raise(own, rise, block, self.baseline.level)
 
-    def _raise(self, rise: Rise, block: BlockConductance, before: float | None = None) -> None:
-        assert self._estimator is not None
-        own, leak, (onset, *ends) = self._estimator, self.leak, rise.onset
+    def _raise(self, own: Estimator, rise: Rise, block: BlockConductance, before: float | None = None) -> None:
+        leak, (onset, *ends) = self.leak, rise.onset
         if before is None:
             earlier = self._last[self._last[:, 0] <= ends[0], 1][-GROUP:]
             known = float(np.mean(earlier)) if earlier.size else block.g - rise.size
@@ -317,7 +312,7 @@ class Watch:
             threshold=rise.threshold,
         )
 
-    def _estimate(self, own: LiveBalance | PressureEstimator, status: str, block: BlockConductance) -> BlockEstimate:
+    def _estimate(self, own: Estimator, status: str, block: BlockConductance) -> BlockEstimate:
         """Return the block's estimate: total flow, and flow beyond the baseline's, or since the onset of the leak."""
         flow, sd = block.flow, block.sd * math.sqrt(self._detector.noise)
         total = total_interval = leak = leak_interval = beyond = None
@@ -335,9 +330,7 @@ class Watch:
             leak_interval = max(0.0, low), own.orifice * max(0.0, high)
         return BlockEstimate(self.blocks, block.end, status, total, total_interval, leak, leak_interval)
 
-    def _beyond_leak(
-        self, leak: WatchedLeak, own: LiveBalance | PressureEstimator, block: BlockConductance, sd: float
-    ) -> tuple[float, float, float]:
+    def _beyond_leak(self, leak: WatchedLeak, own: Estimator, block: BlockConductance, sd: float) -> _WithInterval:
         """Return the conductance since the onset of a leak, and its interval, in which the oil may have warmed."""
         recent = self._last[self._last[:, 0] - self.block_seconds >= leak.onset_interval_s[1], 1][-_RECENT:]
         now, oil = float(np.mean(recent)) if recent.size else block.g, beliefs("inference")["oil"]
