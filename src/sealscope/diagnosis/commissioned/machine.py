@@ -314,8 +314,7 @@ def commission(
     RepairLimit.of(limit)
     known = None if rig is None else load_rig(rig)
     channel_map = map if map is not None else {} if known is None else known.channel_map
-    machine = CommissionedMachine(name, (), known, channel_map, rate, limit)
-    problems: list[str] = []
+    machine, problems = CommissionedMachine(name, (), known, channel_map, rate, limit), list[str]()
     for path in recordings_in(paths):
         try:
             machine = machine._with(machine.read(path), path.name, checksum_of(path))

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, create_model
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PositiveFloat, create_model
 
 from sealscope.calls import checked_call
 from sealscope.diagnosis.commissioned.machine import CommissionedMachine, JudgedAlarm
@@ -58,7 +58,6 @@ def _numbers(values: list[Any]) -> np.ndarray:
 
 
 _Moment = Annotated[float, BeforeValidator(_moment)]
-_Positive = Annotated[float, Field(gt=0)]
 _Numbers = Annotated[Any, AfterValidator(_numbers)]
 
 
@@ -108,8 +107,8 @@ _HEALTHY = _table(
     file=str,
     digest=str,
     units=dict[str, str],
-    rate=_Positive,
-    seconds=_Positive,
+    rate=PositiveFloat,
+    seconds=PositiveFloat,
     start_s=(Annotated[_Moment, Field(alias="start")], None),
     lessons=_table("allow", **_LESSONS),
     about=(_table("allow", **{name: (kind, None) for name, kind in _ABOUT.items()}), None),

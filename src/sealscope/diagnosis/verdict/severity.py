@@ -104,20 +104,16 @@ def severity(evidence: Evidence, limit: RepairLimit, *, trusts_position: bool = 
 
     `trusts_position`: a speed of the piston is stated; not where the geometry as measured contradicts the stated one.
     """
-    relative = evidence.relative
-    if evidence.verdict != "leak" or (evidence.leak_lpm is None and relative is None):
+    if evidence.verdict != "leak" or (evidence.leak_lpm is None and evidence.relative is None):
         return None
+    relative = evidence.relative or RelativeLeak()
     flow = _figure(evidence.leak_lpm, evidence.leak_interval_lpm, LITRE_PER_MINUTE)
-    creep = share = None
-    if relative is not None:
-        share = _figure(relative.pump_share, relative.pump_share_interval)
-        creep = _figure(relative.creep, relative.creep_interval) if trusts_position else None
-    against = flow if limit.kind == "flow" else creep
+    creep = _figure(relative.creep, relative.creep_interval) if trusts_position else None
     return Severity(
         mL_per_min=_over(flow, ML_PER_MINUTE),
-        pump_share=share,
+        pump_share=_figure(relative.pump_share, relative.pump_share_interval),
         creep_mm_per_min=_over(creep, MM_PER_MINUTE),
-        of_limit=_over(against, limit.value),
+        of_limit=_over(flow if limit.kind == "flow" else creep, limit.value),
     )
 
 
