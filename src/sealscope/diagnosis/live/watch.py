@@ -13,7 +13,7 @@ import numpy as np
 
 from sealscope.calls import checked_call
 from sealscope.diagnosis.beliefs import beliefs
-from sealscope.diagnosis.live.balance import LEARNED, BlockConductance, LiveBalance, NotJudged
+from sealscope.diagnosis.live.balance import LEARNED, BlockConductance, LiveBalance, NotJudged, Shown
 from sealscope.diagnosis.live.estimates import BaselineLearning, BlockEstimate, WatchBaseline, WatchedLeak, within
 from sealscope.diagnosis.live.joining import SampleJoiner
 from sealscope.diagnosis.live.pressures import PressureEstimator
@@ -180,19 +180,10 @@ class Watch:
                 every = self._estimator.take(t, channels, self._samples.rate)
             self._samples.settled = self._estimator.begun
             for shown in every:
-                if not isinstance(shown, NotJudged):
-                    self.blocks += 1
-                    for block in shown:
-                        estimate = self._judge(self._estimator, block)
-                    yield estimate, self.leak
-                    continue
-                if shown.apart:
-                    self._forget()
-                if shown.counted:
+                if isinstance(shown, NotJudged) and not shown.status:
                     self._samples.count(shown.counted)
-                if shown.status:
-                    self.blocks += 1
-                    yield BlockEstimate(self.blocks, shown.end, shown.status), self.leak
+                else:
+                    yield self.judged(shown), self.leak
 
     def _estimator_by(self) -> Estimator:
         return _KINDS[self.method](self._rig, self._samples.names, self._litres.get(self.method, False))
@@ -217,6 +208,20 @@ class Watch:
     def _forget(self) -> None:
         self._detector.forget()
         self._last, self._group = self._last[:0], self._group[:0]
+
+    def judged(self, shown: Shown) -> BlockEstimate:
+        """Return the estimate of a block, from what is shown of it."""
+        self.blocks += 1
+        if isinstance(shown, NotJudged):
+            if shown.apart:
+                self._forget()
+            if shown.counted:
+                self._samples.count(shown.counted)
+            return BlockEstimate(self.blocks, shown.end, shown.status)
+        assert self._estimator is not None
+        for block in shown:
+            estimate = self._judge(self._estimator, block)
+        return estimate
 
     def _judge(self, own: Estimator, block: BlockConductance) -> BlockEstimate:
         """Test a block by all that came before, and return its estimate."""

@@ -17,6 +17,7 @@ from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.inference.pressures.detector import PressureResponse
 from sealscope.diagnosis.inspection import inspected
 from sealscope.diagnosis.rms_change.blocks import JUDGED, QUANTITIES, whole
+from sealscope.diagnosis.trend.wear import DayToDay
 from sealscope.diagnosis.verdict.machine import AssumedMachine, assumed_rig
 from sealscope.errors import InputError
 from sealscope.parameters import Rig
@@ -112,6 +113,15 @@ def _stated(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[str, Any
         return {"basis": BASES[2], "level": ringing, "error": beliefs("trend")["own"]["ringing"]}
     why = dict.fromkeys(reason for reason in (lack, lacks) if reason) or ["the pressures do not ring"]
     return {"problem": "no detector states a level: " + "; ".join(why)}
+
+
+def scatter_of(basis: Basis, usual: float) -> DayToDay:
+    """Return the prior on the scatter of a level between recordings, for a machine of that usual level."""
+    believed = beliefs("trend")["between"]
+    if basis == "pressure response":
+        return DayToDay(beliefs("inference.pressures")["conductance"]["level"], believed["freedom"])
+    size = abs(usual) if basis == "volume balance" else 1.0
+    return DayToDay(max(believed[basis] * size, float(np.finfo(float).tiny)), believed["freedom"])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,8 +13,16 @@ import numpy as np
 from sealscope.calls import checked_call
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Interval
-from sealscope.diagnosis.trend.reading import Basis, LeakReading, TrendPoint, findings_of, reading_of, timeline
-from sealscope.diagnosis.trend.wear import DayToDay, Episode, Levels, Wear, beyond, episodes
+from sealscope.diagnosis.trend.reading import (
+    Basis,
+    LeakReading,
+    TrendPoint,
+    findings_of,
+    reading_of,
+    scatter_of,
+    timeline,
+)
+from sealscope.diagnosis.trend.wear import Episode, Levels, Wear, beyond, episodes
 from sealscope.diagnosis.verdict.evidence import Verdict
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.severity import RepairLimit
@@ -299,12 +307,7 @@ def _levels(trend: Trend) -> tuple[Levels, float | None]:
         np.array([getattr(own, name) for own in kept]) for name in ("day", "group", "level", "error")
     )
     usual, pressure = float(np.mean(value[: trend.healthy])), float(np.median([own.pressure for own in kept]))
-    least, between = float(np.finfo(float).tiny), beliefs("trend")["between"]
-    scatter = between["ringing"]
-    if trend.basis == "volume balance":
-        scatter = max(between["volume balance"] * abs(usual), least)
-    elif trend.basis == "pressure response":
-        scatter = beliefs("inference.pressures")["conductance"]["level"]
+    prior = scatter_of(trend.basis or "ringing", usual)
     warmer, slope_sd = np.zeros(t.size), 0.0
     temperatures = [own.temperature for own in kept if own.temperature is not None]
     if trend.basis != "ringing" and len(temperatures) == t.size:
@@ -312,7 +315,7 @@ def _levels(trend: Trend) -> tuple[Levels, float | None]:
         warmer, slope_sd = np.array(temperatures) - temperatures[0], deviation * abs(usual)
         value, error = (own * np.exp(-slope * warmer) for own in (value, error))
     flows = trend.pressure is not None
-    unit = pressure / LITRE_PER_MINUTE if flows else 100.0 / max(abs(usual), least)
+    unit = pressure / LITRE_PER_MINUTE if flows else 100.0 / max(abs(usual), float(np.finfo(float).tiny))
     if trend.basis == "ringing":
         unit, value = 100.0, value - usual
     allowed = None
@@ -320,7 +323,7 @@ def _levels(trend: Trend) -> tuple[Levels, float | None]:
         allowed = trend.repair.value / LITRE_PER_MINUTE
     elif trend.repair.kind == "creep" and kept[0].area is not None:
         allowed = trend.repair.value * kept[0].area / pressure * unit
-    prior = DayToDay(scatter * unit, between["freedom"])
+    prior = prior._replace(scale=prior.scale * unit)
     return Levels(t, value * unit, error * unit, group, warmer, prior, slope_sd * unit), allowed
 
 
