@@ -209,17 +209,16 @@ def _lines(tree: Mapping[str, Any], path: str = "", head: str = "") -> list[str]
     lines, within = list[str](), list[str]()
     for name, value in tree.items():
         place = f"{path}.{_key(name)}" if path else _key(name)
-        if isinstance(value, Mapping) and not (path and _is_figures(value)):
+        figures = isinstance(value, Mapping) and all(
+            isinstance(own, str | float | int | None) for own in value.values()
+        )
+        if isinstance(value, Mapping) and not (path and value and figures):
             within += _lines(value, place, f"[{place}]")
         elif isinstance(value, list) and not path:
             within += [line for row in value for line in _lines(row, place, f"[[{place}]]")]
         elif value is not None:
             lines.append(f"{_key(name)} = {_value(value)}")
     return [*(["", head, *lines] if lines else []), *within]
-
-
-def _is_figures(table: Mapping[str, Any]) -> bool:
-    return bool(table) and all(isinstance(value, str | float | int | None) for value in table.values())
 
 
 def _key(name: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -249,10 +249,15 @@ def trend(
         raise InputError(f"every must be > 0 s, got {every!r}")
     readings = [own if isinstance(own, LeakReading) else reading_of(own, rig) for own in recordings]
     points, apart = timeline(readings, every)
+    return _judged(points, apart, repair=RepairLimit.of(limit), years=years, healthy=healthy, dated=every is None)
+
+
+def _judged(points: Sequence[TrendPoint], apart: tuple[str, ...], **stated: Any) -> Trend:
+    """Return the trend of readings in the order of their times; `stated`: what the caller states of it."""
     rows = tuple(k for k, point in enumerate(points) if point.group >= 0)
     kept = [points[k] for k in rows]
     flows = bool(kept) and all(own.states_flow for own in kept)
-    stated = Trend(
+    trend = Trend(
         verdict="cannot tell",
         reason="",
         basis=kept[0].basis if kept else None,
@@ -262,17 +267,14 @@ def trend(
         groups=apart,
         episodes=(),
         rows=rows,
-        repair=RepairLimit.of(limit),
         machine=points[0].machine if points else None,
         findings=tuple(findings_of(points, apart)),
-        years=years,
-        healthy=healthy,
-        dated=every is None,
+        **stated,
     )
     if kept:
-        stated = _with_levels(stated)
-    verdict, reason = _verdict(stated)
-    return replace(stated, verdict=verdict, reason=reason)
+        trend = _with_levels(trend)
+    verdict, reason = _verdict(trend)
+    return replace(trend, verdict=verdict, reason=reason)
 
 
 def _with_levels(trend: Trend) -> Trend:
