@@ -32,14 +32,14 @@ from typing import Any
 import numpy as np
 
 from sealscope.diagnosis.trend.reading import reading_of, scatter_of
-from sealscope.diagnosis.trend.wear import MONTH, DayToDay, Levels, episodes, search
+from sealscope.diagnosis.trend.wear import Levels, episodes, search
 from sealscope.evaluation.binomial import clopper_pearson
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Array, Recording
 from sealscope.simulation.bench.machines import BenchMachine, draw
 from sealscope.simulation.leaks import Leak
 from sealscope.simulation.simulate import simulate_with_truth
-from sealscope.units import LITRE_PER_MINUTE
+from sealscope.units import DAYS_PER_MONTH, DAYS_PER_YEAR, LITRE_PER_MINUTE
 
 HEALTHY_DAYS, WORN_DAYS, SECONDS, YEARS = 20, 84, 120.0, 10.0
 WEAR = 0.002
@@ -105,7 +105,7 @@ def simulate(folder: Path, machines: int, pressures_of: int, seconds: float) -> 
             if worn and math.isnan(slope):
                 first = recording_of(seed, 0, float(warm[0]), 0.0)
                 pressure = float(np.mean(np.abs(first["p_A"] - first["p_B"])))
-                slope = WEAR * LITRE_PER_MINUTE / pressure / MONTH
+                slope = WEAR * LITRE_PER_MINUTE / pressure / DAYS_PER_MONTH
             recording = recording_of(seed, day, float(warm[day]), worn * slope if worn else 0.0)
             with path.open("a", encoding="utf-8") as file:
                 for view in wanted:
@@ -116,8 +116,8 @@ def simulate(folder: Path, machines: int, pressures_of: int, seconds: float) -> 
                         "day": day,
                         "view": view,
                         "basis": own.basis,
-                        "value": own.level.value if math.isfinite(own.level.value) else None,
-                        "error": own.level.error if math.isfinite(own.level.error) else None,
+                        "value": own.level if math.isfinite(own.level) else None,
+                        "error": own.error if math.isfinite(own.error) else None,
                         "pressure": own.pressure,
                     }
                     file.write(json.dumps(row) + "\n")
@@ -143,30 +143,25 @@ def machines_of(folder: Path, view: str) -> list[list[dict[str, Any]]]:
     return [[own[day] for day in sorted(own)] for own in whole]
 
 
-def levels_at(t: Array, value: Array, error: Array | float) -> Levels:
-    """Return levels of recordings that can all be compared."""
-    zeros = np.zeros(len(t))
-    return Levels(t, value, zeros + error, zeros.astype(np.int64), zeros)
+def levels_at(t: Array, value: Array, error: Array | float, basis: str, healthy_days: int, unit: float) -> Levels:
+    """Return levels of recordings that can all be compared, with the prior as `sealscope trend` sets it."""
+    zeros, own = np.zeros(len(t)), scatter_of(basis, float(np.mean(value[:healthy_days])) / unit)  # type: ignore[arg-type]
+    prior = own._replace(scale=own.scale * unit)
+    return Levels(t, value, zeros + error, zeros.astype(np.int64), zeros, prior)
 
 
-def levels_of(days: Sequence[dict[str, Any]], basis: str) -> tuple[Levels, float]:
+def levels_of(days: Sequence[dict[str, Any]], basis: str, healthy_days: int = HEALTHY_DAYS) -> tuple[Levels, float]:
     """Return the levels in L/min that the detector states, and the pressure for which."""
     kept = [row for row in days if row["basis"] == basis]
     pressure = float(np.median([row["pressure"] for row in kept]))
     unit = pressure / LITRE_PER_MINUTE
     t, value, error = (np.array([row[name] for row in kept], dtype=float) for name in ("day", "value", "error"))
-    return levels_at(t, value * unit, error * unit), unit
+    return levels_at(t, value * unit, error * unit, basis, healthy_days, unit), unit
 
 
-def prior_of(basis: str, levels: Levels, healthy_days: int, unit: float) -> DayToDay:
-    """Return the prior as `sealscope trend` sets it."""
-    own = scatter_of(basis, float(np.mean(levels.value[:healthy_days])) / unit)  # type: ignore[arg-type]
-    return own._replace(scale=own.scale * unit)
-
-
-def first_alarm(levels: Levels, prior: DayToDay, healthy_days: int) -> float | None:
+def first_alarm(levels: Levels, healthy_days: int) -> float | None:
     """Return the day of the first alarm when each day was the last one, None where there is none."""
-    alarm = search(levels, prior, healthy_days).alarm(YEARS * 365.25)
+    alarm = search(levels, healthy_days).alarm(YEARS * DAYS_PER_YEAR)
     return None if alarm is None else float(levels.t[alarm])
 
 
@@ -182,8 +177,8 @@ def delays(folder: Path) -> None:
         for healthy_days in HEALTHY_COUNTS if machines else ():
             waits, early, silent = [], 0, 0
             for days in machines:
-                levels, unit = levels_of(days[HEALTHY_DAYS - healthy_days :], basis)
-                alarm = first_alarm(levels, prior_of(basis, levels, healthy_days, unit), healthy_days)
+                levels, _ = levels_of(days[HEALTHY_DAYS - healthy_days :], basis, healthy_days)
+                alarm = first_alarm(levels, healthy_days)
                 if alarm is None:
                     silent += 1
                 elif alarm < HEALTHY_DAYS:
@@ -193,7 +188,7 @@ def delays(folder: Path) -> None:
             n = len(machines)
             quantiles = np.quantile([*waits, *[np.inf] * silent], [0.5, 0.05, 0.95], method="inverted_cdf")
             shown = [f"{q:.0f}" if math.isfinite(q) else "never" for q in quantiles]
-            flows = [f"{q * WEAR / MONTH:.4f}" if math.isfinite(q) else "never" for q in quantiles]
+            flows = [f"{q * WEAR / DAYS_PER_MONTH:.4f}" if math.isfinite(q) else "never" for q in quantiles]
             print(
                 f"| {view} | {healthy_days} | {n} | {len(waits)} | {early} | {shown[0]} ({shown[1]} to {shown[2]}) | "
                 f"{flows[0]} ({flows[1]} to {flows[2]}) |"
@@ -233,13 +228,12 @@ def false_alarms(folder: Path, years: int) -> None:
                 noise = random.standard_normal(365)
                 for k in range(1, noise.size):
                     noise[k] = lasts * noise[k - 1] + math.sqrt(1.0 - lasts**2) * noise[k]
-                levels = levels_at(np.arange(365.0), mean + scatter * noise, error)
-                prior = prior_of(basis, levels, healthy_days, unit)
+                levels = levels_at(np.arange(365.0), mean + scatter * noise, error, basis, healthy_days, unit)
                 few = levels.merged()
                 known = max(1, round(healthy_days * len(few) / len(levels)))
                 begin = 0
                 while begin < len(few) - 1:  # an alarm is looked into, and the series goes on
-                    alarm = search(few.part(slice(begin, None)), prior, known).alarm(YEARS * 365.25)
+                    alarm = search(few.part(slice(begin, None)), known).alarm(YEARS * DAYS_PER_YEAR)
                     if alarm is None:
                         break
                     alarms, begin = alarms + 1, begin + alarm + 1
@@ -258,8 +252,8 @@ def growths(folder: Path) -> None:
     for view, basis in VIEWS.items():
         values, held, count = [], 0, 0
         for days in machines_of(folder, view):
-            levels, unit = levels_of(days, basis)
-            own = episodes(levels, prior_of(basis, levels, HEALTHY_DAYS, unit), years=YEARS, known=HEALTHY_DAYS)[-1]
+            levels, _ = levels_of(days, basis)
+            own = episodes(levels, years=YEARS, known=HEALTHY_DAYS)[-1]
             count += 1
             if own.alarm is not None:
                 values.append(own.wear.growth.value)

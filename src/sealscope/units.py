@@ -24,9 +24,17 @@ from numpy.typing import ArrayLike, NDArray
 from sealscope.errors import InputError
 
 Array = NDArray[np.float64]
-#: One litre per minute [m^3/s], one pound-force per square inch [Pa].
+#: One litre and one millilitre per minute [m^3/s], one millimetre per minute [m/s], one bar and one pound-force per
+#: square inch [Pa].
 LITRE_PER_MINUTE = 1e-3 / 60.0
+ML_PER_MINUTE = 1e-3 * LITRE_PER_MINUTE
+MM_PER_MINUTE = 1e-3 / 60.0
+BAR = 1e5
 PSI = 0.45359237 * 9.80665 / 0.0254**2
+#: Seconds of a day, days of a Julian year and of a twelfth of it.
+DAY = 86_400.0
+DAYS_PER_YEAR = 365.25
+DAYS_PER_MONTH = DAYS_PER_YEAR / 12.0
 _Powers = tuple[tuple[str, Fraction], ...]
 _Conversion = tuple[Fraction, float, Fraction, Fraction]
 

@@ -18,15 +18,14 @@ from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.trend.reading import LeakReading, reading_of
 from sealscope.diagnosis.trend.trend import Trend
 from sealscope.diagnosis.trend.trend import trend as trend_of
-from sealscope.diagnosis.trend.wear import MONTH, DayToDay, Level, Levels, beyond, search
+from sealscope.diagnosis.trend.wear import DayToDay, Levels, beyond, search
 from sealscope.errors import InputError
 from sealscope.recordings.oil import oil_temperature
-from sealscope.units import LITRE_PER_MINUTE
+from sealscope.units import DAY, DAYS_PER_MONTH, LITRE_PER_MINUTE
 
 PRIOR = DayToDay(1.0, 4.0)
 #: 0.0044 L/min at 0.11 MPa.
 HEALTHY, PRESSURE = 6.7e-13, 1.1e5
-DAY = 86_400.0
 
 
 def reading(day: float, level: float = HEALTHY, *, number: int | None = None, **more: object) -> LeakReading:
@@ -37,7 +36,8 @@ def reading(day: float, level: float = HEALTHY, *, number: int | None = None, **
         "start": 1.704e9 + day * DAY,
         "duration": 60.0,
         "basis": "volume balance",
-        "level": Level(level, 0.02 * HEALTHY),
+        "level": level,
+        "error": 0.02 * HEALTHY,
         "pressure": PRESSURE,
         "states_flow": True,
         "area": 633e-6,
@@ -54,7 +54,7 @@ def life(
 ) -> list[LeakReading]:
     """One recording a day; `wears` L/min a month from day `since` on."""
     random = np.random.default_rng(seed)
-    growth = wears * LITRE_PER_MINUTE / PRESSURE / MONTH
+    growth = wears * LITRE_PER_MINUTE / PRESSURE / DAYS_PER_MONTH
     return [
         reading(day, HEALTHY * (1.0 + scatter * random.standard_normal()) + growth * max(day - since, 0.0))
         for day in range(days)
@@ -63,7 +63,7 @@ def life(
 
 def levels_at(t: np.ndarray, value: np.ndarray, error: np.ndarray | float) -> Levels:
     zeros = np.zeros(len(t))
-    return Levels(t, value, zeros + error, zeros.astype(int), zeros)
+    return Levels(t, value, zeros + error, zeros.astype(int), zeros, PRIOR)
 
 
 def flow(level: float) -> float:
@@ -108,15 +108,15 @@ def test_the_statistic_is_the_ratio_of_the_likelihoods(monkeypatch: pytest.Monke
     monkeypatch.setitem(beliefs("trend")["between"], "nodes", 3)  # type: ignore[arg-type]
     monkeypatch.setitem(beliefs("trend")["between"], "lasts", [0.5])  # type: ignore[arg-type]
     levels = levels_at(np.array([0.0, 1.0, 3.0, 4.0]), np.array([5.0, 5.5, 6.2, 6.9]), np.array([0.1, 0.5, 0.2, 0.3]))
-    assert not np.any(beyond(levels, PRIOR))
-    assert search(levels, PRIOR, 2).log_R[-1] == pytest.approx(math.log(oracle(levels, PRIOR, 2)), abs=2e-3)
+    assert not np.any(beyond(levels))
+    assert search(levels, 2).log_R[-1] == pytest.approx(math.log(oracle(levels, PRIOR, 2)), abs=2e-3)
 
 
 def test_later_recordings_do_not_change_what_was_said_before() -> None:
     random = np.random.default_rng(3)
     levels = levels_at(np.arange(12.0), random.standard_normal(12), 0.1)
-    whole = search(levels, PRIOR, 2).log_R
-    part = search(levels.part(slice(0, 7)), PRIOR, 2).log_R
+    whole = search(levels, 2).log_R
+    part = search(levels.part(slice(0, 7)), 2).log_R
     # but for the upper end of the grid of tau, which follows the range of the values
     assert whole[2:7] == pytest.approx(part[2:], abs=0.1)
 
@@ -133,7 +133,7 @@ def alarms(machines: int, days: int, years: float, *, seed: int, tails: float = 
         for k in range(1, days):
             noise[k] = lasting * noise[k - 1] + math.sqrt(1.0 - lasting**2) * noise[k]
         levels = levels_at(np.arange(float(days)), 3.0 + tau * noise, 0.02)
-        count += search(levels, PRIOR, 1).alarm(years * 365.25) is not None
+        count += search(levels, 1).alarm(years * 365.25) is not None
     return count
 
 
@@ -163,7 +163,7 @@ def delay(wears: float, seed: int) -> float:
 def test_faster_wear_alarms_earlier_and_before_it_has_doubled_the_level() -> None:
     slow, fast = (np.median([delay(wears, seed) for seed in range(4)]) for wears in (0.002, 0.02))
     assert 1.0 <= fast < 0.5 * slow
-    assert slow * 0.002 / MONTH < flow(HEALTHY)
+    assert slow * 0.002 / DAYS_PER_MONTH < flow(HEALTHY)
 
 
 def test_growth_and_limit_hold_the_truth() -> None:
@@ -173,9 +173,9 @@ def test_growth_and_limit_hold_the_truth() -> None:
     assert own is not None and own.step is None and own.onset is not None and own.reach is not None
     assert own.growth.low < 0.006 < own.growth.high < 0.0075
     assert own.onset.low <= 15.0 <= own.onset.high
-    truth = flow(HEALTHY) + 0.006 * (59.0 - 15.0) / MONTH
+    truth = flow(HEALTHY) + 0.006 * (59.0 - 15.0) / DAYS_PER_MONTH
     assert own.now.low < truth < own.now.high
-    assert own.reach.low < (0.0156 + flow(HEALTHY) - truth) / 0.006 * MONTH < own.reach.high
+    assert own.reach.low < (0.0156 + flow(HEALTHY) - truth) / 0.006 * DAYS_PER_MONTH < own.reach.high
     assert own.healthy.low < flow(HEALTHY) < own.healthy.high
 
 
@@ -206,13 +206,13 @@ def test_the_order_of_files_does_not_matter_and_a_repeated_file_counts_once() ->
 
 def test_a_single_outlier_neither_alarms_nor_counts() -> None:
     days = life(30)
-    days[14] = replace(days[14], level=Level(3.0 * HEALTHY, 0.02 * HEALTHY))
+    days[14] = replace(days[14], level=3.0 * HEALTHY)
     trend = trend_of(days, healthy=5)
     assert trend.verdict == "no leak"
     assert "apart from the recordings before and after" in trend.points[14].note
     at_the_end = trend_of(days[:15], healthy=5)
     assert at_the_end.alarm is None  # the last recording is not confirmed by another one
-    stepped = [replace(own, level=Level(3.0 * HEALTHY, 0.02 * HEALTHY)) for own in days[14:17]]
+    stepped = [replace(own, level=3.0 * HEALTHY) for own in days[14:17]]
     trend = trend_of([*days[:14], *stepped], healthy=5)
     assert trend.alarm is not None and trend.alarm.day <= 15.0
     assert trend.wear is not None and trend.wear.step is not None and trend.wear.onset is not None
@@ -230,12 +230,12 @@ def test_a_repair_begins_a_new_stretch() -> None:
 
 def test_other_sensors_are_compared_among_themselves() -> None:
     days = life(60)
-    sensor = [replace(own, scale=1.03, level=Level(0.8 * own.level.value, own.level.error)) for own in days[30:40]]
+    sensor = [replace(own, scale=1.03, level=0.8 * own.level) for own in days[30:40]]
     trend = trend_of([*days[:30], *sensor, *days[40:]], healthy=5)
     assert trend.verdict == "no leak" and len(trend.groups) == 2 and trend.alarm is None
     texts = [finding.text for finding in trend.findings]
     assert any("a sensor exchanged" in text and "10 of 60" in text for text in texts)
-    one = [*days[:30], *sensor, *(replace(own, level=Level(own.level.value * 2.0, 1e-14)) for own in days[40:])]
+    one = [*days[:30], *sensor, *(replace(own, level=own.level * 2.0, error=1e-14) for own in days[40:])]
     assert trend_of(one, healthy=5).verdict == "leak"  # the first sensors again, and twice as much
 
 
@@ -246,7 +246,7 @@ def test_the_oil_s_temperature_is_taken_out_where_it_is_known() -> None:
         replace(
             own,
             temperature=25.0 + 25.0 * k / 59.0,
-            level=Level(own.level.value * math.exp(0.04 * 25.0 * k / 59.0), own.level.error),
+            level=own.level * math.exp(0.04 * 25.0 * k / 59.0),
         )
         for k, own in enumerate(days)
     ]

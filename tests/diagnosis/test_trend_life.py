@@ -14,16 +14,16 @@ import sealscope as ss
 from sealscope.diagnosis.trend.reading import LeakReading, reading_of
 from sealscope.diagnosis.trend.trend import Trend
 from sealscope.diagnosis.trend.trend import trend as trend_of
-from sealscope.diagnosis.trend.wear import MONTH
 from sealscope.recordings.recording import Recording
 from sealscope.reporting.trend.page import render_trend_page
 from sealscope.simulation.leaks import Leak
+from sealscope.units import DAYS_PER_MONTH
 
 REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "real" / "vtnsi_actuator"
 #: Wear from this day on, and the days on which the seal is changed, the duty, and the encoder of the position.
 WORN, REPAIRED, OTHER_DUTY, USUAL_DUTY, EXCHANGED = 25, 60, 70, 76, 82
 #: Conductance of the worn seal a day: 0.003 L/min a month at 0.1 MPa.
-WEAR = 0.003 / 60e3 / 0.1e6 / MONTH
+WEAR = 0.003 / 60e3 / 0.1e6 / DAYS_PER_MONTH
 
 
 def kelvin_of(day: int) -> float:
@@ -69,7 +69,9 @@ def test_ninety_days(readings: list[LeakReading]) -> None:
     assert WORN < day_of(until, 0) < WORN + 20
     assert until.wear.onset is not None and until.wear.onset.low <= WORN + 1 <= until.wear.onset.high + 2
     assert until.pressure is not None
-    grown = WEAR * MONTH * 60e3 * until.pressure * math.exp(0.045 * kelvin_of(0))  # at the first day's temperature
+    grown = (
+        WEAR * DAYS_PER_MONTH * 60e3 * until.pressure * math.exp(0.045 * kelvin_of(0))
+    )  # at the first day's temperature
     assert until.wear.growth.low < grown < until.wear.growth.high
     whole = trend_of(readings, healthy=5)
     assert [point.file for point in whole.repairs] == [f"day_{REPAIRED}.csv"]

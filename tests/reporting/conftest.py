@@ -14,7 +14,6 @@ from sealscope.campaigns.results import CampaignResult, prior_knowledge
 from sealscope.diagnosis.trend.reading import LeakReading
 from sealscope.diagnosis.trend.trend import Trend
 from sealscope.diagnosis.trend.trend import trend as trend_of
-from sealscope.diagnosis.trend.wear import Level
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.quality import Finding
@@ -165,7 +164,8 @@ def trend() -> Trend:
                 start=1.7e9 + 86400.0 * k,
                 duration=60.0,
                 basis=None if k == 5 else "volume balance",
-                level=Level(level, 1.3e-14),
+                level=level,
+                error=1.3e-14,
                 states_flow=True,
                 area=633e-6,
                 pressure=1.1e5,

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from sealscope.calls import checked_call
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.detector import Detector, checked, failure, unusable
 from sealscope.diagnosis.inference.other_steps.step import other_step
 from sealscope.diagnosis.inspection import comparable, inspected
@@ -26,13 +27,15 @@ from sealscope.recordings.motion import does_not_move
 from sealscope.recordings.recording import Recording
 
 #: Probability of `leak` on a leak-free recording, unless the caller asks for another.
-FALSE_ALARM_PROBABILITY = 0.01
+_ALLOWED = beliefs("verdict")["false_alarm"]
+FALSE_ALARM_PROBABILITY: float = _ALLOWED["probability"]
 
 
 def check_probability(probability: float) -> None:
     """Raise InputError for a false-alarm probability that no threshold can be set for."""
-    if not (isinstance(probability, float | int) and 1e-4 <= probability <= 0.2):
-        raise InputError(f"false-alarm probability must be 0.0001 to 0.2, got {probability!r}")
+    least, most = _ALLOWED["rarest"], _ALLOWED["largest"]
+    if not (isinstance(probability, float | int) and least <= probability <= most):
+        raise InputError(f"false-alarm probability must be {least:g} to {most:g}, got {probability!r}")
 
 
 @dataclass(frozen=True, eq=False)

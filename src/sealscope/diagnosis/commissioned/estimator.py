@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.commissioned.machine import CommissionedMachine, commission
+from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.errors import MissingExtra
 from sealscope.recordings.recording import Array
@@ -46,7 +47,7 @@ class LeakDetector(OutlierMixin, BaseEstimator):  # type: ignore[misc]
         map: Any = None,
         rate: float | None = None,
         limit: str | None = None,
-        false_alarm_probability: float = 0.01,
+        false_alarm_probability: float = FALSE_ALARM_PROBABILITY,
     ) -> None:
         self.rig, self.map, self.rate, self.limit = rig, map, rate, limit
         self.false_alarm_probability = false_alarm_probability

@@ -15,7 +15,7 @@ import numpy as np
 
 from sealscope.calls import checked_call
 from sealscope.diagnosis.detector import failure, unusable
-from sealscope.diagnosis.diagnose import diagnose
+from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY, diagnose
 from sealscope.diagnosis.inspection import inspected
 from sealscope.diagnosis.learnt import Learnt, Lesson
 from sealscope.diagnosis.registry import detectors
@@ -116,7 +116,7 @@ class CommissionedMachine:
         self,
         recording: Recording | str | os.PathLike[str],
         *,
-        false_alarm_probability: float = 0.01,
+        false_alarm_probability: float = FALSE_ALARM_PROBABILITY,
     ) -> Diagnosis:
         """Say whether oil bypasses the piston in a recording, or in the file of one, against the healthy ones.
 
@@ -314,8 +314,7 @@ def commission(
     RepairLimit.of(limit)
     known = None if rig is None else load_rig(rig)
     channel_map = map if map is not None else {} if known is None else known.channel_map
-    machine = CommissionedMachine(name, (), known, channel_map, rate, limit)
-    problems: list[str] = []
+    machine, problems = CommissionedMachine(name, (), known, channel_map, rate, limit), list[str]()
     for path in recordings_in(paths):
         try:
             machine = machine._with(machine.read(path), path.name, checksum_of(path))

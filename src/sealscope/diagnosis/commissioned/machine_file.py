@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, create_model
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PositiveFloat, create_model
 
 from sealscope.calls import checked_call
 from sealscope.diagnosis.commissioned.machine import CommissionedMachine, JudgedAlarm
@@ -58,7 +58,6 @@ def _numbers(values: list[Any]) -> np.ndarray:
 
 
 _Moment = Annotated[float, BeforeValidator(_moment)]
-_Positive = Annotated[float, Field(gt=0)]
 _Numbers = Annotated[Any, AfterValidator(_numbers)]
 
 
@@ -108,8 +107,8 @@ _HEALTHY = _table(
     file=str,
     digest=str,
     units=dict[str, str],
-    rate=_Positive,
-    seconds=_Positive,
+    rate=PositiveFloat,
+    seconds=PositiveFloat,
     start_s=(Annotated[_Moment, Field(alias="start")], None),
     lessons=_table("allow", **_LESSONS),
     about=(_table("allow", **{name: (kind, None) for name, kind in _ABOUT.items()}), None),
@@ -210,17 +209,16 @@ def _lines(tree: Mapping[str, Any], path: str = "", head: str = "") -> list[str]
     lines, within = list[str](), list[str]()
     for name, value in tree.items():
         place = f"{path}.{_key(name)}" if path else _key(name)
-        if isinstance(value, Mapping) and not (path and _is_figures(value)):
+        figures = isinstance(value, Mapping) and all(
+            isinstance(own, str | float | int | None) for own in value.values()
+        )
+        if isinstance(value, Mapping) and not (path and value and figures):
             within += _lines(value, place, f"[{place}]")
         elif isinstance(value, list) and not path:
             within += [line for row in value for line in _lines(row, place, f"[[{place}]]")]
         elif value is not None:
             lines.append(f"{_key(name)} = {_value(value)}")
     return [*(["", head, *lines] if lines else []), *within]
-
-
-def _is_figures(table: Mapping[str, Any]) -> bool:
-    return bool(table) and all(isinstance(value, str | float | int | None) for value in table.values())
 
 
 def _key(name: str) -> str:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.beliefs import beliefs
+from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY
 from sealscope.diagnosis.inference.blocks import Columns, solve
 from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.inference.terms import ATMOSPHERE, equations
@@ -18,7 +19,7 @@ from sealscope.diagnosis.inspection import Inspection
 from sealscope.diagnosis.verdict.machine import unstated
 from sealscope.recordings.oil import oil_temperature
 from sealscope.recordings.recording import Array, Recording
-from sealscope.units import LITRE_PER_MINUTE
+from sealscope.units import BAR, LITRE_PER_MINUTE, from_si
 
 if TYPE_CHECKING:
     from sealscope.diagnosis.learnt import Learnt
@@ -67,17 +68,14 @@ class Summary:
 
     def text(self, healthy: Sequence[Learnt], rig: Rig | None) -> str:
         """Return it in some ten lines."""
-        dates = sorted(own.start_s for own in healthy if own.start_s is not None)
-        first, last = (
-            (datetime.fromtimestamp(at, UTC).date().isoformat() for at in (min(dates), max(dates)))
-            if dates
-            else ("", "")
-        )
-        span = "" if not dates else f", {first}" if first == last else f", {first} to {last}"
+        starts = [own.start_s for own in healthy if own.start_s is not None]
+        dates = sorted(datetime.fromtimestamp(at, UTC).date().isoformat() for at in starts)
+        span = f", {' to '.join(dict.fromkeys((dates[0], dates[-1])))}" if dates else ""
         noise = []
         for name, value in self.noise.items():
-            unit, size = _SHOWN.get(healthy[0].units.get(name, ""), (healthy[0].units.get(name, ""), 1.0))
-            noise.append(f"{name} {value / size:.2g} {unit}")
+            unit = healthy[0].units.get(name, "")
+            shown = {"Pa": "bar", "m": "mm"}.get(unit, unit)
+            noise.append(f"{name} {from_si(value, shown, unit):.2g} {shown}")
         rows = [
             ("recordings", f"{len(healthy)} healthy, {sum(own.seconds for own in healthy):.4g} s in all{span}"),
             ("channels", ", ".join(f"{name} [{unit}]" for name, unit in healthy[0].units.items())),
@@ -101,19 +99,16 @@ class Summary:
         )
 
 
-#: Units in which people read others, and their sizes.
-_SHOWN = {"Pa": ("bar", 1e5), "m": ("mm", 1e-3)}
-
-
 def _stated(rig: Rig | None) -> str:
     """Return what is stated of the machine, in words."""
-    parts = []
-    if rig is not None and rig.states("cylinder.M_eq"):
+    rig = rig or unstated()
+    if rig.states("cylinder.M_eq"):
         return rig.title or rig.name
-    if rig is not None and rig.states("cylinder.A_A", "cylinder.A_B"):
+    parts = []
+    if rig.states("cylinder.A_A", "cylinder.A_B"):
         areas = dict.fromkeys(f"{1e6 * area:.4g}" for area in (rig.cylinder.A_A, rig.cylinder.A_B))
         parts.append(f"piston {' and '.join(areas)} mm^2")
-    if rig is not None and rig.states("pump.q_b"):
+    if rig.states("pump.q_b"):
         parts.append(f"pump {1e6 * rig.pump.q_b:.3g} cm^3/rev")
     return ", ".join(parts) or "size not stated: L/min needs a rig, an area or a displacement"
 
@@ -122,17 +117,16 @@ def _duty(healthy: Sequence[Learnt]) -> str:
     """Return the ranges of the pump's mean flow, where the machine's size is stated, of pressure and temperature."""
     lessons = [own.lessons.get(_BALANCE, {}) for own in healthy]
     flows = [lesson.get("flow", 0.0) * lesson.get("scale", 0.0) / LITRE_PER_MINUTE for lesson in lessons]
-    pressures, oils = (
-        [own.about[name] for own in healthy if name in own.about] for name in ("pressure_bar", "oil_degC")
-    )
+    ranges = {
+        "L/min": [flow for flow in flows if flow > 0.0],
+        "bar between the chambers": [own.about["pressure_bar"] for own in healthy if "pressure_bar" in own.about],
+        "deg C": [own.about["oil_degC"] for own in healthy if "oil_degC" in own.about],
+    }
     texts = []
-    for values, unit in (
-        ([flow for flow in flows if flow > 0.0], "L/min"),
-        (pressures, "bar between the chambers"),
-        (oils, "deg C"),
-    ):
-        ends = dict.fromkeys(f"{end:.3g}" for end in (min(values), max(values))) if values else ()
-        texts += [f"{' to '.join(ends)} {unit}"] if ends else []
+    for unit, values in ranges.items():
+        if values:
+            ends = dict.fromkeys(f"{end:.3g}" for end in (min(values), max(values)))
+            texts.append(f"{' to '.join(ends)} {unit}")
     return ", ".join(texts)
 
 
@@ -140,7 +134,7 @@ def about_recording(recording: Recording, inspection: Inspection) -> dict[str, A
     """Return what people read of a healthy recording, and what looks wrong with it."""
     part, about = inspection.part, dict[str, Any]()
     if {"p_A", "p_B"} <= set(part.channels) and part.units["p_A"] == "Pa":
-        about["pressure_bar"] = _rounded(float(np.mean(np.abs(part["p_A"] - part["p_B"]))) / 1e5)
+        about["pressure_bar"] = _rounded(float(np.mean(np.abs(part["p_A"] - part["p_B"]))) / BAR)
     if (oil := oil_temperature(recording)) is not None:
         about["oil_degC"] = _rounded(oil)
     about["noise"] = {name: noise for name in part.channels if (noise := _noise(part[name])) > 0.0}
@@ -172,7 +166,7 @@ def summarised(healthy: Sequence[Learnt], rig: Rig | None, left_out: Sequence[st
     problems += [
         f"{own.file} is not like the others: its leakage differs from theirs by {abs(rise.score):.2g} deviations"
         for own, rise in zip(alike, rises, strict=True)
-        if len(rises) > 2 and 2.0 * min(rise.chance, 1.0 - rise.chance) < _ASKED["false_alarm"]
+        if len(rises) > 2 and 2.0 * min(rise.chance, 1.0 - rise.chance) < FALSE_ALARM_PROBABILITY
     ]
     return Summary(terms, noise, _smallest(balance, lessons, channels), problems)
 
@@ -206,7 +200,7 @@ def _smallest(balance: VolumeBalance, lessons: Sequence[Mapping[str, Any]], chan
 
     def findable(repeated: int) -> float:
         coming = balance.next_rise(lessons, channels, repeated)
-        return float((coming.threshold(_ASKED["false_alarm"]) + ndtri(_ASKED["power"])) * coming.deviation)
+        return float((coming.threshold(FALSE_ALARM_PROBABILITY) + ndtri(_ASKED["power"])) * coming.deviation)
 
     pressure, flow = (float(np.median([own[name] for own in lessons])) for name in ("pressure", "flow"))
     scale, own = float(np.median([lesson["scale"] for lesson in lessons])), findable(1)
@@ -236,7 +230,7 @@ def _noise(values: Array) -> float:
 def _below_vacuum(part: Recording, name: str) -> str:
     if part.units[name] != "Pa" or not (least := float(np.quantile(part[name], 0.01))) < -ATMOSPHERE:
         return ""
-    off = (-ATMOSPHERE - least) / 1e5
+    off = (-ATMOSPHERE - least) / BAR
     return f"{name} reads below vacuum: its zero is at least {off:.1g} bar too low"
 
 

@@ -88,9 +88,8 @@ class PressureEstimator:
 
     def _begin(self, first: Recording) -> bool:
         """Fit the response to the first minute; return whether the machine moves in it, and nothing is missing."""
-        if not all(np.isfinite(first[name]).all() for name in first.channels):
-            return False
-        if not all(name in first and moves(first[name]) for name in _READ):
+        whole = all(np.isfinite(first[name]).all() for name in first.channels)
+        if not (whole and all(name in first and moves(first[name]) for name in _READ)):
             return False
         if unusable(first, self._rig) is None:
             self._follower = Follower.begun(first.only(_READ), self._rig)

@@ -41,23 +41,12 @@ SIZES = np.array(_BELIEVED["sizes"])
 PARTS = np.array(_BELIEVED["parts"])
 JUMP, MEMORY = beliefs("live")["coefficients"]["jump"], _BELIEVED["memory"]
 #: Onsets are all kept for `RECENT` blocks, then `RECENT / 4` of every doubling of age, up to `HORIZON` blocks.
-RECENT, HORIZON = 32, 4096
+RECENT, HORIZON = _BELIEVED["recent"], _BELIEVED["horizon"]
 #: What is kept of each onset and walk, and of each onset.
 _FIELDS = ("answer", "along", "square", "total", "lead")
 _PLACES = ("number", "born", "onset", "begin")
 _SAVED = tuple(f"_{name}" for name in ("level", "spread", "total", "weight", "widths", "onsets", "places", "unit",
                                        "known", "blocks", "last"))  # fmt: skip
-
-
-def probability_of(rate: float, hours: float, seconds: float, name: str) -> float:
-    """Return the probability of a false alarm of a look every `seconds`, at a `rate` of alarms in so many hours.
-
-    `name`: of the rate, in the InputError that is raised where no threshold can be set for it.
-    """
-    looks, (least, most) = hours * 3600.0 / seconds, (1e-12, 0.05)
-    if not least * looks <= rate <= most * looks:
-        raise InputError(f"{name} must be {least * looks:.2g} to {most * looks:.3g}, got {rate:g}")
-    return rate / looks
 
 
 class Rise(NamedTuple):

@@ -17,7 +17,7 @@ from sealscope.diagnosis.live.balance import LEARNED, BlockConductance, LiveBala
 from sealscope.diagnosis.live.estimates import BaselineLearning, BlockEstimate, WatchBaseline, WatchedLeak, within
 from sealscope.diagnosis.live.joining import SampleJoiner
 from sealscope.diagnosis.live.pressures import PressureEstimator
-from sealscope.diagnosis.live.sequential import RECENT, Rise, StepDetector, probability_of
+from sealscope.diagnosis.live.sequential import RECENT, Rise, StepDetector
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
@@ -29,11 +29,15 @@ if TYPE_CHECKING:
 
 #: Format of the saved state.
 STATE_VERSION = 10
-#: Blocks of one mean that is compared with the baseline, and of the mean that is the leak after an alarm.
-GROUP, _RECENT = 16, 8
 _BELIEVED = beliefs("live")["watch"]
+#: Blocks of one mean that is compared with the baseline, and of the mean that is the leak after an alarm.
+GROUP, _RECENT = _BELIEVED["group"], _BELIEVED["recent"]
+#: What a watched leak and the evidence of it call alike.
+_FIGURES = ("score", "threshold", "onset_s", "onset_interval_s", "leak_lpm", "leak_interval_lpm")
 #: Ways of watching, each a stream of conductances.
-_KINDS: dict[str, type[LiveBalance | PressureEstimator]] = {of.method: of for of in (LiveBalance, PressureEstimator)}
+Estimator = LiveBalance | PressureEstimator
+_WithInterval = tuple[float, float, float]
+_KINDS: dict[str, type[Estimator]] = {of.method: of for of in (LiveBalance, PressureEstimator)}
 
 
 class Watch:
@@ -80,7 +84,7 @@ class Watch:
         self._rig = rig
         self._litres = {by: kind.states_flow(rig) for by, kind in _KINDS.items()} if litres is None else litres
         self._samples = SampleJoiner(valved=rig.valve.spool == "present")
-        self._estimator: LiveBalance | PressureEstimator | None = None
+        self._estimator: Estimator | None = None
         self.baseline: WatchBaseline | None = None
         self.leak: WatchedLeak | None = None
         self.blocks, self.baseline_version = 0, 1
@@ -90,9 +94,16 @@ class Watch:
         self._last, self._group = np.empty((0, 6)), np.empty((0, 4))
 
     def _probability(self, test: str, seconds: float) -> float:
-        """Return the probability of a false alarm of one look of a test, with so many seconds between looks."""
-        hours = 1000.0 / _BELIEVED[test]
-        return probability_of(self.false_alarms_per_1000_h, hours, seconds, "false_alarms_per_1000_h")
+        """Return the probability of a false alarm of one look of a test, with so many seconds between looks.
+
+        Raises InputError where no threshold can be set for it.
+        """
+        rate: float = self.false_alarms_per_1000_h
+        looks: float = 1000.0 / _BELIEVED[test] * 3600.0 / seconds
+        least, most = 1e-12 * looks, 0.05 * looks
+        if not least <= rate <= most:
+            raise InputError(f"false_alarms_per_1000_h must be {least:.2g} to {most:.3g}, got {rate:g}")
+        return rate / looks
 
     @cached_property
     def _rig_text(self) -> str:
@@ -118,17 +129,9 @@ class Watch:
         """Verdict of now, with the leak that the tests show, else with the 95 % bound of one that they do not."""
         leak, own = self.leak, self._estimator
         if leak is not None:
-            return Evidence(
-                "leak",
-                leak.reason,
-                score=leak.score,
-                threshold=leak.threshold,
-                onset_s=leak.onset_s,
-                onset_interval_s=leak.onset_interval_s,
-                leak_lpm=leak.leak_lpm,
-                leak_interval_lpm=leak.leak_interval_lpm,
-                cause=None if leak.cause == PressureEstimator.cause else leak.cause,  # type: ignore[arg-type]
-            )
+            figures: dict[str, Any] = {name: getattr(leak, name) for name in _FIGURES}
+            cause: Any = None if leak.cause == PressureEstimator.cause else leak.cause
+            return Evidence("leak", leak.reason, cause=cause, **figures)
         bound = self._detector.bound() if own is not None and len(self._last) else math.inf
         if own is None or not math.isfinite(bound):
             why = f": {', '.join(self.counters)}" if self.counters else ""
@@ -171,9 +174,7 @@ class Watch:
             if self._estimator is not None:
                 self._estimator.interrupt()
         for t, channels in self._samples.runs(samples):
-            if (
-                self._estimator is None or self._estimator.method != self.method
-            ):  # a position came with the second piece
+            if self._estimator is None or self._estimator.method != self.method:  # a position came later
                 self._estimator = self._estimator_by()
             with np.errstate(all="ignore"):  # a block whose sums overflow says nothing
                 every = self._estimator.take(t, channels, self._samples.rate)
@@ -184,7 +185,7 @@ class Watch:
                 else:
                     yield self.judged(shown), self.leak
 
-    def _estimator_by(self) -> LiveBalance | PressureEstimator:
+    def _estimator_by(self) -> Estimator:
         return _KINDS[self.method](self._rig, self._samples.names, self._litres.get(self.method, False))
 
     def continue_from(self, blocks: int, baseline_version: int) -> None:
@@ -217,12 +218,13 @@ class Watch:
             if shown.counted:
                 self._samples.count(shown.counted)
             return BlockEstimate(self.blocks, shown.end, shown.status)
+        assert self._estimator is not None
         for block in shown:
-            estimate = self._judge(block)
+            estimate = self._judge(self._estimator, block)
         return estimate
 
-    def _judge(self, block: BlockConductance) -> BlockEstimate:
-        assert self._estimator is not None
+    def _judge(self, own: Estimator, block: BlockConductance) -> BlockEstimate:
+        """Test a block by all that came before, and return its estimate."""
         if self.baseline is not None and not within(block.duty, self.baseline.duty_low, self.baseline.duty_high):
             self._samples.count("blocks: another duty")
             return BlockEstimate(self.blocks, block.end, "another duty")
@@ -231,21 +233,20 @@ class Watch:
         self._detector.take(block.begin, block.end, block.g, block.sd)
         row = block.end, block.g, block.sd, block.flow, *block.duty
         self._last = np.vstack([self._last[1 - RECENT :], row])
-        self._test_step(block)
-        self._test_level(block)
+        self._test_step(own, block)
+        self._test_level(own, block)
         if self.baseline is None and self.leak is None:
             self._learning.add(block.g, block.flow, block.duty, GROUP)
             hours = self._learning.blocks * self.block_seconds / 3600.0
             if self._learning.blocks >= LEARNED and hours >= self.learn_hours * (1.0 - 1e-12):
-                litres = self._estimator.litres and self._estimator.levels
-                self.baseline = self._learning.frozen(self.baseline_version, block.end, hours, litres)
+                self.baseline = self._learning.frozen(
+                    self.baseline_version, block.end, hours, own.litres and own.levels
+                )
                 self._learning = BaselineLearning()
         status = "alarm" if self.leak is not None else "learning" if self.baseline is None else "watched"
-        if not self._estimator.litres:
-            return BlockEstimate(self.blocks, block.end, status)
-        return self._estimate(self._estimator, status, block)
+        return self._estimate(own, status, block) if own.litres else BlockEstimate(self.blocks, block.end, status)
 
-    def _test_step(self, block: BlockConductance) -> None:
+    def _test_step(self, own: Estimator, block: BlockConductance) -> None:
         """Test for a step; an alarm that stands is stated anew while more blocks sharpen it."""
         leak = self.leak
         if leak is not None and (leak.test != "step" or block.end - leak.raised_s > RECENT * self.block_seconds):
@@ -255,7 +256,7 @@ class Watch:
         if not self._detector.log_e(least) > least:
             return
         rise = self._detector.rise()
-        if leak is None and self._other_duty(rise.onset[0], rise.size):
+        if leak is None and self._other_duty(own, rise):
             self._samples.count("blocks not compared: changed duty")
             self._forget()
             return
@@ -263,22 +264,21 @@ class Watch:
             f"the leakage conductance rises at {rise.onset[0]:.0f} s beyond its random walk (score {rise.score:.1f}, "
             f"threshold {2.0 * threshold:.1f})"
         )
-        self._raise(rise._replace(threshold=2.0 * threshold, reason=reason), block)
+        self._raise(own, rise._replace(threshold=2.0 * threshold, reason=reason), block)
 
-    def _other_duty(self, onset: float, size: float) -> bool:
+    def _other_duty(self, own: Estimator, rise: Rise) -> bool:
         """Return whether the duty changed with a rise, beyond what it was before and what a leak makes of it."""
-        assert self._estimator is not None
         ends, *_, pressure, motion = self._last.T
-        after = ends > onset
+        after = ends > rise.onset[0]
         if np.count_nonzero(~after) < _RECENT or not after.any():
             return False
         low, high = ((float(f(pressure[~after])), float(f(motion[~after]))) for f in (np.min, np.max))
         now = float(np.median(pressure[after])), float(np.median(motion[after]))
-        lost = 1.0 - size * math.exp(now[0] - now[1]) if self._estimator.levels else 1.0
+        lost = 1.0 - rise.size * math.exp(now[0] - now[1]) if own.levels else 1.0
         net = now[0], now[1] + math.log(max(lost, np.finfo(float).tiny))  # the pump may give what leaks
         return not (within(now, low, high) or within(net, low, high))
 
-    def _test_level(self, block: BlockConductance) -> None:
+    def _test_level(self, own: Estimator, block: BlockConductance) -> None:
         """Gather blocks to means, and compare these with the baseline."""
         self._group = np.vstack([self._group, (block.end, block.g, block.sd, block.offset)])
         if len(self._group) < GROUP:
@@ -292,11 +292,10 @@ class Watch:
         deviation = math.hypot(sd, offset * (beliefs("inference")["oil"]["warmest"] - 1.0))
         rise = self.baseline.rise(at, g, deviation, self._probability("level", GROUP * self.block_seconds))
         if rise is not None:
-            self._raise(rise, block, self.baseline.level)
+            self._raise(own, rise, block, self.baseline.level)
 
-    def _raise(self, rise: Rise, block: BlockConductance, before: float | None = None) -> None:
-        assert self._estimator is not None
-        own, leak, (onset, *ends) = self._estimator, self.leak, rise.onset
+    def _raise(self, own: Estimator, rise: Rise, block: BlockConductance, before: float | None = None) -> None:
+        leak, (onset, *ends) = self.leak, rise.onset
         if before is None:
             earlier = self._last[self._last[:, 0] <= ends[0], 1][-GROUP:]
             known = float(np.mean(earlier)) if earlier.size else block.g - rise.size
@@ -318,7 +317,7 @@ class Watch:
             threshold=rise.threshold,
         )
 
-    def _estimate(self, own: LiveBalance | PressureEstimator, status: str, block: BlockConductance) -> BlockEstimate:
+    def _estimate(self, own: Estimator, status: str, block: BlockConductance) -> BlockEstimate:
         """Return the block's estimate: total flow, and flow beyond the baseline's, or since the onset of the leak."""
         flow, sd = block.flow, block.sd * math.sqrt(self._detector.noise)
         total = total_interval = leak = leak_interval = beyond = None
@@ -336,9 +335,7 @@ class Watch:
             leak_interval = max(0.0, low), own.orifice * max(0.0, high)
         return BlockEstimate(self.blocks, block.end, status, total, total_interval, leak, leak_interval)
 
-    def _beyond_leak(
-        self, leak: WatchedLeak, own: LiveBalance | PressureEstimator, block: BlockConductance, sd: float
-    ) -> tuple[float, float, float]:
+    def _beyond_leak(self, leak: WatchedLeak, own: Estimator, block: BlockConductance, sd: float) -> _WithInterval:
         """Return the conductance since the onset of a leak, and its interval, in which the oil may have warmed."""
         recent = self._last[self._last[:, 0] - self.block_seconds >= leak.onset_interval_s[1], 1][-_RECENT:]
         now, oil = float(np.mean(recent)) if recent.size else block.g, beliefs("inference")["oil"]

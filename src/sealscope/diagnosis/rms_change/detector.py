@@ -29,9 +29,9 @@ from sealscope.signals.details import shortest
 
 
 class _Change(NamedTuple):
-    """Change g of a quantity, of the likelier sign, with the 95 % bound of its size, and its `onset` in a recording.
+    """Change of the log RMS of a quantity, of the likelier sign, its `onset` in a recording, and its test.
 
-    `weight` times g is the change of its log RMS.
+    `bound`: 95 % bound of the size of the machine's own part of it.
     """
 
     name: str
@@ -40,17 +40,20 @@ class _Change(NamedTuple):
     chance: float
     threshold: float
     bound: float
-    weight: float
     onset: Interval | None = None
+
+    @property
+    def text(self) -> str:
+        """The change in words."""
+        percent = 100.0 * np.expm1(self.value)
+        return f"RMS of {self.name} {'rose' if percent > 0 else 'fell'} by {abs(percent):.1f} %"
 
     def evidence(self) -> Evidence:
         """Return it as a part of the detector's evidence; noise (d1) that changed is no leak."""
-        percent = 100.0 * np.expm1(self.weight * self.value)
-        text = f"RMS of {self.name} {'rose' if percent > 0 else 'fell'} by {abs(percent):.1f} %"
         at = "" if self.onset is None else f" at {self.onset.value:.1f} s"
         changed: Verdict = "cannot tell" if self.name.startswith("d1 ") else "leak"
         verdict: Verdict = "no leak" if self.score <= self.threshold else changed
-        return Evidence(verdict, text + at, self.score, self.threshold, detector=f"RMS of {self.name}")
+        return Evidence(verdict, self.text + at, self.score, self.threshold, detector=f"RMS of {self.name}")
 
 
 class RmsChange:
@@ -116,7 +119,8 @@ def within(blocks: RmsBlocks, probability: float) -> Evidence:
             return Evidence("cannot tell", f"{name} says nothing in most blocks")
         test = min(tests, key=lambda each: each.chance)
         size, bound = test.fitted[0] * (1.0 if test is tests[0] else -1.0), max(each.bound() for each in tests)
-        changes.append(_Change(name, size, test.score, test.chance, test.threshold(share), bound, weight, test.onset()))
+        figures = test.score, test.chance, test.threshold(share), bound, test.onset()
+        changes.append(_Change(name, weight * size, *figures))
         if name.split()[0] in JUDGED:
             moved.append(test)
     rarest = min(moved, key=lambda test: test.chance)
@@ -141,7 +145,7 @@ def against(recording: Recording, baseline: Sequence[Healthy], probability: floa
     for name, rise, weight in zip(columns_of(chambers), *rises(*whole(recording), levels, duties, times), strict=True):
         size = rise._replace(value=abs(rise.value))
         bound = size.value + size.threshold(0.05) * size.deviation
-        changes.append(_Change(name, rise.value, size.score, size.chance, size.threshold(share), bound, weight))
+        changes.append(_Change(name, weight * rise.value, size.score, size.chance, size.threshold(share), bound))
     unknown = ", maybe of another session or machine" if times is None else ""
     count = f"{len(alike)} comparable leak-free recording{'s' if len(alike) > 1 else ''}{unknown}"
     return _evidence(changes, 1.0, f"against {count}", None)
@@ -163,7 +167,7 @@ def _evidence(changes: Sequence[_Change], share: float, where: str, onset: Inter
     verdict: Verdict = "leak" if rarest.score > rarest.threshold else "no leak"
     if verdict == "leak":
         at = "" if onset is None else f" at {onset.value:.1f} s"
-        moved = [own._replace(onset=None).evidence().reason for own in judged if own.score > own.threshold][:3]
+        moved = [own.text for own in judged if own.score > own.threshold][:3]
         reason = f"{', '.join(moved)}{at} {where} ({figures}){note}"
     elif bound > beliefs("rms_change")["recordings"]["worth"]:
         verdict = "cannot tell"

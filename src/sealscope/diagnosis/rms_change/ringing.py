@@ -20,9 +20,6 @@ from sealscope.diagnosis.inference.scatter import Among, Rise, sessions_of
 from sealscope.diagnosis.rms_change.blocks import DUTY, QUANTITIES, RmsBlocks
 from sealscope.recordings.recording import Array
 
-#: Rates of the walk between recordings that are tried: quantiles of what is believed.
-WALKS = 16
-
 
 def beyond_noise(log_rms: Array, known: Array) -> tuple[Array, Array]:
     """Return y and w (n, 5 per chamber) of log RMS (n, 5 per chamber), the machine's own energy that of `known`."""
@@ -74,14 +71,15 @@ def rises(
     belief, walk, n = beliefs("rms_change")["recordings"], beliefs("rms_change")["walk"], len(known)
     exponents = np.array([float(beliefs("rms_change")["duty"][name]) for name in DUTY])
     apart = (np.vstack([known_duty, duty]) - duty) * exponents
-    gained = walk["machine"] * np.tan(0.5 * np.pi * (np.arange(WALKS) + 0.5) / WALKS)
+    quantiles = (np.arange(walk["tried"]) + 0.5) / walk["tried"]
+    gained = walk["machine"] * np.tan(0.5 * np.pi * quantiles)
     rates = (gained / belief["session"]) ** 2 / (2.0 * walk["time"])
     since, alike = np.zeros((n + 1, n + 1)), np.ones((n + 1, n + 1))
     if times is not None:
         sessions = sessions_of(list(times), belief["pause"])
         since, alike = np.abs(np.subtract.outer(times, times)), np.equal.outer(sessions, sessions).astype(float)
     fading = belief["session"] ** 2 * np.exp(-rates[:, None, None] * since) * alike
-    among = Among(fading + apart @ apart.T, np.zeros(WALKS))
+    among = Among(fading + apart @ apart.T, np.zeros(len(rates)))
     values, weights = beyond_noise(np.vstack([log_rms, known]), known)
     weight = weights[1:].mean(axis=0)
     stated = []

@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.inference.pressures.detector import PressureResponse
 from sealscope.diagnosis.inspection import inspected
 from sealscope.diagnosis.rms_change.blocks import JUDGED, QUANTITIES, whole
-from sealscope.diagnosis.trend.wear import DayToDay, Level
+from sealscope.diagnosis.trend.wear import DayToDay
 from sealscope.diagnosis.verdict.machine import AssumedMachine, assumed_rig
 from sealscope.errors import InputError
 from sealscope.parameters import Rig
@@ -26,13 +26,12 @@ from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.oil import oil_temperature
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
+from sealscope.units import DAY
 
-DAY = 86_400.0
 #: What a level rests on, the most specific first: a conductance, but for `ringing`, the damping of the pressures'
 #: details.
 Basis = Literal["volume balance", "pressure response", "ringing"]
 BASES: tuple[Basis, ...] = ("volume balance", "pressure response", "ringing")
-_UNKNOWN = Level(np.nan, np.nan)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -41,17 +40,18 @@ class LeakReading:
 
     `start`: of its first sample [s since 1970], None where not known, and `duration` [s]; `basis`, None where nothing
     can be stated, and `problem`: why; `level`: conductance of pump and piston together [m^3/(s Pa)], or a relative
-    index; `states_flow`: whether L/min can be stated of it, and `area` [m^2] of the piston by which a speed of creep is
-    a flow in the level's unit, None where it is in none; `pressure`: mean |p_A - p_B|; `temperature` of the oil
-    [deg C], None where the file does not say; `scale`: displacement over area, over the assumed one; `machine`: what
-    was assumed; `digest`: equal for copies.
+    index, with its standard `error`; `states_flow`: whether L/min can be stated of it, and `area` [m^2] of the piston
+    by which a speed of creep is a flow in the level's unit, None where it is in none; `pressure`: mean |p_A - p_B|;
+    `temperature` of the oil [deg C], None where the file does not say; `scale`: displacement over area, over the
+    assumed one; `machine`: what was assumed; `digest`: equal for copies.
     """
 
     file: str
     start: float | None
     duration: float
     basis: Basis | None = None
-    level: Level = _UNKNOWN
+    level: float = np.nan
+    error: float = np.nan
     states_flow: bool = False
     area: float | None = None
     pressure: float
@@ -94,17 +94,23 @@ def _stated(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[str, Any
     own = balance.balance(part) if lack is None else None
     if own is not None and len(own.columns) == 1:
         size, total = own.size, own.level
-        level = Level(total.value * size.scale, (total.high - total.low) * size.scale / 3.92)
         area = machine.area if size.stated or ("x", "m") in own.units else None
-        ratio = None if size.ratio is None else size.ratio.value
-        return {"basis": BASES[0], "level": level, "states_flow": size.stated, "area": area, "scale": ratio}
+        return {
+            "basis": BASES[0],
+            "level": total.value * size.scale,
+            "error": (total.high - total.low) * size.scale / 3.92,
+            "states_flow": size.stated,
+            "area": area,
+            "scale": None if size.ratio is None else size.ratio.value,
+        }
     if lacks is None and (reading := response.reading(part)) is not None:
         area = machine.area if reading.stated else None
-        return {"basis": BASES[1], "level": Level(*reading.level), "states_flow": reading.stated, "area": area}
+        level, error = reading.level
+        return {"basis": BASES[1], "level": level, "error": error, "states_flow": reading.stated, "area": area}
     log_rms = whole(part)[0].reshape(-1, len(QUANTITIES))
     ringing = float(-np.mean(log_rms[:, [QUANTITIES.index(name) for name in JUDGED]]))
     if np.isfinite(ringing):
-        return {"basis": BASES[2], "level": Level(ringing, beliefs("trend")["own"]["ringing"])}
+        return {"basis": BASES[2], "level": ringing, "error": beliefs("trend")["own"]["ringing"]}
     why = dict.fromkeys(reason for reason in (lack, lacks) if reason) or ["the pressures do not ring"]
     return {"problem": "no detector states a level: " + "; ".join(why)}
 
@@ -112,62 +118,38 @@ def _stated(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[str, Any
 def scatter_of(basis: Basis, usual: float) -> DayToDay:
     """Return the prior on the scatter of a level between recordings, for a machine of that usual level."""
     believed = beliefs("trend")["between"]
-    if basis == "volume balance":
-        scale = max(believed[basis] * abs(usual), float(np.finfo(float).tiny))
-    else:
-        scale = (
-            beliefs("inference.pressures")["conductance"]["level"] if basis == "pressure response" else believed[basis]
-        )
-    return DayToDay(scale, believed["freedom"])
+    if basis == "pressure response":
+        return DayToDay(beliefs("inference.pressures")["conductance"]["level"], believed["freedom"])
+    size = abs(usual) if basis == "volume balance" else 1.0
+    return DayToDay(max(believed[basis] * size, float(np.finfo(float).tiny)), believed["freedom"])
 
 
-@dataclass(frozen=True)
-class TrendPoint:
-    """One recording of a trend.
+@dataclass(frozen=True, kw_only=True)
+class TrendPoint(LeakReading):
+    """The reading of a recording in a trend.
 
-    `start` [s since 1970], `day` since the first one; `value` and 95 % interval of its own error in the trend's unit,
-    None where it is left out, for the reason `note`; `group` of comparable recordings, -1 where left out.
+    `day` since the first one; `group` of comparable readings, -1 where it is left out, for the reason `note`; `value`
+    and 95 % interval of its own error in the trend's unit, None where it is left out.
     """
 
-    file: str
     start: float
     day: float
-    value: float | None
-    low: float | None
-    high: float | None
     group: int
-    temperature: float | None
-    note: str = ""
+    note: str
+    value: float | None = None
+    low: float | None = None
+    high: float | None = None
 
 
-class Timeline(NamedTuple):
-    """Readings in the order of their times, the `points` of them without values yet.
-
-    `groups`: what each group of comparable ones is, in words; `findings`: on the whole; `basis` of those in a group.
-    """
-
-    readings: list[LeakReading]
-    points: list[TrendPoint]
-    groups: tuple[str, ...]
-    findings: list[Finding]
-    basis: Basis | None
-
-
-def natural(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Return what orders names with numbers as people do: day_2 before day_10."""
-    parts = re.findall(r"\d+|\D+", name)
-    return tuple((0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts)
-
-
-def timeline(readings: Sequence[LeakReading], every: float | None = None) -> Timeline:
-    """Order readings by their times, and sort out what cannot be compared.
+def timeline(readings: Sequence[LeakReading], every: float | None = None) -> tuple[list[TrendPoint], tuple[str, ...]]:
+    """Return readings in the order of their times, and what sets each group of comparable ones apart from the first.
 
     `every`: time between them [s], in the order of their names. Raises InputError where the time of one is not known.
     """
-    ordered = sorted(readings, key=lambda reading: natural(reading.file))
+    ordered = sorted(readings, key=lambda reading: _natural(reading.file))
     if every is not None:
         ordered = [replace(reading, start=k * every) for k, reading in enumerate(ordered)]
-    if unknown := [reading.file for reading in ordered if reading.start is None]:
+    if unknown := [reading for reading in ordered if reading.start is None]:
         raise InputError(
             f"the time of every recording must be known, got none of {_names(unknown)}: put the date into the names "
             "(press_20240531.csv, press_20240531_0730.csv), or give every (such as 1d) where they were made at equal "
@@ -181,34 +163,57 @@ def timeline(readings: Sequence[LeakReading], every: float | None = None) -> Tim
         notes.append(reading.problem or ("" if copy == reading.file else f"the same samples as {copy}"))
     kept = [reading.basis for reading, note in zip(ordered, notes, strict=True) if not note]
     basis: Basis | None = max(BASES, key=kept.count) if kept else None
-    scales: list[float | None] = []
-    points = []
-    for k, reading in enumerate(ordered):
-        if not notes[k] and reading.basis != basis:
-            notes[k] = f"its channels allow the {reading.basis}, not the {basis}"
-        group = -1 if notes[k] else next((n for n, own in enumerate(scales) if _alike(reading.scale, own)), len(scales))
-        scales += [reading.scale] if group == len(scales) else []
+    points, scales, most = [], list[float | None](), beliefs("trend")["own"]["scale"]
+    for reading, problem in zip(ordered, notes, strict=True):
+        other = "" if reading.basis == basis else f"its channels allow the {reading.basis}, not the {basis}"
+        note = problem or other
+        alike = (n for n, scale in enumerate(scales) if abs(_change(reading.scale, scale)) <= most)
+        group = -1 if note else next(alike, len(scales))
+        if group == len(scales):
+            scales.append(reading.scale)
         start = reading.start or 0.0
         day = (start - (ordered[0].start or 0.0)) / DAY
-        points.append(TrendPoint(reading.file, start, day, None, None, None, group, reading.temperature, notes[k]))
-    others = (
+        points.append(TrendPoint(**vars(reading) | {"start": start}, day=day, group=group, note=note))
+    apart = [
         f"position or angle is scaled by {100.0 * _change(scale, scales[0]):+.2g} %: a sensor exchanged, or another "
         "machine"
-        for scale in scales[1:]
-    )
-    groups = ("", *others) if scales else ()
-    return Timeline(ordered, points, groups, [*_clock(ordered), *_named(points, groups)], basis)
+        for scale in scales
+    ]
+    return points, ("", *apart[1:]) if scales else ()
+
+
+def findings_of(points: Sequence[TrendPoint], apart: Sequence[str]) -> list[Finding]:
+    """Return findings on the clock, on what is left out, one for each reason, and on what is compared apart."""
+    findings, count = _clock(points), len(points)
+    reasons: dict[str, list[TrendPoint]] = {}
+    for point in points:
+        if point.note:
+            reasons.setdefault(re.sub(r"\d[\d.]*", "#", point.note), []).append(point)  # alike but for its numbers
+    for own in reasons.values():
+        text = f"{len(own)} of {count} left out: {own[0].note} ({_names(own)})"
+        findings.append(Finding("left_out", "warning", None, len(own), None, text))
+    for number, difference in enumerate(apart[1:], 1):
+        own = [point for point in points if point.group == number]
+        text = f"{len(own)} of {count} compared among themselves only: {difference} ({_names(own)})"
+        findings.append(Finding("not_comparable", "note", None, len(own), None, text))
+    return findings
+
+
+def _names(readings: Sequence[LeakReading]) -> str:
+    return ", ".join(reading.file for reading in readings[:3]) + (", ..." if len(readings) > 3 else "")
+
+
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    """Return what orders names with numbers as people do: day_2 before day_10."""
+    parts = re.findall(r"\d+|\D+", name)
+    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts]
 
 
 def _change(scale: float | None, other: float | None) -> float:
     return 0.0 if scale is None or other is None else scale / other - 1.0
 
 
-def _alike(scale: float | None, other: float | None) -> bool:
-    return bool(abs(_change(scale, other)) <= beliefs("trend")["own"]["scale"])
-
-
-def _clock(ordered: Sequence[LeakReading]) -> list[Finding]:
+def _clock(ordered: Sequence[TrendPoint]) -> list[Finding]:
     """Return what shows that a clock was set back: recordings that overlap, or numbered names against the times.
 
     Recordings of one date without times of day have the same start.
@@ -216,39 +221,14 @@ def _clock(ordered: Sequence[LeakReading]) -> list[Finding]:
     overlaps = [
         f"{early.file} was still recording when {late.file} began: a clock was set back, or they are of two machines"
         for early, late in pairwise(ordered)
-        if early.digest != late.digest and 0.0 < _wait(early, late) < 0.99 * early.duration
+        if early.digest != late.digest and 0.0 < late.start - early.start < 0.99 * early.duration
     ]
     back = [
         f"{late.file} is numbered after {early.file} and has an earlier time: a clock was set back"
-        for early, late in pairwise(sorted(ordered, key=lambda reading: natural(reading.file)))
-        if _wait(early, late) < 0.0
+        for early, late in pairwise(sorted(ordered, key=lambda reading: _natural(reading.file)))
+        if late.start < early.start
     ]
     alike = len({re.split(r"[\d\W_]", reading.file, maxsplit=1)[0].lower() for reading in ordered}) == 1
     # numbers that fall more often are no order
     texts = overlaps or (back if alike and len(back) <= max(2, len(ordered) // 10) else [])
     return [Finding("clock", "warning", None, len(texts), None, texts[0])] if texts else []
-
-
-def _wait(early: LeakReading, late: LeakReading) -> float:
-    return (late.start or 0.0) - (early.start or 0.0)
-
-
-def _named(points: Sequence[TrendPoint], groups: Sequence[str]) -> list[Finding]:
-    """Return findings on what is left out, one for each reason, and on what is compared among itself only."""
-    reasons: dict[str, list[TrendPoint]] = {}
-    for point in points:
-        if point.note:
-            reasons.setdefault(re.sub(r"\d[\d.]*", "#", point.note), []).append(point)  # alike but for its numbers
-    findings = []
-    for own in reasons.values():
-        text = f"{len(own)} of {len(points)} left out: {own[0].note} ({_names([point.file for point in own])})"
-        findings.append(Finding("left_out", "warning", None, len(own), None, text))
-    for number in range(1, len(groups)):
-        files = [point.file for point in points if point.group == number]
-        text = f"{len(files)} of {len(points)} compared among themselves only: {groups[number]} ({_names(files)})"
-        findings.append(Finding("not_comparable", "note", None, len(files), None, text))
-    return findings
-
-
-def _names(files: Sequence[str]) -> str:
-    return ", ".join(files[:3]) + (", ..." if len(files) > 3 else "")

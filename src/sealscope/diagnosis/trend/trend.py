@@ -14,15 +14,15 @@ from sealscope.calls import checked_call
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Interval
 from sealscope.diagnosis.trend.reading import (
-    DAY,
     Basis,
     LeakReading,
     TrendPoint,
+    findings_of,
     reading_of,
     scatter_of,
     timeline,
 )
-from sealscope.diagnosis.trend.wear import DayToDay, Episode, Levels, Wear, beyond, episodes
+from sealscope.diagnosis.trend.wear import Episode, Levels, Wear, beyond, episodes
 from sealscope.diagnosis.verdict.evidence import Verdict
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.severity import RepairLimit
@@ -31,7 +31,7 @@ from sealscope.errors import InputError
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
 from sealscope.storage.plain_values import plain
-from sealscope.units import LITRE_PER_MINUTE
+from sealscope.units import DAY, LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -248,40 +248,46 @@ def trend(
     if every is not None and not (math.isfinite(every) and every > 0.0):
         raise InputError(f"every must be > 0 s, got {every!r}")
     readings = [own if isinstance(own, LeakReading) else reading_of(own, rig) for own in recordings]
-    line = timeline(readings, every)
-    kept = tuple(k for k, point in enumerate(line.points) if point.group >= 0)
-    flows = bool(kept) and all(line.readings[k].states_flow for k in kept)
-    stated = Trend(
+    points, apart = timeline(readings, every)
+    return _judged(points, apart, repair=RepairLimit.of(limit), years=years, healthy=healthy, dated=every is None)
+
+
+def _judged(points: Sequence[TrendPoint], apart: tuple[str, ...], **stated: Any) -> Trend:
+    """Return the trend of readings in the order of their times; `stated`: what the caller states of it."""
+    rows = tuple(k for k, point in enumerate(points) if point.group >= 0)
+    kept = [points[k] for k in rows]
+    flows = bool(kept) and all(own.states_flow for own in kept)
+    trend = Trend(
         verdict="cannot tell",
         reason="",
-        basis=line.basis,
+        basis=kept[0].basis if kept else None,
         unit="L/min" if flows else "%",
-        pressure=float(np.median([line.readings[k].pressure for k in kept])) if flows else None,
-        points=tuple(line.points),
-        groups=line.groups,
+        pressure=float(np.median([own.pressure for own in kept])) if flows else None,
+        points=tuple(points),
+        groups=apart,
         episodes=(),
-        rows=kept,
-        repair=RepairLimit.of(limit),
-        machine=line.readings[0].machine if line.readings else None,
-        findings=tuple(line.findings),
-        years=years,
-        healthy=healthy,
-        dated=every is None,
+        rows=rows,
+        machine=points[0].machine if points else None,
+        findings=tuple(findings_of(points, apart)),
+        **stated,
     )
     if kept:
-        stated = _with_levels(stated, [line.readings[k] for k in kept])
-    verdict, reason = _verdict(stated)
-    return replace(stated, verdict=verdict, reason=reason)
+        trend = _with_levels(trend)
+    verdict, reason = _verdict(trend)
+    return replace(trend, verdict=verdict, reason=reason)
 
 
-def _with_levels(trend: Trend, readings: Sequence[LeakReading]) -> Trend:
+def _with_levels(trend: Trend) -> Trend:
     """Return the trend with its levels and what they say, of one recording or more that can be compared."""
-    levels, prior, allowed = _levels(trend, readings)
+    levels, allowed = _levels(trend)
     few, points, rows = levels.merged(), [*trend.points], trend.rows
-    alone = np.flatnonzero(beyond(levels, prior)[1])
+    alone = np.flatnonzero(beyond(levels)[1])
     apart = "apart from the recordings before and after: it counts as if it were near"
-    files = ", ".join(points[rows[k]].file for k in alone[:3])
-    outliers = Finding("outlier", "warning", None, alone.size, None, f"{alone.size} of {len(points)} {apart} ({files})")
+    findings = [*trend.findings]
+    if alone.size:
+        files = ", ".join(points[rows[k]].file for k in alone[:3])
+        text = f"{alone.size} of {len(points)} {apart} ({files})"
+        findings.append(Finding("outlier", "warning", None, alone.size, None, text))
     for k, row in enumerate(rows):
         value, half = float(levels.value[k]), 1.96 * float(levels.error[k])
         note = apart if k in alone else ""
@@ -290,21 +296,22 @@ def _with_levels(trend: Trend, readings: Sequence[LeakReading]) -> Trend:
     return replace(
         trend,
         points=tuple(points),
-        findings=(*trend.findings, *([outliers] if alone.size else [])),
-        episodes=tuple(episodes(few, prior, years=trend.years, known=known, allowed=allowed)),
+        findings=tuple(findings),
+        episodes=tuple(episodes(few, years=trend.years, known=known, allowed=allowed)),
         rows=tuple(rows[int(np.argmin(np.abs(levels.t - t)))] for t in few.t) if few is not levels else rows,
     )
 
 
-def _levels(trend: Trend, readings: Sequence[LeakReading]) -> tuple[Levels, DayToDay, float | None]:
-    """Return the levels in the trend's unit, their prior, and the rise at which a repair is due, None where unknown."""
-    points = [trend.points[k] for k in trend.rows]
-    t, group = np.array([point.day for point in points]), np.array([point.group for point in points])
-    value, error = (np.array([reading.level[k] for reading in readings]) for k in (0, 1))
-    usual, pressure = float(np.mean(value[: trend.healthy])), float(np.median([own.pressure for own in readings]))
+def _levels(trend: Trend) -> tuple[Levels, float | None]:
+    """Return the levels in the trend's unit, and the rise at which a repair is due, None where unknown."""
+    kept = [trend.points[k] for k in trend.rows]
+    t, group, value, error = (
+        np.array([getattr(own, name) for own in kept]) for name in ("day", "group", "level", "error")
+    )
+    usual, pressure = float(np.mean(value[: trend.healthy])), float(np.median([own.pressure for own in kept]))
     prior = scatter_of(trend.basis or "ringing", usual)
     warmer, slope_sd = np.zeros(t.size), 0.0
-    temperatures = [reading.temperature for reading in readings if reading.temperature is not None]
+    temperatures = [own.temperature for own in kept if own.temperature is not None]
     if trend.basis != "ringing" and len(temperatures) == t.size:
         slope, deviation = (beliefs("inference")["oil"][name] for name in ("per_kelvin", "per_kelvin_deviation"))
         warmer, slope_sd = np.array(temperatures) - temperatures[0], deviation * abs(usual)
@@ -316,10 +323,10 @@ def _levels(trend: Trend, readings: Sequence[LeakReading]) -> tuple[Levels, DayT
     allowed = None
     if trend.repair.kind == "flow" and flows:
         allowed = trend.repair.value / LITRE_PER_MINUTE
-    elif trend.repair.kind == "creep" and readings[0].area is not None:
-        allowed = trend.repair.value * readings[0].area / pressure * unit
-    levels = Levels(t, value * unit, error * unit, group, warmer, slope_sd * unit)
-    return levels, prior._replace(scale=prior.scale * unit), allowed
+    elif trend.repair.kind == "creep" and kept[0].area is not None:
+        allowed = trend.repair.value * kept[0].area / pressure * unit
+    prior = prior._replace(scale=prior.scale * unit)
+    return Levels(t, value * unit, error * unit, group, warmer, prior, slope_sd * unit), allowed
 
 
 def _verdict(trend: Trend) -> tuple[Verdict, str]:

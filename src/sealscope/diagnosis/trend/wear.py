@@ -39,18 +39,10 @@ from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Interval
 from sealscope.recordings.recording import Array
 from sealscope.signals.filters import IntArray
+from sealscope.units import DAYS_PER_MONTH, DAYS_PER_YEAR
 
-#: Days of a month: a growth is stated per month.
-MONTH = 365.25 / 12.0
 #: Deviation of a prior that says nothing, over scatter and range of the values: its square leaves half of the digits.
 _WIDE, _TINY = 1e2, 1e-10
-
-
-class Level(NamedTuple):
-    """Level that a recording states, and the standard error of it."""
-
-    value: float
-    error: float
 
 
 class DayToDay(NamedTuple):
@@ -62,7 +54,7 @@ class DayToDay(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """Levels (n,) of n recordings in the order of their times.
+    """Levels (n,) of n recordings in the order of their times, and the `prior` on their scatter.
 
     `t` [days]; `value`; `error`: standard deviation that each states of itself; `group` (n,): number of the group that
     shares a mean; `covariate` (n,) with the standard deviation `slope_sd` of its coefficient, 0 for none.
@@ -73,6 +65,7 @@ class Levels:
     error: Array
     group: IntArray
     covariate: Array
+    prior: DayToDay
     slope_sd: float = 0.0
 
     def __len__(self) -> int:
@@ -81,7 +74,7 @@ class Levels:
     def part(self, rows: slice) -> Levels:
         """Return some of the recordings."""
         t, value, error, covariate = (own[rows] for own in (self.t, self.value, self.error, self.covariate))
-        return Levels(t, value, error, self.group[rows], covariate, self.slope_sd)
+        return Levels(t, value, error, self.group[rows], covariate, self.prior, self.slope_sd)
 
     @property
     def interval(self) -> float:
@@ -89,8 +82,10 @@ class Levels:
         waits = np.diff(self.t)
         return float(np.median(waits[waits > 0.0])) if np.any(waits > 0.0) else 1.0
 
-    def scatter(self, prior: DayToDay) -> float:
-        """Return the deviation of a recording from its neighbours: their median step, shrunk towards the prior."""
+    @property
+    def scatter(self) -> float:
+        """Deviation of a recording from its neighbours: their median step, shrunk towards the prior."""
+        prior = self.prior
         steps = np.abs(np.diff(self.value))[np.diff(self.group) == 0] / math.sqrt(2.0)
         known = prior.scale**2 + (float(np.mean(self.error**2)) if len(self) else 0.0)
         own = (1.4826 * float(np.median(steps))) ** 2 if steps.size else 0.0
@@ -105,10 +100,10 @@ class Levels:
         rows = [run[k : k + each] for run in runs for k in range(0, run.size, each)]
         t, value, covariate = (np.array([own[r].mean() for r in rows]) for own in (self.t, self.value, self.covariate))
         error = np.array([math.sqrt(np.sum(self.error[r] ** 2)) / r.size for r in rows])
-        return Levels(t, value, error, self.group[[r[0] for r in rows]], covariate, self.slope_sd)
+        return Levels(t, value, error, self.group[[r[0] for r in rows]], covariate, self.prior, self.slope_sd)
 
 
-def beyond(levels: Levels, prior: DayToDay) -> tuple[Array, Array]:
+def beyond(levels: Levels) -> tuple[Array, Array]:
     """Return what of each value does not count while it is the last one, and what not once the next one is known.
 
     That is what lies beyond some deviations of the three before it, unless its neighbour lies as far out.
@@ -119,7 +114,7 @@ def beyond(levels: Levels, prior: DayToDay) -> tuple[Array, Array]:
         place = int(np.searchsorted(same, k))
         before, after = levels.value[same[max(place - 3, 0) : place]], levels.value[same[place + 1 : place + 2]]
         if before.size:
-            reach, middle = outlier * levels.part(slice(0, k)).scatter(prior), float(np.median(before))
+            reach, middle = outlier * levels.part(slice(0, k)).scatter, float(np.median(before))
             apart = levels.value[k] - middle
             agree = [np.sign(apart) * (other - middle) > reach for other in (before[-1], *after)]
             last[k] = 0.0 if agree[0] else np.sign(apart) * max(abs(apart) - reach, 0.0)
@@ -148,8 +143,8 @@ class _Changes(NamedTuple):
         believed = beliefs("trend")["change"]
         begin = np.arange(max(known, 1), len(levels))
         step = (np.arange(len(levels))[:, None] >= begin).astype(float)
-        growth = np.maximum(levels.t[:, None] - levels.t[begin - 1], 0.0) / MONTH
-        slopes = [] if steps_only else [MONTH / levels.interval / many for many in believed["intervals"]]
+        growth = np.maximum(levels.t[:, None] - levels.t[begin - 1], 0.0) / DAYS_PER_MONTH
+        slopes = [] if steps_only else [DAYS_PER_MONTH / levels.interval / many for many in believed["intervals"]]
         steps = len(believed["steps"])
         scale = np.array([*believed["steps"], *slopes], dtype=float)[:, None]
         grows = np.arange(scale.size)[:, None] >= steps
@@ -183,19 +178,19 @@ class _Node(NamedTuple):
     yields: Array
 
 
-def _nodes(levels: Levels, prior: DayToDay, shapes: Array, *, sloping: bool = False) -> list[_Node]:
+def _nodes(levels: Levels, shapes: Array, *, sloping: bool = False) -> list[_Node]:
     """Return every node of the grid, for changes (n, m); `sloping`: the level may have grown evenly before."""
     from scipy.linalg import solve_triangular
 
-    believed = beliefs("trend")["between"]
-    last, later = beyond(levels, prior)
+    believed, prior = beliefs("trend")["between"], levels.prior
+    last, later = beyond(levels)
     values = levels.value - levels.value[0] - later
     reach = max(prior.scale, 0.3 * float(np.ptp(levels.value)))
     wide = (_WIDE * reach) ** 2
     mean = wide * (levels.group == levels.group[-1])
     shared = wide * (levels.group[:, None] == levels.group) + levels.slope_sd**2 * np.outer(*(levels.covariate,) * 2)
     if sloping:
-        grown = 10.0 * levels.scatter(prior) / levels.interval * (levels.t - levels.t[0])
+        grown = 10.0 * levels.scatter / levels.interval * (levels.t - levels.t[0])
         shared += np.outer(grown, grown)
     waits = np.abs(levels.t[:, None] - levels.t)
     lasting = np.mean([np.exp(-waits / time) for time in believed["times"]], axis=0)
@@ -241,7 +236,7 @@ class Path(NamedTuple):
         return int(over[0]) if over.size else None
 
 
-def search(levels: Levels, prior: DayToDay, known: int = 1, *, falls: bool = False, sloping: bool = False) -> Path:
+def search(levels: Levels, known: int = 1, *, falls: bool = False, sloping: bool = False) -> Path:
     """Run the sequential test for a rise (a step or a growth), or for a fall (a step).
 
     `known`: how many of the first recordings are known to be of a machine that has not changed; `sloping`: whether the
@@ -253,7 +248,7 @@ def search(levels: Levels, prior: DayToDay, known: int = 1, *, falls: bool = Fal
     terms, null = np.full((n, changes.begin.size), -np.inf), np.full(n, -np.inf)
     if not changes.begin.size:
         return Path(null, np.zeros(n, dtype=np.int64))
-    for node in _nodes(levels, prior, changes.shape, sloping=sloping):
+    for node in _nodes(levels, changes.shape, sloping=sloping):
         null = np.logaddexp(null, node.log)
         a, b = node.a[:, changes.column], node.b[:, changes.column]
         terms = np.logaddexp(terms, node.log[:, None] + _log_ratio(a, b, changes.scale * node.tau))
@@ -271,12 +266,12 @@ class _Draws(NamedTuple):
     base: Array
 
     @classmethod
-    def of(cls, levels: Levels, prior: DayToDay, changes: _Changes, *, signed: bool = False) -> _Draws:
+    def of(cls, levels: Levels, changes: _Changes, *, signed: bool = False) -> _Draws:
         """Return draws; `signed`: the size may be of either sign, its prior flat."""
         from scipy.special import ndtr, ndtri
 
         random, count = np.random.default_rng(20), 4000
-        nodes = _nodes(levels, prior, changes.shape)
+        nodes = _nodes(levels, changes.shape)
         a, b = (np.stack([getattr(node, name)[-1][changes.column] for node in nodes]) for name in ("a", "b"))
         scale = changes.scale * np.array([[node.tau] for node in nodes])
         v = 1.0 / (a + scale**-2)
@@ -320,7 +315,7 @@ def _interval(draws: Array) -> Interval:
     return Interval(float(middle), float(low), float(high))
 
 
-def describe(levels: Levels, prior: DayToDay, allowed: float | None, alarmed: int | None) -> Wear:
+def describe(levels: Levels, allowed: float | None, alarmed: int | None) -> Wear:
     """Return level, growth and time to a limit after the last recording.
 
     `allowed`: rise of the level at which a repair is due, None where none is stated; `alarmed`: first recording that
@@ -328,14 +323,14 @@ def describe(levels: Levels, prior: DayToDay, allowed: float | None, alarmed: in
     estimated, of either sign and with a wide prior. Recordings of less than a day state no growth by a month.
     """
     spans, rises = levels.t[-1] - levels.t[0] >= 1.0, alarmed is not None
-    even = (levels.t - levels.t[0]) / MONTH if spans else np.zeros(len(levels))
-    changes = _Changes.after(levels, 1) if rises else _Changes.single(even, _WIDE * MONTH / levels.interval)
-    draws = _Draws.of(levels, prior, changes, signed=not rises)
+    even = (levels.t - levels.t[0]) / DAYS_PER_MONTH if spans else np.zeros(len(levels))
+    changes = _Changes.after(levels, 1) if rises else _Changes.single(even, _WIDE * DAYS_PER_MONTH / levels.interval)
+    draws = _Draws.of(levels, changes, signed=not rises)
     grows = changes.grows[draws.change]
     now = draws.base + draws.size * changes.shape[-1, changes.column[draws.change]]
     slope, growing = np.where(grows, draws.size, 0.0), float(np.mean(grows)) >= 0.5
     before = levels.part(slice(0, alarmed))
-    usual = _Draws.of(before, prior, _Changes.single(np.zeros(len(before)), 1.0))
+    usual = _Draws.of(before, _Changes.single(np.zeros(len(before)), 1.0))
     error = float(np.mean(before.error[before.group == before.group[-1]] ** 2))
     noise = np.random.default_rng(21).standard_normal(usual.tau.size)
     healthy = _interval(usual.base + np.sqrt(usual.tau**2 + error) * noise)._replace(value=float(usual.base.mean()))
@@ -344,7 +339,7 @@ def describe(levels: Levels, prior: DayToDay, allowed: float | None, alarmed: in
     if allowed is not None:
         limit = healthy.value + allowed
         with np.errstate(divide="ignore", invalid="ignore"):
-            wait = np.where(slope > 0.0, (limit - now) / slope, math.inf) * MONTH
+            wait = np.where(slope > 0.0, (limit - now) / slope, math.inf) * DAYS_PER_MONTH
         reach = _interval(np.where(now >= limit, 0.0, wait)) if spans else unknown._replace(low=0.0)
     return Wear(
         now=_interval(now),
@@ -372,28 +367,26 @@ class Episode(NamedTuple):
     fell: bool
 
 
-def episodes(
-    levels: Levels, prior: DayToDay, *, years: float, known: int = 1, allowed: float | None = None
-) -> list[Episode]:
+def episodes(levels: Levels, *, years: float, known: int = 1, allowed: float | None = None) -> list[Episode]:
     """Return the stretches between repairs, each with its alarm.
 
     `years`: a healthy machine has one false alarm in so many, on average or less often; `known`: how many of the first
     recordings are of a healthy machine; `allowed`: rise at which a repair is due. A repair is a fall of the level that
     the same test finds; the level starts anew there, and the scatter seen before is kept in the prior.
     """
-    days, begin, result = years * 365.25, 0, list[Episode]()
+    days, begin, result = years * DAYS_PER_YEAR, 0, list[Episode]()
     while begin < len(levels):
         part = levels.part(slice(begin, None))
-        rise, fall = search(part, prior, known), search(part, prior, known, falls=True)
+        rise, fall = search(part, known), search(part, known, falls=True)
         alarm, dropped, first = rise.alarm(days), fall.alarm(days), 0
         if alarm is not None and (dropped is None or alarm < dropped):  # worn: what falls back to its beginning
             first = int(rise.first[alarm])
-            fall = search(part.part(slice(first, None)), prior, 2, falls=True, sloping=True)
+            fall = search(part.part(slice(first, None)), 2, falls=True, sloping=True)
             dropped = fall.alarm(days)
         end = len(part) if dropped is None else max(first + int(fall.first[dropped]), 1)
         alarm = None if alarm is None or alarm >= end else alarm
-        wear = describe(part.part(slice(0, end)), prior, allowed, None if alarm is None else int(rise.first[end - 1]))
+        wear = describe(part.part(slice(0, end)), allowed, None if alarm is None else int(rise.first[end - 1]))
         result.append(Episode(begin, begin + end, None if alarm is None else begin + alarm, wear, bool(result)))
-        prior = DayToDay(wear.scatter, prior.freedom + min(end - 1, 20))
+        levels = replace(levels, prior=DayToDay(wear.scatter, levels.prior.freedom + min(end - 1, 20)))
         begin, known = begin + end, 1
     return result

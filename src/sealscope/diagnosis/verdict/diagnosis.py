@@ -30,6 +30,11 @@ _COLUMNS = (
     *("file", "start", "machine", "verdict", "reason", "onset_s", "leak_lpm", "bound_lpm", "score", "threshold"),
     *("chance", "odds", "false_alarm_probability", "cause", "summary", "next_check"),
 )
+#: What a diagnosis as JSON begins with, by the names of its fields.
+_FIRST = (
+    *("file", "verdict", "reason", "onset_s", "onset_interval_s", "leak_lpm", "leak_interval_lpm", "bound_lpm"),
+    *("unused", "false_alarm_probability", "score", "threshold"),
+)
 #: What the file of a recording may call its machine.
 _MACHINES = ("machine", "actuator", "asset", "serial number", "serial", "rig", "test rig", "maschine", "prüfstand")
 
@@ -194,18 +199,7 @@ class Diagnosis(Evidence):
         names = ("code", "channel", "count", "first_t", "severity", "text")
         return plain(  # type: ignore[no-any-return]
             {
-                "file": self.file,
-                "verdict": self.verdict,
-                "reason": self.reason,
-                "onset_s": self.onset_s,
-                "onset_interval_s": self.onset_interval_s,
-                "leak_lpm": self.leak_lpm,
-                "leak_interval_lpm": self.leak_interval_lpm,
-                "bound_lpm": self.bound_lpm,
-                "unused": self.unused,
-                "false_alarm_probability": self.false_alarm_probability,
-                "score": self.score,
-                "threshold": self.threshold,
+                **{name: getattr(self, name) for name in _FIRST},
                 "methods": methods,
                 "quality": [{name: getattr(own, name) for name in names} for own in self.quality],
                 "cause": self.cause,

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.recordings.recording import Array
 
 Verdict = Literal["leak", "no leak", "cannot tell"]
@@ -25,8 +26,8 @@ NO_RIG = "L/min is not stated: no rig was stated (--rig)"
 Figure = Literal["onset_s", "leak_lpm"]
 #: The causes for which the verdict is `leak`: piston and pump lie in parallel, and often no channel tells them apart.
 LEAKS: tuple[Cause, ...] = ("piston leak", "piston or pump leak")
-#: Smallest chance that is stated: no null distribution is known further out.
-RAREST = 1e-4
+#: Smallest chance that is stated.
+RAREST: float = beliefs("verdict")["false_alarm"]["rarest"]
 #: The detector that judges where no other can: it sees that something changed, and states no size.
 LEAST_SPECIFIC = "rms change"
 
@@ -185,15 +186,3 @@ class Evidence:
             return "more than 1 in 5 healthy recordings look like this"
         times = f"{float(f'{1.0 / self.stated_chance:.2g}'):,.0f}".replace(",", " ")
         return f"{'fewer than ' if self.stated_chance == RAREST else ''}1 in {times} healthy recordings looks like this"
-
-
-def without_flow(evidence: Evidence, why: str) -> Evidence:
-    """Return the evidence without L/min, which is refused, and with the reason for that."""
-    return replace(
-        evidence,
-        reason=f"{evidence.reason}; {why}",
-        leak_lpm=None,
-        leak_interval_lpm=None,
-        course=None,
-        refuses=evidence.refuses | {"leak_lpm"},
-    )

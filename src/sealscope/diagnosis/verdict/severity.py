@@ -13,13 +13,12 @@ from sealscope.diagnosis.verdict.evidence import Evidence, RelativeLeak
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
-from sealscope.units import LITRE_PER_MINUTE, parse_quantity
+from sealscope.units import LITRE_PER_MINUTE, ML_PER_MINUTE, MM_PER_MINUTE, parse_quantity
 
 #: How much of the limit a leak takes: surely all of it, maybe half of it or more, surely less than half of it.
 Level = Literal["repair", "plan", "monitor"]
 #: A figure with its 95 % interval, None where it is not known.
 _Figure = tuple[float, float, float] | None
-_ML_PER_MINUTE, _MM_PER_MINUTE = 1e-3 * LITRE_PER_MINUTE, 1e-3 / 60.0
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ class RepairLimit:
     def of(cls, text: str | None) -> RepairLimit:
         """Return the limit that a text states as a flow or a speed with its unit, the default one for None."""
         if text is None:
-            return cls(beliefs("verdict")["repair"]["creep"] * _MM_PER_MINUTE, "creep", stated=False)
+            return cls(beliefs("verdict")["repair"]["creep"] * MM_PER_MINUTE, "creep", stated=False)
         for kind, unit in (("flow", "m^3/s"), ("creep", "m/s")):
             try:
                 value = parse_quantity(text, unit, name="limit")
@@ -53,14 +52,14 @@ class RepairLimit:
 
     def __str__(self) -> str:
         if self.kind == "flow":
-            return f"{self.value / _ML_PER_MINUTE:.3g} mL/min"
-        return f"{self.value / _MM_PER_MINUTE:.3g} mm/min of creep"
+            return f"{self.value / ML_PER_MINUTE:.3g} mL/min"
+        return f"{self.value / MM_PER_MINUTE:.3g} mm/min of creep"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the limit as plain JSON values; the one that it does not state is null."""
         return {
-            "mL_per_min": self.value / _ML_PER_MINUTE if self.kind == "flow" else None,
-            "creep_mm_per_min": self.value / _MM_PER_MINUTE if self.kind == "creep" else None,
+            "mL_per_min": self.value / ML_PER_MINUTE if self.kind == "flow" else None,
+            "creep_mm_per_min": self.value / MM_PER_MINUTE if self.kind == "creep" else None,
             "stated": self.stated,
         }
 
@@ -105,20 +104,16 @@ def severity(evidence: Evidence, limit: RepairLimit, *, trusts_position: bool = 
 
     `trusts_position`: a speed of the piston is stated; not where the geometry as measured contradicts the stated one.
     """
-    relative = evidence.relative
-    if evidence.verdict != "leak" or (evidence.leak_lpm is None and relative is None):
+    if evidence.verdict != "leak" or (evidence.leak_lpm is None and evidence.relative is None):
         return None
+    relative = evidence.relative or RelativeLeak()
     flow = _figure(evidence.leak_lpm, evidence.leak_interval_lpm, LITRE_PER_MINUTE)
-    creep = share = None
-    if relative is not None:
-        share = _figure(relative.pump_share, relative.pump_share_interval)
-        creep = _figure(relative.creep, relative.creep_interval) if trusts_position else None
-    against = flow if limit.kind == "flow" else creep
+    creep = _figure(relative.creep, relative.creep_interval) if trusts_position else None
     return Severity(
-        mL_per_min=_over(flow, _ML_PER_MINUTE),
-        pump_share=share,
-        creep_mm_per_min=_over(creep, _MM_PER_MINUTE),
-        of_limit=_over(against, limit.value),
+        mL_per_min=_over(flow, ML_PER_MINUTE),
+        pump_share=_figure(relative.pump_share, relative.pump_share_interval),
+        creep_mm_per_min=_over(creep, MM_PER_MINUTE),
+        of_limit=_over(flow if limit.kind == "flow" else creep, limit.value),
     )
 
 

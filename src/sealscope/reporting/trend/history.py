@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.trend.reading import DAY
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
 from sealscope.reporting import charts, messages, template
 from sealscope.reporting.trend.page import level_chart
 from sealscope.reporting.trend.text import stamp
+from sealscope.units import DAY
 
 
 class Judged(NamedTuple):

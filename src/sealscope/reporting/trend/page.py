@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from sealscope.diagnosis.trend.trend import Trend
-from sealscope.diagnosis.trend.wear import MONTH, Episode
+from sealscope.diagnosis.trend.wear import Episode
 from sealscope.reporting import messages, template
 from sealscope.reporting.picture import Scale
 from sealscope.reporting.trend import text
+from sealscope.units import DAYS_PER_MONTH
 
 #: Sizes of the picture: for a screen, and for a telephone; the margins round its frame.
 SIZES = {"wide": (900.0, 320.0), "narrow": (420.0, 300.0)}
@@ -130,7 +131,7 @@ def _course(days: list[float], own: Episode) -> list[tuple[float, float]]:
     first, last, wear = days[own.begin], days[own.end - 1], own.wear
     if own.alarm is None or wear.onset is None:
         rise = wear.growth.value if math.isfinite(wear.growth.value) else 0.0
-        return [(first, wear.now.value - rise * (last - first) / MONTH), (last, wear.now.value)]
+        return [(first, wear.now.value - rise * (last - first) / DAYS_PER_MONTH), (last, wear.now.value)]
     onset = min(max(wear.onset.value, first), last)
     stepped = [(onset, wear.now.value)] if wear.step else []
     return [(first, wear.healthy.value), (onset, wear.healthy.value), *stepped, (last, wear.now.value)]

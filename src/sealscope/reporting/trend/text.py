@@ -11,10 +11,10 @@ import numpy as np
 
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Interval
-from sealscope.diagnosis.trend.reading import DAY
 from sealscope.diagnosis.trend.trend import Trend
 from sealscope.recordings.formats.columns import counted
 from sealscope.reporting.messages import machine_text, number, say
+from sealscope.units import DAY, DAYS_PER_YEAR
 
 
 def moment(trend: Trend, day: float) -> str:
@@ -105,7 +105,7 @@ def _reach(trend: Trend, limit: float, reach: Interval) -> str:
     if trend.alarm is not None and reach.value <= furthest:
         return f"{named}, reached {value} ({low} to {high}) if it goes on so"
     if reach.low > furthest:
-        return f"{named}, not within {furthest / 365.25:.0f} years"
+        return f"{named}, not within {furthest / DAYS_PER_YEAR:.0f} years"
     if reach.low * max(len(trend.rows) - 1, 1) < last - first or math.isnan(reach.value):
         return f"{named}; the recordings are too few to say when"
     return f"{named}, not before {low} (95 %)"
