@@ -31,6 +31,7 @@ from numba import carray
 
 from sealscope.compiled import large_law, law, record_at
 from sealscope.diagnosis.inference.blocks import Columns
+from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.inference.row_weights import SUPPORT, Workspace, median, weigh, workspace_shapes
 from sealscope.diagnosis.inference.terms import ATMOSPHERE, HALF_DIFFERENCE, LEAST_ABSOLUTE
 from sealscope.diagnosis.inference.weak_form import LARGEST, SPAN, STRIDE, stride_samples, test_function
@@ -63,7 +64,6 @@ READ = "pump.q_b"
 WINDOW = 20
 #: Walk of a block over its noise (variances) in a healthy machine: the oil's warming shows from block to block.
 WALK = 3.0
-_95 = 1.96
 _SIZE = VALUES.index(READ)
 #: The columns in the order of `_increments`: the terms' names, and the left side.
 COLUMNS = (
@@ -397,7 +397,7 @@ def _write_results(m: Any, error: float, quantiles: Any, out: Any) -> None:
         return
     G, flow = _mean(last, newest, n, 0), _mean(last, newest, n, 4)
     half = math.hypot(
-        quantiles[n - 2] * math.sqrt(_variance(last, newest, n)), _95 * math.sqrt(_mean(last, newest, n, 3))
+        quantiles[n - 2] * math.sqrt(_variance(last, newest, n)), WITHIN_95 * math.sqrt(_mean(last, newest, n, 3))
     )
     out[0], out[1], out[2], out[6] = flow * G, flow * (G - half), flow * (G + half), G
     n = min(count - WINDOW, WINDOW)
@@ -408,7 +408,7 @@ def _write_results(m: Any, error: float, quantiles: Any, out: Any) -> None:
     before = max((m.base_square - WINDOW * base**2) / (WINDOW - 1.0), m.base_variance / WINDOW)
     walked = WALK * (count - 0.5 * (n + WINDOW)) / (1.0 + WALK * (WINDOW + 1.0) / 6.0)
     variance = _variance(last, newest, n) + before * (1.0 / WINDOW + walked)
-    half = math.hypot(quantiles[n - 2] * math.sqrt(variance), _95 * error * rise)
+    half = math.hypot(quantiles[n - 2] * math.sqrt(variance), WITHIN_95 * error * rise)
     out[3], out[4], out[5], out[9] = flow * rise, flow * (rise - half), flow * (rise + half), 1.0
 
 

@@ -31,8 +31,9 @@ from sealscope.storage.plain_state import array_of, part_of, plain_array
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Longest and shortest block, and how many a recording has where it is long enough for these [s].
-LONGEST, SHORTEST, WANTED = 3.0, 0.5, 20
+_BLOCKS = beliefs("inference")["blocks"]
+LONGEST: float = _BLOCKS["longest"]
+SHORTEST: float = _BLOCKS["shortest"]
 #: Turns by which the terms are taken about a zero of p_A - p_B, and how near to it they are, as a share of what is
 #: believed of one: a root is not linear in it, nor is which side carries.
 TURNS, NEAR = 2, 3.0
@@ -265,7 +266,7 @@ def blocks_of(recording: Recording, rig: Rig) -> tuple[Blocks, Blocks, tuple[Col
     needed = {"x", "p_A", "p_B", *(name for balance in balances for term in balance.terms for name in term.needs)}
     needed |= {next(name for name in ("theta", "omega", "q_pump", "u") if name in names)}
     samples = whole_samples(recording, needed)
-    seconds = min(LONGEST, max(SHORTEST, recording.duration / WANTED))
+    seconds = min(LONGEST, max(SHORTEST, recording.duration / _BLOCKS["wanted"]))
     zero = 0.0
     blocks, plain = None, None
     for _ in range(TURNS):

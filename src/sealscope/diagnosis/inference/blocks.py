@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Information
-from sealscope.diagnosis.inference.row_weights import SUPPORT, weighted
+from sealscope.diagnosis.inference.row_weights import MOST_TURNS, RIDGE, SUPPORT, TOLERANCE, weighted
 from sealscope.diagnosis.inference.terms import BIAS, LEAK, Equation
 from sealscope.diagnosis.inference.weak_form import OVERLAP
 from sealscope.errors import InputError
@@ -38,9 +38,7 @@ MOST_BLOCKS = 240
 DRIFT_DEGREE = 2
 #: Beliefs of the coefficients that are free in each block while its rows are weighted.
 UNSTEADY = ("leak", "pump", "bias", "outside")
-_RIDGE = 1e-10  # of a matrix whose diagonal is 1
 _TURNS = 3
-_MOST, _TOLERANCE = 50, 1e-2  # turns to a fixed point at most, and the relative change that ends them
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +204,7 @@ def solve(matrix: Array, right: Array) -> Array:
     size[~(size > 0.0)] = 1.0
     column = size[:, None]
     scaled = matrix / column / size
-    scaled.flat[:: len(size) + 1] += _RIDGE
+    scaled.flat[:: len(size) + 1] += RIDGE
     shaped = right / (size if right.ndim == 1 else column)
     _, solved, failed = _cholesky()(scaled, shaped) if shaped.size else (None, shaped, 0)
     if failed:  # rounding made it no longer positive
@@ -307,7 +305,7 @@ def _fitted(normal: _Normal, believed: _Belief, degrees: int, rows: float) -> _F
     square = normal.square - float((normal.lead**2 / energy).sum())
     least = 1e-14 * normal.square / rows
     variance = max(square / rows, least)
-    for _ in range(_MOST):
+    for _ in range(MOST_TURNS):
         belief, mean = np.zeros((2, len(believed.drift), degrees))
         with np.errstate(divide="ignore", over="ignore"):
             belief[:, 0] = OVERLAP * variance / believed.level**2
@@ -319,7 +317,7 @@ def _fitted(normal: _Normal, believed: _Belief, degrees: int, rows: float) -> _F
         lead = precision * mean.ravel()
         coefficients = solve(cross + np.diag(precision), left + lead)
         before, variance = variance, max(square - float(left @ coefficients), least) / rows
-        if abs(variance - before) <= _TOLERANCE * before:
+        if abs(variance - before) <= TOLERANCE * before:
             break
     return _Fitted(coefficients, precision, lead, max(OVERLAP * variance, np.finfo(float).tiny))
 
@@ -351,7 +349,7 @@ def _fit(gram: Array, blocks: Blocks, columns: Columns, test: int, others: list[
         normal = _normal(_about(gram, columns, test, slope, zero), powers, chosen, test, columns.left)
         fitted = _fitted(normal, believed._replace(at=zero), degrees, rows)
         step = float(fitted.coefficients[-degrees])
-        if turn == _TURNS or not width > 0.0 or (turn > 0 and abs(step) <= _TOLERANCE * width):
+        if turn == _TURNS or not width > 0.0 or (turn > 0 and abs(step) <= TOLERANCE * width):
             break
         zero += step
         slope = (normal.lead - normal.along @ fitted.coefficients) / np.maximum(normal.energy, np.finfo(float).tiny)

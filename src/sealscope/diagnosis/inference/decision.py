@@ -20,7 +20,16 @@ import numpy as np
 
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, information, mean_of, zero_of
-from sealscope.diagnosis.inference.onset import Course, Information, Interval, StepTest, course, step_test
+from sealscope.diagnosis.inference.onset import (
+    BELOW_95,
+    WITHIN_95,
+    Course,
+    Information,
+    Interval,
+    StepTest,
+    course,
+    step_test,
+)
 from sealscope.diagnosis.inference.other_steps.causes import StepHypothesis, hypotheses, probabilities
 from sealscope.diagnosis.inference.other_steps.causes import stepped as stepped_cause
 from sealscope.diagnosis.inference.other_steps.step import other_step
@@ -44,10 +53,7 @@ from sealscope.units import LITRE_PER_MINUTE
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Share of the false-alarm probability that a question has beside another: the change within the recording where there
-#: is a baseline, the level against the rig's file where there is none.
-SECOND = 0.25
-_95, _ONE_SIDED, _SURE = 1.96, 1.645, 0.95
+SECOND: float = beliefs("inference")["verdict"]["second"]
 
 
 class Size(NamedTuple):
@@ -199,7 +205,7 @@ def _size(balance: RecordedBalance) -> Size:
     apart = abs(1.0 / ratio.value - 1.0)
     known = float(np.hypot(believed["displacement"], believed["area"]))
     if states_displacement:
-        disagrees = rig.states("cylinder.A_A", "cylinder.A_B") and apart > _95 * known
+        disagrees = rig.states("cylinder.A_A", "cylinder.A_B") and apart > WITHIN_95 * known
         deviation = apart if disagrees else believed["displacement"]
         return Size(1.0, deviation, pressures, ratio, area.measured, disagrees)
     if rig.states("cylinder.A_A", "cylinder.A_B"):
@@ -222,7 +228,7 @@ def _area(balance: RecordedBalance, motion: list[int]) -> _Area:
     energy = np.einsum("kii->i", balance.blocks.gram[:, 0])[motion]
     shares = energy / max(float(energy.sum()), np.finfo(float).tiny)
     value, deviation = mean_of(balance.blocks, column, dict(zip(motion, shares, strict=True)))
-    value, half = abs(value), _95 * deviation
+    value, half = abs(value), WITHIN_95 * deviation
     stated = [cylinder.A_A if column.names[k].endswith("A carries") else cylinder.A_B for k in motion]
     return _Area(value, value - half, value + half, float(shares @ stated))
 
@@ -245,7 +251,7 @@ def judge(balance: RecordedBalance, probability: float, baseline: Sequence[Recor
         judging = questions[0]
         bound = bound_of(balance, against)
         enough = balance.moving > 0.0 and bound <= beliefs("inference")["worth"]["share"] * balance.moving
-        enough &= sum(causes.get(own, 0.0) for own in LEAKS) < 1.0 - _SURE  # a change that may as well be a leak
+        enough &= not may_be_leak(causes)
         cause = stepped_cause(balance.hypotheses, probability, other_step(balance.recording, probability))
         evidence = Evidence("no leak" if enough else "cannot tell", "", cause=None if cause in LEAKS else cause)
     else:
@@ -257,7 +263,8 @@ def judge(balance: RecordedBalance, probability: float, baseline: Sequence[Recor
             evidence = _flow(balance, evidence, *_of_rise(balance, against))
         else:
             level, pressure = balance.level, balance.mean(0)
-            evidence = _flow(balance, evidence, level.value * pressure, (level.high - level.low) * pressure / (2 * _95))
+            deviation = (level.high - level.low) * pressure / (2 * WITHIN_95)
+            evidence = _flow(balance, evidence, level.value * pressure, deviation)
     return _with_figures(balance, evidence, against, questions, judging)
 
 
@@ -283,7 +290,7 @@ def questions_of(balance: RecordedBalance, against: Rise | None, probability: fl
     if not (healthy > 0.0 and against is None and balance.size.stated and measured):
         return questions(balance.test, against, probability)
     own = balance.level
-    deviation = float(np.hypot((own.high - own.low) / (2 * _95), own.value * balance.size.deviation))
+    deviation = float(np.hypot((own.high - own.low) / (2 * WITHIN_95), own.value * balance.size.deviation))
     level = (own.value - healthy) / max(deviation, np.finfo(float).tiny)
     return questions(balance.test, against, probability, level)
 
@@ -322,6 +329,12 @@ def is_leak(causes: dict[Cause, float]) -> bool:
     return max(leak, pump) > others and leak > RAREST * pump
 
 
+def may_be_leak(causes: dict[Cause, float]) -> bool:
+    """Whether a change that has one of these causes may as well be a leak past the piston."""
+    sure: float = beliefs("inference")["verdict"]["sure"]
+    return sum(causes.get(own, 0.0) for own in LEAKS) >= 1.0 - sure
+
+
 def _together(balance: RecordedBalance) -> Cause:
     return "piston or pump leak" if len(balance.columns) == 1 else "piston leak"
 
@@ -353,7 +366,7 @@ def _step(balance: RecordedBalance, causes: dict[Cause, float]) -> Evidence:
 def _of_rise(balance: RecordedBalance, against: Rise) -> tuple[float, float]:
     """Return a rise against the baseline and its deviation as flows [m^3/s]."""
     pressure = balance.mean(0)
-    half = 0.5 * (against.interval()[1] - against.interval()[0]) / _95
+    half = 0.5 * (against.interval()[1] - against.interval()[0]) / WITHIN_95
     return against.value * pressure, half * pressure
 
 
@@ -361,13 +374,14 @@ def _flow(balance: RecordedBalance, evidence: Evidence, value: float, deviation:
     """Return the evidence with the flow [m^3/s] of a leak and its deviation, as far as the machine's size is known."""
     size = balance.size
     pump = balance.mean(2)
-    half = _95 * float(np.linalg.norm([deviation, value * size.deviation, value * beliefs("inference")["size"]["law"]]))
+    deviations = [deviation, value * size.deviation, value * beliefs("inference")["size"]["law"]]
+    half = WITHIN_95 * float(np.linalg.norm(deviations))
     low, high = max(value - half, 0.0), value + half
     relative = RelativeLeak(
         pump_share=value / pump if pump > 0.0 else None,
-        pump_share_interval=_over((value - _95 * deviation, value + _95 * deviation), pump),
+        pump_share_interval=_over((value - WITHIN_95 * deviation, value + WITHIN_95 * deviation), pump),
         creep=None if size.area is None else value / size.area,
-        creep_interval=_over((value - _95 * deviation, value + _95 * deviation), size.area),
+        creep_interval=_over((value - WITHIN_95 * deviation, value + WITHIN_95 * deviation), size.area),
     )
     evidence = replace(evidence, relative=relative)
     if not size.stated:
@@ -388,7 +402,7 @@ def bound_of(balance: RecordedBalance, against: Rise | None) -> float:
     elif balance.test is not None:
         bounds.append(balance.test.bound() * balance.mean(0))
     size = float(np.hypot(balance.size.deviation, beliefs("inference")["size"]["law"]))
-    return max(max(bounds, default=np.inf), 0.0) * (1.0 + _ONE_SIDED * size)
+    return max(max(bounds, default=np.inf), 0.0) * (1.0 + BELOW_95 * size)
 
 
 def asked(evidence: Evidence, questions: Sequence[Question], judging: Question, what: str) -> Evidence:
@@ -451,7 +465,7 @@ def _total_leakage(balance: RecordedBalance, level: Interval, findable: float | 
     size, pressure, pump = balance.size, balance.mean(0), balance.mean(2)
     healthy = balance.rig.pump.G_healthy
     flow = pressure * size.scale / LITRE_PER_MINUTE
-    wide = 1.0 + _95 * size.deviation
+    wide = 1.0 + WITHIN_95 * size.deviation
     stated = size.stated and len(balance.columns) == 1  # a valve's edges pass as well, by an amount that is not known
     low, high = (
         end * flow * (wide if (end > 0.0) == upper else 1.0 / wide)
@@ -474,7 +488,7 @@ def _leak_course(balance: RecordedBalance, evidence: Evidence) -> LeakCourse:
     own = balance.whole if evidence.onset_s is None else balance.course(step=True).beyond(time < evidence.onset_s)
     value, deviation = own.mean, np.sqrt(np.maximum(np.diag(own.covariance), 0.0))
     unit = balance.blocks.driving(balance.zero) * balance.size.scale / LITRE_PER_MINUTE
-    half = _95 * np.hypot(deviation, value * balance.size.deviation)
+    half = WITHIN_95 * np.hypot(deviation, value * balance.size.deviation)
     return LeakCourse(time, value * unit, (value - half) * unit, (value + half) * unit, whole=whole)
 
 
@@ -508,9 +522,9 @@ def _reason(balance: RecordedBalance, evidence: Evidence, bound: float, question
     size = balance.size
     if size.ratio is not None and size.disagrees:
         text += f"; displacement over area is {size.ratio.value:.3g} times the assumed one: flows lie between both"
-    if abs(balance.zero) > 2.0 * _95 * beliefs("inference")["zero"]["pressure"]:
+    if abs(balance.zero) > 2.0 * WITHIN_95 * beliefs("inference")["zero"]["pressure"]:
         text += f"; p_A - p_B reads {abs(balance.zero) / 1e5:.2g} bar too {'much' if balance.zero > 0.0 else 'little'}"
-    if (late := balance.delay) is not None and abs(late[0]) > 1.0 / balance.recording.rate + _95 * late[1]:
+    if (late := balance.delay) is not None and abs(late[0]) > 1.0 / balance.recording.rate + WITHIN_95 * late[1]:
         text += f"; x is recorded {1e3 * abs(late[0]):.3g} ms {'later' if late[0] > 0.0 else 'earlier'} than the flow"
     if evidence.verdict != "leak" and evidence.cause is not None:
         text += f"; what stepped is rather {evidence.cause}"

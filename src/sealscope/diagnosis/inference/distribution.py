@@ -7,6 +7,8 @@ of white noise, is that of the sixth differences over 924, the sum of their squa
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from sealscope.diagnosis.inference.weak_form import stride_samples
@@ -14,8 +16,8 @@ from sealscope.recordings.recording import Array
 
 #: Equal parts of a block's distribution whose means are kept, and the time over which the pressure is averaged [s].
 PARTS, SMOOTHED = 9, 0.025
-#: Order of the differences that leave noise alone, and the sum of their squared coefficients.
-_ORDER, _ENERGY = 6, 924.0
+#: Order of the differences that leave noise alone.
+_ORDER = 6
 
 
 def distribution(pressure: Array, rate: float) -> Array:
@@ -37,7 +39,8 @@ def distribution(pressure: Array, rate: float) -> Array:
     if piece > 1:
         differences = np.diff(pressure, _ORDER)
         differences = differences[np.isfinite(differences)]
-        noise = float((differences**2).sum()) / max(len(differences), 1) / _ENERGY  # the same bits in any thread
+        energy = math.comb(2 * _ORDER, _ORDER)  # sum of the squared coefficients
+        noise = float((differences**2).sum()) / max(len(differences), 1) / energy  # the same bits in any thread
         variance = np.nansum(deviation**2, axis=(1, 2), keepdims=True) / (pieces * (piece - 1))
         deviation *= np.sqrt(1.0 - noise / np.maximum(variance, max(noise, np.finfo(float).tiny)))
     values = (mean + deviation).ravel()

@@ -49,6 +49,8 @@ from numpy.typing import NDArray
 
 from sealscope.recordings.recording import Array
 
+#: Standard deviations of a normal law within which 95 % lies, and below which 95 % lies.
+WITHIN_95, BELOW_95 = 1.96, 1.645
 #: Fewest blocks: a level, a slope, a step and its deviation leave nothing below.
 FEWEST = 5
 #: Parts of a block in which an onset is looked for, and blocks at either end in which none is.
@@ -57,7 +59,8 @@ PARTS, EDGE = 5, 2
 WALKS = np.concatenate([[0.0], 10.0 ** np.linspace(-4.0, 3.0, 29)])
 #: How far below the largest a walk's log-likelihood may be for the null law to count with it: 99.7 % of chi square(1).
 ALLOWED = 4.5
-_RANK = 1e-9  # directions that carry less of the largest precision carry nothing
+#: Directions that carry less of what the largest carries carry nothing.
+RANK = 1e-9
 
 
 class Information(NamedTuple):
@@ -181,7 +184,7 @@ class Course(NamedTuple):
     def over(self, weights: Array) -> Interval:
         """Return the weighted mean of the coefficient with its 95 % interval, weights (K,) of sum 1."""
         value = float(weights @ self.mean)
-        half = 1.96 * float(np.sqrt(np.maximum(weights @ self.covariance @ weights, 0.0)))
+        half = WITHIN_95 * float(np.sqrt(np.maximum(weights @ self.covariance @ weights, 0.0)))
         return Interval(value, value - half, value + half)
 
     def beyond(self, before: NDArray[np.bool_]) -> Course:
@@ -252,7 +255,7 @@ def step_tests(information: Information, signs: Sequence[float]) -> list[StepTes
     time, precision, vector = _with_level(information)
     count = len(time)
     values, vectors = np.linalg.eigh(precision)
-    kept = values > _RANK * max(float(values[-1]), 0.0)
+    kept = values > RANK * max(float(values[-1]), 0.0)
     if count < FEWEST or np.count_nonzero(kept) < FEWEST:
         return []
     root = np.sqrt(values[kept])

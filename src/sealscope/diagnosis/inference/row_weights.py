@@ -22,8 +22,10 @@ from sealscope.recordings.recording import Array
 SUPPORT = 5
 #: Where Huber's function turns from square to linear, in standard deviations: 95 % efficiency for normal errors.
 HUBER = 1.345
-_RIDGE = 1e-10  # as a share of a matrix's diagonal
-_MOST, _TOLERANCE = 50, 1e-2  # turns to a fixed point at most, and the mean change of a weight that ends them
+#: What is added to a matrix, as a share of its diagonal.
+RIDGE = 1e-10
+#: Turns to a fixed point at most, and the relative change that ends them, the mean one of weights.
+MOST_TURNS, TOLERANCE = 50, 1e-2
 _SIGMA = 1.4826  # standard deviation of normal values over the median of their size
 
 
@@ -59,7 +61,7 @@ def eliminate(matrix: Any, count: int) -> None:
     """
     rows, columns = matrix.shape
     for i in range(count):
-        matrix[i, i] *= 1.0 + _RIDGE
+        matrix[i, i] *= 1.0 + RIDGE
     for i in range(count):
         scale = 1.0 / matrix[i, i] if matrix[i, i] > 0.0 else 0.0
         for q in range(i, columns):
@@ -135,7 +137,7 @@ def _reweigh(values: Any, ends: Any, place: Any, workspace: Any) -> bool:
         weight = size / workspace.residual[r] if size > 0.0 and workspace.residual[r] > size else 1.0
         change += abs(weight / workspace.weights[r] - 1.0)
         workspace.weights[r] = weight
-    return change < _TOLERANCE * count or not size > 0.0
+    return change < TOLERANCE * count or not size > 0.0
 
 
 @large_law
@@ -150,11 +152,11 @@ def weigh(values: Any, ends: Any, place: Any, fast: int, known: Any, share: floa
     for r in range(count):
         workspace.weights[r] = 1.0
     settled = count == 0
-    for turn in range(_MOST + 1):
+    for turn in range(MOST_TURNS + 1):
         for b in range(blocks):
             _sum_products(values, int(ends[b - 1]) if b else 0, int(ends[b]), workspace.weights, gram[b])
             _reduce(gram[b], place, fast, reduced[b])
-        settled = settled or turn == _MOST
+        settled = settled or turn == MOST_TURNS
         for i in range(slow + 1):
             for j in range(slow + 1):
                 normal[i, j] = 0.0 if settled else known[i, j]

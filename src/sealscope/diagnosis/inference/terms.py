@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.recordings.recording import Array
 
@@ -30,8 +31,8 @@ if TYPE_CHECKING:
 
 #: Pressure of the surroundings [Pa], by which a gauge pressure is less than the absolute one.
 ATMOSPHERE = 101325.0
-#: The least absolute pressure that the terms of air are computed for [Pa]; oil boils, and they say nothing, below it.
-LEAST_ABSOLUTE = 2e4
+#: The least absolute pressure that the terms of air are computed for [Pa].
+LEAST_ABSOLUTE: float = beliefs("inference")["pressure"]["least"]
 #: Half the time over which speed and direction of motion are taken [s]: a few counts of an encoder at slow motion.
 HALF_DIFFERENCE = 0.025
 

@@ -25,14 +25,11 @@ import numpy as np
 
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, cost_of_zero, pair
-from sealscope.diagnosis.inference.onset import FEWEST, WALKS
+from sealscope.diagnosis.inference.onset import FEWEST, RANK, WALKS
 from sealscope.recordings.recording import Array
 
-#: Blocks that the zero is estimated from; neighbours are added up beyond.
-ENOUGH = 40
 #: Zeros that are tried at first, within three times what is believed of one that is far off.
 TRIED = 21
-_RANK = 1e-9  # directions that carry less of the largest precision carry nothing
 
 
 def about_zero(blocks: Blocks, columns: Sequence[Columns]) -> Blocks:
@@ -44,7 +41,7 @@ def about_zero(blocks: Blocks, columns: Sequence[Columns]) -> Blocks:
 
     if len(blocks) < FEWEST or len(columns) != 1 or columns[0].bias is None:
         return blocks
-    effects = _effects(blocks.merged(ENOUGH), columns[0])
+    effects = _effects(blocks.merged(beliefs("inference")["blocks"]["coarse"]), columns[0])
     if effects is None:
         return blocks
     within, offset, z = effects
@@ -80,7 +77,7 @@ def _effects(blocks: Blocks, columns: Columns) -> tuple[Array, Array, Array] | N
     precision, vector, middle = pair(blocks, columns)
     scale = np.sqrt(np.maximum(np.diag(precision), np.finfo(float).tiny))
     values, vectors = np.linalg.eigh(precision / np.outer(scale, scale))
-    kept = values > _RANK * max(float(values[-1]), 0.0)
+    kept = values > RANK * max(float(values[-1]), 0.0)
     index = np.linspace(-1.0, 1.0, count)
     trend, drift = (np.polynomial.legendre.legvander(index, degree) for degree in (1, 2))
     fixed = np.block([[trend, np.zeros_like(drift)], [middle[:, None] * trend, drift]])
@@ -100,7 +97,7 @@ def _effects(blocks: Blocks, columns: Columns) -> tuple[Array, Array, Array] | N
 def _likelihoods(steps: Array, z: Array, walks: Array) -> Array:
     """Return the log-likelihood of z (n,) for each walk, beside its best step; a walk takes each of `steps` (n, K)."""
     eigen, basis = np.linalg.eigh(steps.T @ steps)
-    kept = eigen > _RANK * max(float(eigen[-1]), np.finfo(float).tiny)
+    kept = eigen > RANK * max(float(eigen[-1]), np.finfo(float).tiny)
     eigen, basis, n = eigen[kept], basis[:, kept], len(z)
     walks = walks * n / max(float(eigen.sum()), np.finfo(float).tiny)
     spread = 1.0 + walks[:, None] * eigen

@@ -38,7 +38,7 @@ LEARNED: int = _BELIEVED["learned"]
 TELLS: float = _BELIEVED["tells"]
 WAKES: int = _BELIEVED["wakes"]
 #: Two samples follow each other where their times differ by so many steps.
-FOLLOWS = (0.5, 1.5)
+FOLLOWS: list[float] = _BELIEVED["follows"]
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass, field
 
 from sealscope.diagnosis.beliefs import beliefs
+from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.live.sequential import Rise
 
 Interval = tuple[float, float]
@@ -115,7 +116,7 @@ class WatchBaseline:
             f"than the warmest oil makes of it (score {score:.1f}, threshold {threshold:.1f})"
         )
         # what is healthy may be anywhere from the least of the baseline to the ceiling
-        healthy = max(self.level - self.low, ceiling - self.level, 0.0) / 1.96
+        healthy = max(self.level - self.low, ceiling - self.level, 0.0) / WITHIN_95
         size = g - max(self.level, 0.0)
         return Rise(score, (at, self.learned_s, at), size, math.hypot(deviation, healthy), "level", threshold, reason)
 

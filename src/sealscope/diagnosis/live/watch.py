@@ -13,6 +13,7 @@ import numpy as np
 
 from sealscope.calls import checked_call
 from sealscope.diagnosis.beliefs import beliefs
+from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.live.balance import LEARNED, BlockConductance, LiveBalance, NotJudged, Shown
 from sealscope.diagnosis.live.estimates import BaselineLearning, BlockEstimate, WatchBaseline, WatchedLeak, within
 from sealscope.diagnosis.live.joining import SampleJoiner
@@ -300,7 +301,7 @@ class Watch:
             earlier = self._last[self._last[:, 0] <= ends[0], 1][-GROUP:]
             known = float(np.mean(earlier)) if earlier.size else block.g - rise.size
             before = leak.before if leak is not None else known
-        half = 1.96 * math.hypot(rise.deviation, own.size_error * rise.size)
+        half = WITHIN_95 * math.hypot(rise.deviation, own.size_error * rise.size)
         low, high = own.inside * max(0.0, rise.size - half) * block.flow, own.orifice * (rise.size + half) * block.flow
         self.leak = WatchedLeak(
             raised_s=block.end if leak is None else leak.raised_s,
@@ -324,10 +325,10 @@ class Watch:
         if self.leak is not None:
             beyond = self._beyond_leak(self.leak, own, block, sd)
         elif self.baseline is not None:
-            base, half = self.baseline, 1.96 * sd
+            base, half = self.baseline, WITHIN_95 * sd
             beyond = block.g - base.level, block.g - base.high - half, block.g - base.low + half
         if own.levels:
-            half = 1.96 * math.hypot(sd, block.offset)
+            half = WITHIN_95 * math.hypot(sd, block.offset)
             total = block.total * flow
             total_interval = max(0.0, block.total - half) * flow, max(0.0, block.total + half) * flow
         if beyond is not None:
@@ -342,7 +343,7 @@ class Watch:
         hours = max(0.0, block.end - leak.onset_s) / 3600.0
         warmed = oil["warmest"] ** min(1.0, hours / oil["shift"])
         before, rise = max(leak.before, 0.0), now - leak.before
-        spread = 1.96 * math.hypot(sd / math.sqrt(max(len(recent), 1)), leak.before_sd, own.size_error * rise)
+        spread = WITHIN_95 * math.hypot(sd / math.sqrt(max(len(recent), 1)), leak.before_sd, own.size_error * rise)
         return rise, own.inside * (now - before * warmed - spread), now - before / warmed + spread
 
     def state(self) -> dict[str, Any]:

@@ -14,6 +14,7 @@ import numpy as np
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.detector import unusable
 from sealscope.diagnosis.inference.detector import VolumeBalance
+from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.inference.pressures.detector import PressureResponse
 from sealscope.diagnosis.inspection import inspected
 from sealscope.diagnosis.rms_change.blocks import JUDGED, QUANTITIES, whole
@@ -98,7 +99,7 @@ def _stated(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[str, Any
         return {
             "basis": BASES[0],
             "level": total.value * size.scale,
-            "error": (total.high - total.low) * size.scale / 3.92,
+            "error": (total.high - total.low) * size.scale / (2.0 * WITHIN_95),
             "states_flow": size.stated,
             "area": area,
             "scale": None if size.ratio is None else size.ratio.value,

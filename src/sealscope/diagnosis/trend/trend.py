@@ -12,7 +12,7 @@ import numpy as np
 
 from sealscope.calls import checked_call
 from sealscope.diagnosis.beliefs import beliefs
-from sealscope.diagnosis.inference.onset import Interval
+from sealscope.diagnosis.inference.onset import WITHIN_95, Interval
 from sealscope.diagnosis.trend.reading import (
     Basis,
     LeakReading,
@@ -289,7 +289,7 @@ def _with_levels(trend: Trend) -> Trend:
         text = f"{alone.size} of {len(points)} {apart} ({files})"
         findings.append(Finding("outlier", "warning", None, alone.size, None, text))
     for k, row in enumerate(rows):
-        value, half = float(levels.value[k]), 1.96 * float(levels.error[k])
+        value, half = float(levels.value[k]), WITHIN_95 * float(levels.error[k])
         note = apart if k in alone else ""
         points[row] = replace(points[row], value=value, low=value - half, high=value + half, note=note)
     known = max(1, round(trend.healthy * len(few) / len(levels)))
@@ -352,7 +352,7 @@ def _verdict(trend: Trend) -> tuple[Verdict, str]:
     if count < 3:
         return "cannot tell", f"{count} comparable recordings are too few, 3 are needed"
     detectable = beliefs("trend")["course"]["detectable"] * max(
-        wear.scatter, (wear.healthy.high - wear.healthy.low) / 3.92
+        wear.scatter, (wear.healthy.high - wear.healthy.low) / (2.0 * WITHIN_95)
     )
     if trend.limit is not None and wear.healthy.value + detectable > trend.limit:
         return "cannot tell", (

@@ -25,9 +25,6 @@ from sealscope.recordings.recording import Array, Recording
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Most blocks of a recording.
-BLOCKS = 40
-
 
 def cycle_length(speed: Array, rate: float) -> float | None:
     """Return the duration of a stroke to and fro [s], or of the strongest line of the speed; None without one."""
@@ -73,7 +70,7 @@ def lost_oil(signals: Signals, rig: Rig, cycle: float | None, begin: float) -> d
         return {}
     unit = 1.0 / signals.rate if cycle is None else cycle
     seconds = len(signals.time_step) / signals.rate
-    length = unit * max(1, round(seconds / (BLOCKS * unit)))
+    length = unit * max(1, round(seconds / (beliefs("inference")["blocks"]["coarse"] * unit)))
     ends = np.round(np.arange(int(seconds / length) + 1) * length * signals.rate).astype(int)
     if len(ends) <= FEWEST:
         return {}

@@ -29,7 +29,7 @@ from sealscope.diagnosis.inference.balance import LONGEST, whole_samples
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, Weighting
 from sealscope.diagnosis.inference.circuit.store import cycle_length, lost_oil
 from sealscope.diagnosis.inference.distribution import distribution
-from sealscope.diagnosis.inference.onset import FEWEST, StepTest
+from sealscope.diagnosis.inference.onset import FEWEST, WITHIN_95, StepTest
 from sealscope.diagnosis.inference.terms import (
     LEAK,
     LOCKED,
@@ -45,10 +45,8 @@ from sealscope.recordings.recording import Array, Recording
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Half-width of a test function while the piston is held, and the time it settles for before, as it moves slower than
-#: a share of its largest speed, averaged over a while [s].
-HELD, SETTLES, SLOW, AVERAGED = 0.25, 0.25, 0.1, 0.1
-_95 = 1.96
+_BELIEVED = beliefs("inference")["held"]
+HELD: float = _BELIEVED["half"]
 _READ = ("u", "omega", "theta", "q_pump", "x", "p_A", "p_B")
 
 
@@ -126,10 +124,10 @@ def _samples(recording: Recording, rig: Rig, equation: Equation) -> dict[str, Ar
 
 def _held(speed: Array, rate: float, area: float = 0.0) -> NDArray[np.bool_]:
     """Return in which samples the piston is held, after it has settled; with an `area`, creep is a standstill."""
-    size, settles = max(1, round(AVERAGED * rate)), max(1, round(SETTLES * rate))
+    size, settles = max(1, round(_BELIEVED["averaged"] * rate)), max(1, round(_BELIEVED["settles"] * rate))
     slow = np.abs(np.convolve(speed, np.full(size, 1.0 / size), "same"))
     finite = np.isfinite(slow)
-    limit = max(SLOW * slow[finite].max(initial=0.0), beliefs("inference")["held"]["creep"] * area)
+    limit = max(_BELIEVED["slow"] * slow[finite].max(initial=0.0), _BELIEVED["creep"] * area)
     moves = ~finite | (slow > limit)
     return np.asarray(np.convolve(moves, np.ones(settles))[: speed.size] == 0)
 
@@ -152,7 +150,7 @@ def _blocks(
     _less_the_zero(rows.values, [term.name for term in equation.terms])
     if carries:
         side = _rows([signals.carried_by_A[1:] / rate], counts, half, rate).values[:, 0]
-        one_side = np.minimum(side, 1.0 - side) < beliefs("inference")["held"]["elsewhere"]
+        one_side = np.minimum(side, 1.0 - side) < _BELIEVED["elsewhere"]
         rows = rows._replace(whole=rows.whole & one_side)
     each = 2 if half > HELD else round(2.0 * LONGEST / half)
     parts = [slice(k * each, (k + 1) * each) for k in range(len(rows.time) // each)]
@@ -191,7 +189,7 @@ def _rows(increments: list[Array], counts: NDArray[np.bool_], half: float, rate:
 
 def _less_the_zero(values: Array, names: list[str]) -> None:
     """Take from the mean pressure difference of each row what zeros of the sensors may have made."""
-    zero = _95 * beliefs("inference")["zero"]["pressure"]
+    zero = WITHIN_95 * beliefs("inference")["zero"]["pressure"]
     mean = values[:, names.index(LEAK)]
     share = np.maximum(1.0 - (zero / np.maximum(np.abs(mean), zero)) ** 2, 0.0)
     for name in (LEAK, ORIFICE):

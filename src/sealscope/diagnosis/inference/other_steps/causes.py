@@ -28,8 +28,6 @@ from sealscope.diagnosis.inference.other_steps.step import OtherStep
 from sealscope.diagnosis.inference.terms import AIR, BIAS, LEAK, MADE_UP, ORIFICE, PUMP, Equation
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause
 
-#: Blocks that causes are weighed with: a step is dated by the leak's own test.
-COARSE = 40
 #: A change of the scale of the left side: displacement, angle, speed, or the position behind a valve.
 SCALE = "scale"
 
@@ -64,7 +62,7 @@ def hypotheses(
     A leak is tested about the zero of p_A - p_B that its change shows, what else may have stepped in the `plain`
     blocks, whose zero is that of the sensors. Oil that leaves the circuit empties the accumulator as well (`lost`).
     """
-    about, recorded = blocks.merged(COARSE), plain.merged(COARSE)
+    about, recorded = (own.merged(beliefs("inference")["blocks"]["coarse"]) for own in (blocks, plain))
     tested = []
     for index, term in enumerate(balances[0].terms):
         if term.drift == "motion" and index in columns[0].motion and term.name.startswith("motion"):

@@ -21,7 +21,7 @@ BLOCKS, ORDER = _BELIEVED["blocks"], _BELIEVED["order"]
 #: What commands the motion, and what moves, in the order of preference.
 COMMANDS, MOTIONS = ("x_d", "u", "omega", "theta"), ("x", "theta", "omega", "u")
 #: Bins of a spectrum beyond the main lobe of a line, by a Hann window.
-_BESIDE = (3.0, 4.0, 5.0)
+_BESIDE: list[float] = _BELIEVED["beside"]
 
 
 def duty_tests(recording: Recording) -> list[StepTest]:

@@ -25,13 +25,12 @@ from typing import NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.beliefs import beliefs
-from sealscope.diagnosis.inference.onset import Information, two_sided
+from sealscope.diagnosis.inference.onset import RANK, Information, two_sided
 from sealscope.diagnosis.inference.terms import HALF_DIFFERENCE
 from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording
 
-_RANK = 1e-9  # directions that carry less than this share of the largest carry nothing
 _TINY = float(np.finfo(float).tiny)
 A, B, HALF_A, HALF_B = np.eye(4)
 #: Oil that is lost lowers both levels; what raises them has many causes.
@@ -141,7 +140,7 @@ def level_tests(recording: Recording) -> tuple[Level, ...]:
     size = np.sqrt(np.diag(covariance))
     eigen, basis = np.linalg.eigh(covariance / np.outer(size, size))
     root = np.zeros((len(kept), 4))
-    root[:, kept] = (basis / np.sqrt(np.maximum(eigen, _RANK))) @ basis.T / size
+    root[:, kept] = (basis / np.sqrt(np.maximum(eigen, RANK))) @ basis.T / size
     mean, both, tested = values.mean(axis=0), values[:, :2].sum(axis=1), []
     scales = (("scale of p_A", A + HALF_A), ("scale of p_B", B + HALF_B))
     patterns = [*PATTERNS, *((name, "sensor fault", [[mean * own]]) for name, own in scales)]
@@ -158,7 +157,7 @@ def level_tests(recording: Recording) -> tuple[Level, ...]:
 def _test(name: str, cause: Cause | None, rows: Array, whitened: Array, time: Array) -> Level | None:
     """Return the test of whitened blocks (K, c) by the steps of `rows` (m, c), the first of them as it is."""
     basis, size = np.linalg.qr(rows.T)
-    basis = basis[:, np.abs(np.diag(size)) > _RANK * np.abs(size).max()]
+    basis = basis[:, np.abs(np.diag(size)) > RANK * np.abs(size).max()]
     blocks = [Information(time, np.eye(len(time)), whitened @ own) for own in basis.T]
     tests = [test for own in blocks if (test := two_sided(own)) is not None]
     if not tests:

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.diagnosis.beliefs import beliefs
-from sealscope.diagnosis.inference.decision import WITHIN, Question, asked, is_leak, questions
-from sealscope.diagnosis.inference.onset import StepTest, course, two_sided
+from sealscope.diagnosis.inference.decision import WITHIN, Question, asked, is_leak, may_be_leak, questions
+from sealscope.diagnosis.inference.onset import WITHIN_95, StepTest, course, two_sided
 from sealscope.diagnosis.inference.other_steps.causes import StepHypothesis, probabilities
 from sealscope.diagnosis.inference.other_steps.causes import stepped as stepped_cause
 from sealscope.diagnosis.inference.other_steps.step import OtherStep, other_step
@@ -37,7 +37,6 @@ CAUSES: dict[str, Cause] = {
     **dict.fromkeys(("F_C", "F_v", "K_brk", "C_c", "side", "give"), "friction change"),
     **dict.fromkeys(("lag", "scale", "offset"), "sensor fault"),
 }
-_95, _SURE = 1.96, 0.95
 
 
 class PressureResponse:
@@ -101,8 +100,8 @@ def judge(
         answered = None
     bound = max(against.interval(0.9)[1], 0.0) if against is not None else (test.bound() if test is not None else 0.0)
     if answered is None:
-        worth = bound * float(own.pressure.mean()) <= beliefs("inference")["worth"]["share"] * own.pump
-        enough = worth and sum(causes.get(cause, 0.0) for cause in LEAKS) < 1.0 - _SURE
+        enough = bound * float(own.pressure.mean()) <= beliefs("inference")["worth"]["share"] * own.pump
+        enough = enough and not may_be_leak(causes)
         cause = stepped_cause(tested, RAREST)
         evidence = Evidence("no leak" if enough else "cannot tell", "", cause=None if cause in LEAKS else cause)
     elif answered.name == WITHIN and test is not None:
@@ -129,7 +128,7 @@ def _begun(own: PressureEvidence, test: StepTest) -> Evidence:
     time = own.information.time
     beyond = course(own.information, test, step=True).beyond(time < onset.value)
     unit = own.pressure * 0.5 * (1.0 + own.orifice) / LITRE_PER_MINUTE
-    value, half = beyond.mean * unit, _95 * np.sqrt(np.maximum(np.diag(beyond.covariance), 0.0)) * unit
+    value, half = beyond.mean * unit, WITHIN_95 * np.sqrt(np.maximum(np.diag(beyond.covariance), 0.0)) * unit
     leak = LeakCourse(time, value, value - half, value + half)
     return replace(evidence, leak_lpm=max(lpm, 0.0), leak_interval_lpm=interval, course=leak)
 
@@ -139,7 +138,7 @@ def _with_figures(
 ) -> Evidence:
     """Return the evidence with scores, thresholds, the bound, the smallest step that shows, and the reason in words."""
     pressure = float(own.pressure.mean())
-    flow = own.orifice * bound * (1.0 + _95 * flow_scale()) * pressure
+    flow = own.orifice * bound * (1.0 + WITHIN_95 * flow_scale()) * pressure
     lpm = flow / LITRE_PER_MINUTE
     limit = f"{lpm:.2g} L/min" if own.stated else f"{100.0 * flow / own.pump:.2g} % of the pump's flow"
     begins = "steps up within the recording, beyond the drift of this machine"

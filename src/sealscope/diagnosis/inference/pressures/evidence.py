@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.beliefs import beliefs
-from sealscope.diagnosis.inference.onset import FEWEST, Information, StepTest, step_test
+from sealscope.diagnosis.inference.onset import FEWEST, WITHIN_95, Information, StepTest, step_test
 from sealscope.recordings.quality import mostly_clipped
 from sealscope.recordings.recording import Array, Recording
 from sealscope.units import LITRE_PER_MINUTE
@@ -80,7 +80,7 @@ class PressureEvidence:
         middle.
         """
         unit = float(self.pressure.mean()) / LITRE_PER_MINUTE
-        reach = 1.96 * math.hypot(deviation, flow_scale() * step)
+        reach = WITHIN_95 * math.hypot(deviation, flow_scale() * step)
         low, high = (step - reach) * unit, self.orifice * (step + reach) * unit
         return 0.5 * (1.0 + self.orifice) * step * unit, (max(0.0, low), max(0.0, high))
 
