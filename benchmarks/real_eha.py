@@ -47,6 +47,8 @@ def main() -> None:
     parser.add_argument("--leaks", nargs="*", type=float, default=[0.0, 0.01, 0.02, 0.05, 0.1, 0.4])
     parser.add_argument("--plain", action="store_true")
     parser.add_argument("--commissioned", nargs="+", default=[])
+    parser.add_argument("--known", type=int, help="each run is judged by so many others, chosen at random, not by all")
+    parser.add_argument("--choices", type=int, default=1, help="how often they are chosen for a run")
     options = parser.parse_args()
     rig = load_rig("single-rod-eha").with_overrides(
         {"cylinder.A_A": AREAS[0], "cylinder.A_B": AREAS[1], "pump.q_b": DISPLACEMENT}
@@ -62,9 +64,11 @@ def main() -> None:
         else "\n" + "| --- " * 6 + "|"
     )
     for lpm in options.leaks:
-        verdicts, plain = [], 0
-        for k, run in enumerate(runs):
+        verdicts, plain, random = [], 0, np.random.default_rng(0)  # the same choices for every leak
+        for k, run in options.choices * list(enumerate(runs)):
             others = [own for j, own in enumerate(runs) if j != k]
+            if options.known:
+                others = [others[j] for j in random.choice(len(others), options.known, replace=False)]
             judged = leaking(run, lpm) if lpm else run
             by = partial(ss.diagnose, baseline=others, rig=rig) if machine is None else machine.diagnose
             verdicts.append(by(judged))
@@ -78,7 +82,9 @@ def main() -> None:
         size = f"{np.median(sizes):.3g}" if sizes else ""
         bound = f"{np.median(bounds):.2g}" if bounds else ""
         unsure = sum(own.verdict == "cannot tell" for own in verdicts)
-        line = f"| {lpm:g} | {len(detected)} of {len(runs)} | {unsure} | {size} | {hold} of {len(sizes)} | {bound} |"
+        line = (
+            f"| {lpm:g} | {len(detected)} of {len(verdicts)} | {unsure} | {size} | {hold} of {len(sizes)} | {bound} |"
+        )
         print(line + (f" {plain} |" if options.plain else ""), flush=True)
 
 
