@@ -182,7 +182,9 @@ def test_products_survive_the_file_but_for_what_is_drawn(tmp_path: Path) -> None
     claim = Claim("claim-1", "section 1", "It is.", "so", "so", "holds", "why")
     table = ThesisTable("t-1", "T", ("a", "b"), ((1, 2.5), ("x", None), (np.float64(0.1), math.inf)))
     row = ItemRow("one", "key", tuple(map(undrawn, (figure, claim, table))), ("a.svg",))
-    list(stored(tmp_path, (of for of in [row]), "x"))
+    with pytest.raises(ValueError, match="float"):
+        list(stored(tmp_path, (of for of in [row]), "x"))
+    list(stored(tmp_path, (of for of in [row]), "x", allow_nan=True))
     again = read_rows(tmp_path, lambda tree: as_type(ItemRow, tree), "x", json.loads)["one"]
     assert again.files == ("a.svg",)
     assert again.products[1] == claim

@@ -65,15 +65,18 @@ def read_rows(
     return rows
 
 
-def stored(folder: Path, rows: Generator[Row, None, None], what: str) -> Iterator[Row]:
-    """Yield rows as their jobs end, each appended to the folder's file before; `rows` is closed at the end."""
+def stored(folder: Path, rows: Generator[Row, None, None], what: str, allow_nan: bool = False) -> Iterator[Row]:
+    """Yield rows as their jobs end, each appended to the folder's file before; `rows` is closed at the end.
+
+    Raises ValueError for a row with a number that is not finite, unless they are allowed (`allow_nan`).
+    """
     with closing(rows), open_inner(folder / ROWS, f"{what}'s file of rows", "ab+") as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(0, size - _LONGEST))
         torn = file.read().rpartition(b"\n")[2]  # a line that was being written when the power went
         file.truncate(size - len(torn))
         for row in rows:
-            line = json.dumps(row.as_dict(), sort_keys=True).encode() + b"\n"
+            line = json.dumps(row.as_dict(), allow_nan=allow_nan, sort_keys=True).encode() + b"\n"
             try:
                 while line:  # past the buffer of `file`, which would be written again at its end
                     line = line[os.write(file.fileno(), line) :]

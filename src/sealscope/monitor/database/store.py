@@ -75,9 +75,7 @@ class StoredRows:
     def add_checkpoint(self, actuator: str, settings: str, state: dict[str, Any]) -> None:
         """Add the state of an actuator, which takes the place of the samples since the last one."""
         self.pending = [row for row in self.pending if row["actuator"] != actuator]
-        import orjson  # of some 100 kB
-
-        plain = orjson.dumps(state).decode()
+        plain = json.dumps(state, allow_nan=False)
         self.actuators[actuator] = {"actuator": actuator, "settings": settings, "checkpoint": plain}
 
     def add_summary(self, actuator: str, summary: dict[str, Any]) -> None:

@@ -126,7 +126,7 @@ def reproduce(
         while order.is_active():
             ready = sorted(order.get_ready(), key=list(waiting).index)
             made = _rows(carried_out(task, begun(ready), min(process_count(jobs), len(ready))))
-            for row in stored(kept, made, _WHAT):
+            for row in stored(kept, made, _WHAT, allow_nan=True):
                 state: State = "failed" if row.error else "made"
                 statuses[row.id] = ItemStatus(waiting[row.id], state, row.error, row.products, row.files)
                 in_work.remove(row.id)
