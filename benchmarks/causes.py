@@ -32,6 +32,7 @@ FAULTS: dict[str, tuple[str | None, ...]] = {
     "leak": LEAKS,
     "pump leak x3": ("pump leak", "piston or pump leak"),
     "rod seal A 0.01 L/min": ("external leak",),
+    "rod seal B 0.01 L/min": ("external leak",),
     "friction +20 %": ("friction change",),
     "air 1 %": ("air in the oil",),
     "sensor p_A offset 5 psi": ("sensor fault",),

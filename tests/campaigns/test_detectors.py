@@ -327,7 +327,7 @@ def test_flows_onsets_and_causes_by_hand():
 def test_every_fault_of_the_simulator_has_a_cause():
     for words, cause in (
         ("pump leak x3", "pump leak"),
-        ("rod seal A 0.01 L/min", "external leak"),
+        ("rod seal B 0.01 L/min", "external leak"),
         ("friction +20 %", "friction change"),
         ("air 1 %", "air in the oil"),
         ("sensor p_A gain 2 %", "sensor fault"),

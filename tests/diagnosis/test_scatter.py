@@ -263,3 +263,9 @@ def test_what_others_let_expect_is_that_of_dense_algebra(seed: int) -> None:
     assert result._replace(value=4.0 + result.value).chance == pytest.approx(
         weights @ norm.sf((4.0 + values[n] - np.array(centres)) / deviations), rel=0.05
     )
+
+
+def test_a_rise_below_zero_bounds_a_leak_no_closer_than_none() -> None:
+    low, none, high = (Rise(value, 2.0, 5.0) for value in (-20.0, 0.0, 3.0))
+    assert low.bound() == none.bound() == pytest.approx(2.0 * 2.015, rel=1e-3)  # Student's t, 5 degrees, 95 %
+    assert high.bound() == pytest.approx(3.0 + none.bound())

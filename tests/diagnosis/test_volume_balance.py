@@ -155,11 +155,12 @@ def test_an_encoder_that_slips_is_no_leak(detector: VolumeBalance) -> None:
             assert result.cause == "sensor fault"
 
 
-def test_oil_lost_to_the_outside_is_no_piston_leak(detector: VolumeBalance) -> None:
-    """Side A loses what its pressure drives out; half of that is a motion that no pressure difference explains."""
+@pytest.mark.parametrize(("channel", "towards"), [("p_A", -1.0), ("p_B", 1.0)])
+def test_oil_lost_to_the_outside_is_no_piston_leak(detector: VolumeBalance, channel: str, towards: float) -> None:
+    """A side loses what its pressure drives out; half of that is a motion that no pressure difference explains."""
     healthy = machine(8)
-    lost = np.cumsum(np.where(healthy.t < 60.0, 0.0, 4.0e-13 * healthy["p_A"])) / healthy.rate
-    result = detector.examine(with_channels(healthy, x=healthy["x"] - 0.5 * lost / 633e-6), [], P)
+    lost = np.cumsum(np.where(healthy.t < 60.0, 0.0, 4.0e-13 * healthy[channel])) / healthy.rate
+    result = detector.examine(with_channels(healthy, x=healthy["x"] + 0.5 * towards * lost / 633e-6), [], P)
     assert result.cause == "external leak"
     assert result.verdict != "leak"
 
@@ -238,3 +239,11 @@ def test_what_a_pump_loses_over_speed_is_no_leak_and_hides_none() -> None:
     assert worn.verdict == "leak"
     low, high = worn.leak_interval_lpm or pytest.fail("no interval")
     assert low < 0.03 < high
+
+
+@pytest.mark.parametrize("side", ["A", "B"])
+def test_a_rod_seal_of_either_side_is_no_piston_leak_where_check_valves_make_up(side: str) -> None:
+    fault = f"rod seal {side} 0.05 L/min from 20 s"
+    recording = ss.simulate(rig="thesis-closed-loop", command="3 sin(4t)", duration="40 s", seed=1, fault=fault)
+    result = ss.diagnose(recording)
+    assert (result.verdict, result.cause) == ("no leak", "external leak")

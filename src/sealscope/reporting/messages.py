@@ -117,15 +117,14 @@ def _pump_share(diagnosis: Diagnosis) -> str | None:
 
 def _why_no_flow(diagnosis: Diagnosis) -> str:
     """Return why a leak has no L/min, and what would state it."""
-    ratio, machine = diagnosis.measured_ratio, diagnosis.machine
     if "leak_lpm" not in diagnosis.refuses:
         small = diagnosis.total_leakage is not None and diagnosis.total_leakage.lpm is not None
         return say(f"how_much.{'too_small' if small else 'channels'}")
-    if machine is not None and not machine.stated:
-        return say(f"how_much.{'machine' if ratio is None else 'machine_or_area'}")
-    if machine is None or ratio is None:
+    if raw_counts(diagnosis):
+        return say("how_much.counts")
+    if diagnosis.machine is None or diagnosis.machine.stated:
         return say("how_much.reason")
-    return say("how_much.ratio", ratio=number(ratio[0]), rig=machine.rig)
+    return say(f"how_much.{'machine' if diagnosis.measured_ratio is None else 'machine_or_area'}")
 
 
 def rests_on(diagnosis: Diagnosis) -> str | None:

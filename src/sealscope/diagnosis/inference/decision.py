@@ -4,9 +4,10 @@
 2. Is it more than in the baseline? (`scatter.rise`)
 3. Is it more than a healthy machine passes? (the level of G against the rig's file, where it says so)
 
-`leak` where one of them is answered with yes at its share of the false-alarm probability, and a leak past piston or
-pump is the most probable of all causes; `no leak` with the 95 % bound X where X is below the leak worth finding
-(`priors.toml`); else `cannot tell` with X. Nothing changes the verdict afterwards.
+`leak` where one of them is answered with yes at its share of the false-alarm probability. Where that is the first, a
+leak past piston or pump must be the most probable of all causes; where it is not, what else stepped may have raised the
+level, too, and no leak is stated. `no leak` with the 95 % bound X where X is below the leak worth finding
+(`priors.toml`); else `cannot tell` with X. `judgement.judged` sets it beside what the other detectors say.
 """
 
 from __future__ import annotations
@@ -398,7 +399,7 @@ def bound_of(balance: RecordedBalance, against: Rise | None) -> float:
     """Return the 95 % upper bound of a leak that began within the recording or came since the baseline [m^3/s]."""
     bounds = []
     if against is not None:
-        bounds.append((against.value + against.threshold(0.05) * against.deviation) * balance.mean(0))
+        bounds.append(against.bound() * balance.mean(0))
     elif balance.test is not None:
         bounds.append(balance.test.bound() * balance.mean(0))
     size = float(np.hypot(balance.size.deviation, beliefs("inference")["size"]["law"]))

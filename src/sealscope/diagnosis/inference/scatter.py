@@ -88,6 +88,10 @@ class Rise(NamedTuple):
         ends = np.sort((self.parts.centres - ndtri(chance) * self.parts.deviations) / self.deviation)
         return float(brentq(lambda score: self._beyond(score) - chance, ends[0], ends[-1]))
 
+    def bound(self, probability: float = 0.95) -> float:
+        """Return the upper bound that holds with a probability; a rise below zero does not make it smaller."""
+        return max(self.value, 0.0) + self.threshold(1.0 - probability) * self.deviation
+
     def interval(self, probability: float = 0.95) -> tuple[float, float]:
         """Return the interval of the rise that holds with a probability."""
         half = self.threshold(0.5 - 0.5 * probability) * self.deviation

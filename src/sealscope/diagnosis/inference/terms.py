@@ -351,7 +351,7 @@ def _lost_outside(side: str, share: float = 1.0) -> Term:
     name = f"p_{side}"
     return Term(
         f"external leak {side}",
-        f"max(p_{side}, 0) dt",
+        f"{'-' if share < 0.0 else ''}max(p_{side}, 0) dt",
         "m^3/(s Pa)",
         lambda s: share * np.maximum(s.mean(name), 0.0) * s.dt,
         "external leak",
@@ -364,17 +364,17 @@ def _lost_outside(side: str, share: float = 1.0) -> Term:
 def _made_up(side: str) -> Term:
     """Return what is lost to the outside on one side and made up by a check valve on the side of lower pressure.
 
-    While that is the same side, the balance shows nothing.
+    While that is the same side, the balance shows nothing. What B loses the pump need not take: it is negative.
     """
     name = f"p_{side}"
 
     def lost(s: Signals) -> Array:
         carries = _middle(s.carried_by_A)
-        return np.asarray((carries if side == "A" else 1.0 - carries) * np.maximum(s.mean(name), 0.0) * s.dt)
+        return np.asarray((carries if side == "A" else carries - 1.0) * np.maximum(s.mean(name), 0.0) * s.dt)
 
     return Term(
         f"external leak {side}{MADE_UP}",
-        f"[{name} the larger] max({name}, 0) dt",
+        f"{'-' if side == 'B' else ''}[{name} the larger] max({name}, 0) dt",
         "m^3/(s Pa)",
         lost,
         "external leak",
@@ -443,7 +443,7 @@ _CYLINDER = (
     _LINES,
     _PUMP,
     _lost_outside("A"),
-    _lost_outside("B"),
+    _lost_outside("B", -1.0),
     _made_up("A"),
     _made_up("B"),
     *_LEAKS,
@@ -549,7 +549,7 @@ def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
     left = pump_volume(rig, channels - {"u"} | ({"omega"} if "u" in channels else set()))
     if rig.valve.spool == "present" or left is None or not {"p_A", "p_B"} <= channels:
         return None
-    return Equation("circulation", left, (_START, *_STORED, _lost_outside("A"), _lost_outside("B"), *_LEAKS))
+    return Equation("circulation", left, (_START, *_STORED, _lost_outside("A"), _lost_outside("B", -1.0), *_LEAKS))
 
 
 def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
@@ -565,7 +565,7 @@ def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
         area = rig.cylinder.A_A if np.nanmean(s.pressure_difference) > 0.0 else rig.cylinder.A_B
         return -area * s.step("x")
 
-    return Equation(LOCKED, gives_way, (*_STORED, _lost_outside("A"), _lost_outside("B"), *_LEAKS))
+    return Equation(LOCKED, gives_way, (*_STORED, _lost_outside("A"), _lost_outside("B", -1.0), *_LEAKS))
 
 
 #: Channels that give what the pump delivers, the first recorded one is taken.

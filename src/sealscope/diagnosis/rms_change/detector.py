@@ -144,8 +144,8 @@ def against(recording: Recording, baseline: Sequence[Healthy], probability: floa
     share, changes = probability / (2 * len(JUDGED) * len(chambers)), []
     for name, rise, weight in zip(columns_of(chambers), *rises(*whole(recording), levels, duties, times), strict=True):
         size = rise._replace(value=abs(rise.value))
-        bound = size.value + size.threshold(0.05) * size.deviation
-        changes.append(_Change(name, weight * rise.value, size.score, size.chance, size.threshold(share), bound))
+        change = (size.score, size.chance, size.threshold(share), size.bound())
+        changes.append(_Change(name, weight * rise.value, *change))
     unknown = ", maybe of another session or machine" if times is None else ""
     count = f"{len(alike)} comparable leak-free recording{'s' if len(alike) > 1 else ''}{unknown}"
     return _evidence(changes, 1.0, f"against {count}", None)

@@ -114,8 +114,7 @@ class Diagnosis(Evidence):
     @property
     def severity(self) -> Severity | None:
         """How bad the leak is; None where there is none, or nothing is known of its size."""
-        measured, stated = self.measured_ratio is not None, self.machine is not None and self.machine.stated
-        return severity(self, self.limit, trusts_position=not ("leak_lpm" in self.refuses and stated and measured))
+        return severity(self, self.limit)
 
     @property
     def limit_lpm(self) -> float | None:

@@ -99,16 +99,13 @@ class Severity:
         return plain
 
 
-def severity(evidence: Evidence, limit: RepairLimit, *, trusts_position: bool = True) -> Severity | None:
-    """Return how bad the leak is that the evidence states; None where it states none, or nothing of its size.
-
-    `trusts_position`: a speed of the piston is stated; not where the geometry as measured contradicts the stated one.
-    """
+def severity(evidence: Evidence, limit: RepairLimit) -> Severity | None:
+    """Return how bad the leak is that the evidence states; None where it states none, or nothing of its size."""
     if evidence.verdict != "leak" or (evidence.leak_lpm is None and evidence.relative is None):
         return None
     relative = evidence.relative or RelativeLeak()
     flow = _figure(evidence.leak_lpm, evidence.leak_interval_lpm, LITRE_PER_MINUTE)
-    creep = _figure(relative.creep, relative.creep_interval) if trusts_position else None
+    creep = _figure(relative.creep, relative.creep_interval)
     return Severity(
         mL_per_min=_over(flow, ML_PER_MINUTE),
         pump_share=_figure(relative.pump_share, relative.pump_share_interval),

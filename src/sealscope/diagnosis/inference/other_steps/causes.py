@@ -57,7 +57,7 @@ def hypotheses(
     columns: Sequence[Columns],
     lost: Mapping[str, StepTest],
 ) -> tuple[StepHypothesis, ...]:
-    """Return the test of every term's coefficient, the most likely first; steps of either sign but of a leak.
+    """Return the test of every term's coefficient, the most likely first; steps of either sign but of what leaks.
 
     A leak is tested about the zero of p_A - p_B that its change shows, what else may have stepped in the `plain`
     blocks, whose zero is that of the sensors. Oil that leaves the circuit empties the accumulator as well (`lost`).
@@ -84,7 +84,8 @@ def hypotheses(
     # the law of a leak lies between both: it needs the lesser zero of them at least
     cost = min(map(cost_of_zero, (zero_of(blocks, columns), of_root)))
     for name, cause, own in tested:
-        signs = (1.0,) if cause in (*LEAKS, "pump leak", "external leak") else (1.0, -1.0)
+        one_way = name != BIAS and cause in (*LEAKS, "pump leak", "external leak")
+        signs = (1.0,) if one_way else (1.0, -1.0)
         best = step_test(own, signs)
         if best is not None:
             stored = lost.get(name.removesuffix(MADE_UP)) if cause == "external leak" else None

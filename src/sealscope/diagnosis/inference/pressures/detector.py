@@ -98,7 +98,7 @@ def judge(
     causes = probabilities(tested, beside) if answered is not None and answered.name == WITHIN else {}
     if causes and not is_leak(causes):
         answered = None
-    bound = max(against.interval(0.9)[1], 0.0) if against is not None else (test.bound() if test is not None else 0.0)
+    bound = against.bound() if against is not None else (test.bound() if test is not None else 0.0)
     if answered is None:
         enough = bound * float(own.pressure.mean()) <= beliefs("inference")["worth"]["share"] * own.pump
         enough = enough and not may_be_leak(causes)
