@@ -59,7 +59,7 @@ class Examination:
     _evidence: dict[tuple[str, frozenset[str]], Evidence] = field(default_factory=dict)
 
     def through(self, channels: Iterable[str]) -> Examination:
-        """Return the same recording with these channels alone; a detector that reads no other is not run again."""
+        """Return the same recording with these channels alone."""
         wanted = set(channels)
         recording, *baseline = (
             own.only(name for name in own.channels if name in wanted)
@@ -80,9 +80,7 @@ class Examination:
             if name not in self._detectors:
                 self._detectors[name] = factory(load_rig(self.rig))
             detector = self._detectors[name]
-            # a detector may state the channels that it `reads` where there is no baseline
-            reads = visible if self.baseline else frozenset(getattr(detector, "reads", visible))
-            key = (name, visible & reads)
+            key = (name, visible)
             if key not in self._evidence:
                 # small matrices: threads would cost more than they give, and how they share the work may not repeat to
                 # the bit

@@ -42,6 +42,10 @@ def made_good(balance: RecordedBalance) -> bool:
     return balance.level.low * balance.mean(0) > least * balance.mean(2)
 
 
+#: Channels that balances read.
+_READ = ("u", "theta", "omega", "q_pump", "x", "p_1", "p_2", *CHAMBERS)
+
+
 class VolumeBalance:
     """Leakage from the balance of volumes: what the pump delivers and the piston does not displace.
 
@@ -51,7 +55,6 @@ class VolumeBalance:
     """
 
     name = "volume balance"
-    reads = ("u", "theta", "omega", "q_pump", "x", "p_1", "p_2", *CHAMBERS)
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
@@ -83,18 +86,18 @@ class VolumeBalance:
         """
         balances = equations(self.rig, frozenset(recording.channels))
         if not balances:
-            made = remembered(recording, (self.name, self.rig), lambda own: circulations(own, self.rig), self.reads)
+            made = remembered(recording, (self.name, self.rig), lambda own: circulations(own, self.rig), _READ)
             recorded = [
                 RecordedBalance(own.blocks, (own.equation,), (own.columns,), self.rig, recording, own.lost)
                 for own in made
             ]
             answering = [own for own in recorded if own.equations[0].name == LOCKED or made_good(own)]
             return min(answering, key=lambda own: bound_of(own, None), default=None)
-        blocks = remembered(recording, (self.name, self.rig), lambda own: blocks_of(own, self.rig), self.reads)
+        blocks = remembered(recording, (self.name, self.rig), lambda own: blocks_of(own, self.rig), _READ)
         if blocks is None:
             return None
         zero = float(blocks[0].zero[0])
-        lost = remembered(recording, ("lost oil", self.rig), lambda own: lost_beside(own, self.rig, zero), self.reads)
+        lost = remembered(recording, ("lost oil", self.rig), lambda own: lost_beside(own, self.rig, zero), _READ)
         return RecordedBalance(blocks[0], balances, blocks[2], self.rig, recording, lost, blocks[1])
 
     def learn(self, recording: Recording) -> Lesson | None:

@@ -43,7 +43,6 @@ class PressureResponse:
     """Leakage from both chamber pressures and the command, by how p_A - p_B responds to the command."""
 
     name = "pressure response"
-    reads = ("u", "p_A", "p_B")
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
