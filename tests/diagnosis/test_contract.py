@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.diagnose import Examination, diagnose
+from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.parameters import Rig, load_rig
