@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, solve
-from sealscope.diagnosis.inference.decision import SECOND
+from sealscope.diagnosis.inference.decision.questions import SECOND
 from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.inference.terms import PUMP
 from sealscope.errors import InputError, SealscopeError
@@ -180,7 +180,7 @@ def _detectable_in(recording: Recording, rig: Rig, false_alarm: float, detection
     size = balance.size.scale
     step = balance.test.findable(share, detection) * size
     ratio = _free_over_known(balance.blocks, balance.columns)
-    return step, step * ratio, balance.mean(0)
+    return step, step * ratio, balance.mean_pressure()
 
 
 def _free_over_known(blocks: Blocks, columns: Sequence[Columns]) -> float:

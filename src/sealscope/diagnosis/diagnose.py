@@ -14,7 +14,7 @@ from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.detector import Detector, checked, failure, unusable
 from sealscope.diagnosis.inference.other_steps.step import other_step
 from sealscope.diagnosis.inspection import comparable, inspected
-from sealscope.diagnosis.judgement import ORDER, judged, judging, rank
+from sealscope.diagnosis.judgement import ORDER, combined, deciding, rank
 from sealscope.diagnosis.learnt import Healthy, Learnt
 from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
@@ -111,10 +111,10 @@ class Examination:
         """Return one verdict from all registered detectors but those that only stand in for one which judges."""
         evidences: list[Evidence] = []
         for name in sorted(detectors(), key=rank):
-            if name not in ORDER or judging(evidences) is None:
+            if name not in ORDER or deciding(evidences) is None:
                 evidences.append(self.evidence(name))
         other = None if self.distrust else other_step(self.recording, RAREST)
-        return judged(evidences, other, self.refusal)
+        return combined(evidences, other, self.refusal)
 
 
 def _unusable(detector: Detector, healthy: Healthy) -> str | None:

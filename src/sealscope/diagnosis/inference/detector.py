@@ -13,7 +13,8 @@ from sealscope.diagnosis.inference.balance import blocks_of, shortest
 from sealscope.diagnosis.inference.blocks import Columns
 from sealscope.diagnosis.inference.circuit.store import lost_beside
 from sealscope.diagnosis.inference.circuit.without_position import circulations
-from sealscope.diagnosis.inference.decision import RecordedBalance, bound_of, judge
+from sealscope.diagnosis.inference.decision.judge import bound_of, judge
+from sealscope.diagnosis.inference.decision.recorded import RecordedBalance
 from sealscope.diagnosis.inference.scatter import RecordingSums, Rise, motion_change, rise
 from sealscope.diagnosis.inference.terms import CYLINDER, LOCKED, circulation, equations, locked
 from sealscope.diagnosis.inference.weak_form import STRIDE, stride_samples
@@ -39,7 +40,7 @@ RESOLVED = 2
 def made_good(balance: RecordedBalance) -> bool:
     """Whether the pump surely delivers what any pump loses: a loop brings the piston back, or holds it."""
     least: float = beliefs("inference")["held"]["share"]
-    return balance.level.low * balance.mean(0) > least * balance.mean(2)
+    return balance.level.low * balance.mean_pressure() > least * balance.mean_flow
 
 
 #: Channels that balances read.

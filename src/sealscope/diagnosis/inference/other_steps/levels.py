@@ -100,7 +100,7 @@ def levels(recording: Recording) -> tuple[Array, Array] | None:
         motion, moving = np.zeros((len(recording), 0)), np.ones(len(recording))
         columns = np.column_stack([moving, pressures - means])
     else:
-        whole = np.isfinite(motion).all(axis=1)
+        whole = np.asarray(np.isfinite(motion).all(axis=1))
         motion = np.where(whole[:, None], motion, 0.0)
         moving = (whole & (np.abs(motion[:, 0]) > believed["slowest"])).astype(float)
         columns = np.column_stack([np.ones(len(recording)), np.sign(motion[:, 0]), motion, pressures - means])
