@@ -44,6 +44,7 @@ from sealscope.diagnosis.verdict.evidence import (
     RelativeLeak,
     TotalLeakage,
 )
+from sealscope.diagnosis.verdict.machine import healthy_leakage
 from sealscope.units import LITRE_PER_MINUTE
 
 
@@ -78,7 +79,7 @@ def _causes(balance: RecordedBalance) -> dict[Cause, float]:
 
 def questions_of(balance: RecordedBalance, against: Rise | None, probability: float) -> list[Question]:
     """Return the questions that can be asked of a balance."""
-    healthy = balance.rig.pump.G_healthy
+    healthy = healthy_leakage(balance.rig)
     # a drive's droop with the load passes for a level of the leak
     measured = len(balance.columns) == 1 and balance.equations[0].drive is None
     if not (healthy > 0.0 and against is None and balance.size.stated and measured):
@@ -182,7 +183,7 @@ def _findable(balance: RecordedBalance, questions: Sequence[Question]) -> float 
 
 def _total_leakage(balance: RecordedBalance, level: Interval, findable: float | None) -> TotalLeakage:
     size, pressure, pump = balance.size, balance.mean_pressure(), balance.mean_flow
-    healthy = balance.rig.pump.G_healthy
+    healthy = healthy_leakage(balance.rig)
     flow = pressure * size.scale / LITRE_PER_MINUTE
     wide = 1.0 + WITHIN_95 * size.deviation
     stated = size.stated and len(balance.columns) == 1  # a valve's edges pass as well, by an amount that is not known

@@ -16,6 +16,7 @@ from sealscope.diagnosis.inference.other_steps.causes import StepHypothesis, hyp
 from sealscope.diagnosis.inference.scatter import RecordingSums
 from sealscope.diagnosis.inference.terms import LAG, ORIFICE, PUMP, Equation
 from sealscope.diagnosis.verdict.evidence import RAREST
+from sealscope.diagnosis.verdict.machine import measures_flow
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.oil import oil_temperature
 from sealscope.recordings.recording import Array, Recording
@@ -165,10 +166,10 @@ class RecordedBalance:
 def _size(balance: RecordedBalance) -> Size:
     """Weigh what is stated of displacement and area against each other.
 
-    The balance measures their ratio. A stated displacement sizes every flow directly, a stated area by that ratio;
-    where both are stated and disagree the flow lies between what either says.
+    A flow meter sizes flows by itself. Else the balance measures their ratio: a stated displacement sizes every flow
+    directly, a stated area by that ratio; where both are stated and disagree the flow lies between what either says.
     """
-    column, rig = balance.columns[0], balance.rig
+    column, rig, meter = balance.columns[0], balance.rig, measures_flow(balance.recording.units)
     believed = beliefs("inference")["size"]
     with_unit = not {("theta", "count"), ("omega", "count"), ("u", "count")} & balance.units
     pressures = not {("p_A", "count"), ("p_B", "count")} & balance.units
@@ -178,7 +179,10 @@ def _size(balance: RecordedBalance) -> Size:
     motion = [k for k in column.motion if column.names[k].startswith("motion")]
     area = _area(balance, motion) if motion and ("x", "m") in balance.units else None
     if area is None or not area.measured > 0.0 or not with_unit:
-        return Size(1.0, believed["displacement"], states_displacement and pressures, None, None)
+        known = believed["meter" if meter else "displacement"]
+        return Size(1.0, known, (meter or states_displacement) and pressures, None, None)
+    if meter:
+        return Size(1.0, believed["meter"], pressures, None, area.measured)
     ratio = Interval(*(area.assumed / end for end in (area.measured, area.high, max(area.low, 1e-12))))
     apart = abs(1.0 / ratio.value - 1.0)
     known = float(np.hypot(believed["displacement"], believed["area"]))
