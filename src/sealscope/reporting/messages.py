@@ -12,7 +12,7 @@ from textwrap import fill, shorten
 from typing import Any
 
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
-from sealscope.diagnosis.verdict.evidence import LEAKS
+from sealscope.diagnosis.verdict.evidence import LEAKS, LEAST_SPECIFIC
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.recordings.formats.columns import counted, listed
 
@@ -271,6 +271,7 @@ def false_alarms(diagnosis: Diagnosis) -> str:
 def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
     """Return what to check next, most useful first."""
     level = None if diagnosis.severity is None else diagnosis.severity.level
+    judge = diagnosis.methods[0].detector if diagnosis.methods else ""
     confirmed = say(f"once_confirmed.{level or 'plan'}", limit=diagnosis.limit)
     named = diagnosis.cause is not None and (diagnosis.verdict == "leak") == (diagnosis.cause in LEAKS)
     if named and diagnosis.verdict == "leak":
@@ -279,6 +280,8 @@ def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
         steps = [diagnosis.next_check, say("next.resolved")]
     elif diagnosis.verdict == "leak":
         steps = [*map(say, ("next.repeat", "next.bypass", "next.creep")), confirmed]
+    elif diagnosis.verdict == "no leak" and judge == LEAST_SPECIFIC:
+        steps = [say("next.ringing"), say("next.longer")]
     elif diagnosis.verdict == "no leak":
         steps = [diagnosis.next_check, say("next.longer")]
     else:

@@ -91,6 +91,9 @@ class Summary:
                 half = f"{times * len(healthy)} healthy recordings instead of {len(healthy)}"
                 half += ", of as many more days" if dates else ""
             rows.append(("half of that", half))
+        else:
+            needs = "speed or angle of the pump, flow or command, and two recordings"
+            rows.append(("smallest leak", f"not known, that needs {needs}; the ringing alone judges"))
         rows += [("check", problem) for problem in self.problems]
         return "\n".join(
             fill(f"  {name:<14}{text}", 80, subsequent_indent=" " * 16, break_on_hyphens=False)
