@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from datetime import date
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,8 @@ from sealscope.recordings.channels import Array
 from sealscope.recordings.formats.headings.words import WORDS
 from sealscope.units import to_si
 
-#: How dates are written; what `first` and `second` are follows from all stamps of a column.
+_EITHER = r"(?P<first>\d{1,2})(?P<stroke>[/-])(?P<second>\d{1,2})(?P=stroke)(?P<year>\d{4}|\d{2})"
+#: How dates are written; what `first` and `second` are follows from all dates of a column (`day_before_month`).
 _DATES = (
     r"(?P<year>\d{4})[-/.](?P<month>\d{1,2})[-/.](?P<day>\d{1,2})",
     r"(?P<plain>(?P<year>(?:19|20)\d{2})(?P<month>\d{2})(?P<day>\d{2}))(?=[T\s]|\Z)",
@@ -23,9 +25,11 @@ _DATES = (
     r"(?P<day>\d{1,2})\.(?P<month>\d{1,2})\.(?P<year>\d{4}|\d{2})",
     r"(?P<day>\d{1,2})[-. /]{1,2}(?P<month>[^\W\d_]{3,9})[-. /]{1,2}(?P<year>\d{4}|\d{2})",
     r"(?P<month>[^\W\d_]{3,9})[. ]{1,2}(?P<day>\d{1,2}),? (?P<year>\d{4})",
-    r"(?P<first>\d{1,2})(?P<stroke>[/-])(?P<second>\d{1,2})(?P=stroke)(?P<year>\d{4}|\d{2})",
+    _EITHER,
     "",
 )
+_EITHER_DATE = re.compile(rf"\s*(?P<date>{_EITHER})")
+_LAST_MONTH = 12
 #: A number, which is no stamp but a date of eight digits.
 _PLAIN = re.compile(r"[+-]?\d*(?:[.,]\d*)?")
 _CLOCK = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,:]\d{1,9})?|[.,]\d{1,9})?|\d{6}(?:[.,]\d{1,9})?"
@@ -82,17 +86,17 @@ def is_stamp(text: str) -> bool:
     return _parsed_stamp(text) is not None
 
 
-def stamps(cells: Sequence[str]) -> NDArray[np.datetime64]:
+def stamps(cells: Sequence[str], day_first: bool | None = None) -> NDArray[np.datetime64]:
     """Read stamps (ISO, day.month.year, month/day/year) and times of a day as datetime64[ns]; an empty cell is NaT.
 
-    Dates with strokes begin with the month, but where the first number of any of them is over 12; dates with hyphens
-    begin with the day, but where the second number is over 12. Raises ValueError with the index of the first cell that
-    is no stamp.
+    `day_first`: the order of dates such as 05/06/2024 and 05-06-2024, by default what these cells tell
+    (`day_before_month`). Raises ValueError with the index of the first cell that is no stamp.
     """
-    parsed = [_parsed_stamp(cell) for cell in cells]
-    day_first = any(int(parts.get("first") or 0) > 12 for parts in parsed if parts is not None)
+    if day_first is None:
+        day_first = day_before_month([either_dates(cells)])
     plain: list[str] = []
-    for index, (cell, parts) in enumerate(zip(cells, parsed, strict=True)):
+    for index, cell in enumerate(cells):
+        parts = _parsed_stamp(cell)
         if parts is None:
             if cell.strip():
                 raise ValueError(index)
@@ -100,7 +104,7 @@ def stamps(cells: Sequence[str]) -> NDArray[np.datetime64]:
             continue
         hour, colon, rest = _clock(parts["clock"] or "00:00").partition(":")
         if half := parts["half"]:  # 12 AM is midnight, 12 PM is noon
-            hour = str(int(hour) % 12 + (12 if half.lower() == "pm" else 0)) if 1 <= int(hour) <= 12 else "99"
+            hour = str(int(hour) % 12 + (12 if half[0] in "pP" else 0)) if 1 <= int(hour) <= 12 else "99"
         plain.append(f"{_date_of(parts, day_first)}T{hour:0>2}{colon}{rest}")
     try:
         return np.array(plain, dtype="datetime64[ns]")
@@ -108,11 +112,58 @@ def stamps(cells: Sequence[str]) -> NDArray[np.datetime64]:
         raise ValueError(next(index for index, text in enumerate(plain) if not _is_moment(text))) from None
 
 
+def either_dates(cells: Iterable[str]) -> dict[str, None]:
+    """Return the dates of stamps that begin with the day or the month, each once, as they follow each other."""
+    return {match["date"]: None for cell in cells if (match := _EITHER_DATE.match(cell))}
+
+
+def stated_order(dates: Iterable[str]) -> bool | None:
+    """Return whether the day is before the month in the first of the `either_dates` that tells; None where none does.
+
+    It has one number over 12.
+    """
+    over = ((first > _LAST_MONTH, second > _LAST_MONTH) for first, second, _ in map(_numbers, dates))
+    return next((first for first, second in over if first != second), None)
+
+
+def day_before_month(columns: Collection[Iterable[str]]) -> bool:
+    """Return whether the day stands before the month in the `either_dates` of columns that follow one rule.
+
+    By their `stated_order`; else in the order in which no column goes back; else in which they span less time; else
+    before a hyphen and not before a stroke.
+    """
+    stated = next((order for order in map(stated_order, columns) if order is not None), None)
+    if stated is not None:
+        return stated
+    hyphen = any("-" in text for column in columns for text in column)
+    ranks = {}
+    for day_first in (hyphen, not hyphen):
+        days = [[_day(text, day_first) for text in column] for column in columns]
+        ends = [day for own in days for day in own if day]
+        ranks[day_first] = any(own != sorted(own) for own in days), max(ends, default=0) - min(ends, default=0)
+    return min(ranks, key=ranks.__getitem__)
+
+
+def _day(either: str, day_first: bool) -> int:
+    """Return the number of a day, 0 for one that no calendar has."""
+    first, second, year = _numbers(either)
+    try:
+        return date(year, *((second, first) if day_first else (first, second))).toordinal()
+    except ValueError:
+        return 0
+
+
+def _numbers(either: str) -> tuple[int, int, int]:
+    first, second, year = re.split("[/-]", either)
+    return int(first), int(second), int(year) + (2000 if len(year) == 2 else 0)
+
+
 def _is_moment(text: str) -> bool:
     try:
-        return bool(np.datetime64(text, "ns")) or True
+        np.datetime64(text, "ns")
     except ValueError:
         return False
+    return True
 
 
 def seconds_of(stamp: str) -> float | None:
@@ -139,10 +190,8 @@ def _date_of(parts: Mapping[str, str | None], day_first: bool) -> str:
     if days := parts.get("days"):
         return str(np.datetime64(_NO_DATE) + int(days))
     year, month, day = (parts.get(name) for name in ("year", "month", "day"))
-    first, second = parts.get("first"), parts.get("second")
-    if first and second:
-        day_first = day_first or (parts["stroke"] == "-" and int(second) <= 12)
-        month, day = (second, first) if day_first else (first, second)
+    if "first" in parts:
+        month, day = (parts["first"], parts["second"])[:: -1 if day_first else 1]
     return f"{'20' if len(year) == 2 else ''}{year}-{month:0>2}-{day:0>2}" if year else _NO_DATE
 
 
