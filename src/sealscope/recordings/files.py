@@ -244,13 +244,11 @@ def _read(file: Path, kind: str, wanted: Wanted) -> Recording:
 
 
 def check_target(path: str | os.PathLike[str]) -> str:
-    """Return the format of a file to write by its suffix; raise InputError for another, or without its folder."""
+    """Return the format of a file to write by its suffix; raise InputError for another."""
     file = Path(path)
     kind = SUFFIXES.get(file.suffix.lower())
     if kind is None:
         raise InputError(f"a recording's file must end in {', '.join(SUFFIXES)}, got {file.name}")
-    if not file.parent.is_dir():
-        raise InputError(f"the folder of a file to write must exist, got {file.parent} ({file})")
     return kind
 
 
