@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -58,7 +59,15 @@ from sealscope.recordings.formats.text_layout import (
     encoding_of,
     layout_of,
 )
-from sealscope.recordings.formats.timebase import day_before_month, either_dates, is_stamp, stamps, stated_order
+from sealscope.recordings.formats.timebase import (
+    LogTime,
+    day_before_month,
+    either_dates,
+    falling,
+    is_stamp,
+    stamps,
+    stated_order,
+)
 
 #: Bytes that are read at a time, so many times more by pyarrow, and bytes of the longest line.
 _CHUNK, _FAST, _LONGEST_LINE = 2**19, 4, 2**23
@@ -84,7 +93,7 @@ def read_text(path: Path, wanted: Wanted) -> RecordingFields:
 def read_text_parts(path: Path, wanted: Wanted, every: float) -> Iterator[RecordingFields]:
     """Yield the wanted columns of a text log in parts of `every` seconds at its first rate, in bounded memory.
 
-    A log with a time for each channel and a long table are one part.
+    A log with a time for each channel, one that begins with its last sample and a long table are one part.
     """
     layout = look_at(path)
     own = None if layout.own is None else parse_description(layout.own)
@@ -103,19 +112,23 @@ def read_text_parts(path: Path, wanted: Wanted, every: float) -> Iterator[Record
             return
     log = _Log(path, layout, choice.columns, choice.date)
 
-    def part(blocks: list[_Block], more: Sequence[str] = ()) -> RecordingFields:
+    def part(blocks: list[_Block], time: LogTime, more: Sequence[str] = ()) -> RecordingFields:
         columns, notes = log.joined(blocks)
-        return converted(choice, columns, layout.kind, wanted, [*layout.notes, *notes, *more], layout.about, own)
+        notes = [*layout.notes, *notes, *more]
+        return converted(choice, columns, layout.kind, wanted, notes, layout.about, own, time)
 
-    blocks = log.blocks()
+    blocks, size, time = log.blocks(), inf, LogTime()
     first = next(blocks, None)
-    size = inf if first is None or every == inf else max(1, round(every * part([first[:]]).rate))
+    backwards = first is not None and choice.time is not None and falling(first.columns[choice.time])
+    if first is not None and every < inf and not backwards:
+        size = max(1, round(every * part([first[:]], time).rate))
+        time = LogTime(time.head, time.rate, time.resolution)
     before: list[_Block] = []
     for blocks_of_part in _cut([] if first is None else chain([first], blocks), size):
         if before:
-            yield part(before)
+            yield part(before, time)
         before = blocks_of_part
-    yield part(before, log.remarks_and_headings())
+    yield part(before, time, log.remarks_and_headings())
 
 
 def _several_clocks(path: Path, layout: Layout, times: Sequence[int], wanted: Wanted) -> RecordingFields:
@@ -213,6 +226,7 @@ class _Log:
         self.stamped: bool | None = None
         self.day_first: bool | None = None
         self.dated = False
+        self.worded = Counter[int]()
         self.nulls, self.width, self.usual = ["", "NaN"], 0, 0
 
     def blocks(self) -> Iterator[_Block]:
@@ -363,6 +377,7 @@ class _Log:
                     continue
             if words:
                 block.words[column] = np.array(words)
+                self.worded[column] += len(words)
                 block.first[column] = f"{cells[words[0]].strip()[:40]!r} {where(words[0])}"
         return block
 
@@ -430,7 +445,7 @@ class _Log:
         }
         for column, at in words.items():  # each column's blocks are let go before the next is joined
             first = next((own.first[column] for own in blocks if len(own.words.get(column, ()))), "")
-            if len(at) > MOST_WORDS * starts[-1]:
+            if at and self.worded[column] > MOST_WORDS * self.total:
                 stamped = self.stamped and self.kinds[column] == "time"
                 raise InputError(f"{_STAMP_RULE if stamped else 'a sample must be a number'}, got {first}")
             if at:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import date
 from typing import Any
 
@@ -60,6 +61,23 @@ _OFFSET_OF_DATENUM = 693_960
 #: Seconds since 1904 begin here, in 2008: those since 1970 would be in 2074.
 _SINCE_1904, _FROM_1904_TO_1970 = 3.28e9, 2_082_844_800.0
 _EARLIEST_EPOCH = 1e8  # [s]: March 1973, and no recording lasts three years
+
+
+@dataclass
+class LogTime:
+    """What the parts of a log that were read before tell of its time.
+
+    `head`: their first times, without a unit; `rate`: of the samples [Hz]; `resolution`: of times that these share [s];
+    `last`: the last time, as the file has it, and where it is, `end` [s].
+    """
+
+    head: Array | None = None
+    rate: float | None = None
+    resolution: float | None = None
+    last: Any = None
+    end: float = 0.0
+
+
 #: Times (n,) [s], what is known of the moment 0, and lines for the history.
 _Seconds = tuple[Array, dict[str, Any], list[str]]
 
@@ -225,15 +243,18 @@ def falling(times: NDArray[Any]) -> bool:
     return len(times) > 1 and bool(np.all(times[1:] < times[:-1]))
 
 
-def _from_stamps(values: NDArray[np.datetime64], name: str) -> _Seconds:
+def _from_stamps(values: NDArray[np.datetime64], name: str, log: LogTime) -> _Seconds:
     nanoseconds = values.astype("datetime64[ns]")
     known = ~np.isnat(nanoseconds)
     if not known.any():
         raise InputError("time must have a stamp in some row, got none")
+    undated = bool((nanoseconds[known] < np.datetime64(_NO_DATE, "ns") + np.timedelta64(1, "D")).all())
+    goes_on = undated and log.last is not None
+    if goes_on:
+        nanoseconds, known = np.append(log.last, nanoseconds), np.append(True, known)
     start = nanoseconds[known][0]
     t = (nanoseconds - start).astype(np.int64).astype(np.float64) / 1e9
     t[~known] = np.nan
-    undated = bool((nanoseconds[known] < np.datetime64(_NO_DATE, "ns") + np.timedelta64(1, "D")).all())
     hour = int((nanoseconds[known] - nanoseconds[known].astype("datetime64[D]")).min() / np.timedelta64(1, "h"))
     steps = {
         -_DAY: "has no date: begins again with the next day",
@@ -247,7 +268,7 @@ def _from_stamps(values: NDArray[np.datetime64], name: str) -> _Seconds:
         if (wrapped := _unwrapped(t, step)) is not None:
             t = wrapped
             notes.append(f"column {name} {what}")
-    return t, {} if undated else {"start": str(start)}, notes
+    return t[1:] + log.end if goes_on else t, {} if undated else {"start": str(start)}, notes
 
 
 def _unwrapped(t: Array, step: float) -> Array | None:
@@ -265,14 +286,14 @@ def _unwrapped(t: Array, step: float) -> Array | None:
     return result
 
 
-def _from_numbers(values: Array, unit: str | None, name: str) -> _Seconds:
+def _from_numbers(values: Array, unit: str | None, name: str, log: LogTime) -> _Seconds:
     """Read numbers in a unit, or without: seconds, a time since 1970 in the unit that their size tells, or days."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         raise InputError("time must have a number in some row, got none")
     first = float(finite[0])
     if unit is None:
-        return _without_unit(values, finite, name)
+        return _without_unit(values, finite, name, log)
     if since := _SINCE.fullmatch(unit.strip()):
         word = _LONG_UNITS.get(since["unit"].lower(), since["unit"].lower())
         seconds = to_si(values - first, word, "s", name="time")
@@ -288,18 +309,25 @@ def _from_numbers(values: Array, unit: str | None, name: str) -> _Seconds:
     return seconds, {}, []
 
 
-def _without_unit(values: Array, finite: Array, name: str) -> _Seconds:
+def _without_unit(values: Array, finite: Array, name: str, log: LogTime) -> _Seconds:
     first = float(finite[0])
-    if (days := _days_since(finite)) is not None:
+    head = finite if log.head is None else log.head
+    if (days := _days_since(head)) is not None:
         origin, what = days
-        begin = {} if origin is None else {"start": str(origin + np.timedelta64(round(first * _DAY * 1e6), "us"))}
+        log.head = head
+        if origin is None:
+            first = first if log.last is None else log.last
+            return (values - first) * _DAY + log.end, {}, [f"column {name} read as {what}"]
+        begin = {"start": str(origin + np.timedelta64(round(first * _DAY * 1e6), "us"))}
         return (values - first) * _DAY, begin, [f"column {name} read as {what}"]
-    if np.all(np.diff(finite) == 1) and finite.size == values.size and abs(first) < _EARLIEST_EPOCH:
+    counted = log.head is None and finite.size == values.size and np.all(np.diff(finite) == 1)
+    log.head = head
+    if counted and abs(first) < _EARLIEST_EPOCH:
         raise InputError(
             f"time must be in seconds, got a count of rows {first:g}, {first + 1:g}, ... in column {name}: "
             f"give the rate, or the unit of its column (t={name} ms)"
         )
-    unit = next((unit for least, unit in _EPOCH if abs(first) >= least), None)
+    unit = next((unit for least, unit in _EPOCH if abs(head[0]) >= least), None)
     if unit is None:
         return values, {}, [f"column {name} has no unit: taken as s"]
     epoch, year = to_si(first, unit, "s"), 1970
@@ -326,43 +354,57 @@ def _days_since(values: Array) -> tuple[np.datetime64 | None, str] | None:
 
 
 def time_base(
-    values: NDArray[Any], unit: str | None, name: str, stated_rate: float | None = None
+    values: NDArray[Any], unit: str | None, name: str, stated_rate: float | None = None, log: LogTime | None = None
 ) -> tuple[Array, float, dict[str, Any], list[str]]:
     """Convert a time column's `values` (n,), numbers in `unit` or datetime64, to seconds and a rate.
 
     Returns the times (n,) [s], the rate [Hz], what is known of the moment 0, and lines for the history. Stamps and
     epoch times are based at their first sample; other times are left where they are. The `stated_rate` of a file [Hz]
-    places samples that share their stamps. Raises InputError.
+    places samples that share their stamps. The values may go on from those of `log`, which then has theirs, too. Raises
+    InputError.
     """
+    log = LogTime() if log is None else log
     if values.dtype.kind == "M":
-        t, start, notes = _from_stamps(values, name)
+        t, start, notes = _from_stamps(values, name, log)
     else:
-        t, start, notes = _from_numbers(np.asarray(values, dtype=np.float64), unit, name)
+        t, start, notes = _from_numbers(np.asarray(values, dtype=np.float64), unit, name, log)
+    known = np.flatnonzero(np.isfinite(t))
+    if known.size:
+        log.last, log.end = values[known[-1]], float(t[known[-1]])
     with np.errstate(invalid="ignore", over="ignore"):  # infinite times are findings, not warnings
         if stated_rate is not None and t.size > 1 and 2 * np.count_nonzero(np.diff(t)) < t.size - 1:
             notes.append(f"column {name}: samples share their stamps, taken at {stated_rate:g} Hz, as the file says")
             return t[0] + np.arange(t.size) / stated_rate, stated_rate, start, notes
-        resolved = _finer(t)
+        resolved = _finer(t, log)
         if resolved is not None:
-            resolution, t = resolved
-            notes.append(f"column {name} in steps of {resolution:g} s: samples in between taken as uniform")
-        return t, nominal_rate(t), start, notes
+            log.resolution, t = resolved
+            notes.append(f"column {name} in steps of {log.resolution:g} s: samples in between taken as uniform")
+        log.rate = nominal_rate(t) if log.rate is None else log.rate
+        return t, log.rate, start, notes
 
 
-def _finer(t: Array) -> tuple[float, Array] | None:
-    """Return the resolution [s] of times (n,) that samples share as their distances ask for, and uniform times."""
+def _finer(t: Array, log: LogTime) -> tuple[float, Array] | None:
+    """Return the resolution [s] of times (n,) that samples share as their distances ask for, and uniform times.
+
+    A part too short to tell, and without a gap, is taken as those before it.
+    """
     steps = np.diff(t)
-    if t.size < _FEWEST_SHARED or 2 * np.count_nonzero(steps) > steps.size:
-        return None
     changes = np.flatnonzero(steps)
-    if not np.isfinite(t).all() or (steps < 0).any() or changes.size < 3:
+    if not np.isfinite(t).all() or (steps < 0).any():
         return None
-    resolution = float(steps[changes].min())
-    counts = np.diff(changes) / np.round(steps[changes][1:] / resolution)
-    usual = float(np.diff(changes).sum() / np.round(steps[changes][1:] / resolution).sum())
-    if usual < 2.0 or np.abs(counts - usual).max() > 1.0:
+    if t.size >= _FEWEST_SHARED and changes.size >= 3:
+        if 2 * changes.size > steps.size:
+            return None
+        resolution = float(steps[changes].min())
+        many = np.round(steps[changes][1:] / resolution)
+        counts, usual = np.diff(changes) / many, float(np.diff(changes).sum() / many.sum())
+        if usual < 2.0 or np.abs(counts - usual).max() > 1.0:
+            return None
+        rate = _shortest(usual / resolution, 1.0 / float(np.diff(changes).sum()))
+    elif log.resolution is not None and log.rate is not None and steps.max(initial=0.0) < 1.5 * log.resolution:
+        resolution, rate = log.resolution, log.rate
+    else:
         return None
-    rate = _shortest(usual / resolution, 1.0 / float(np.diff(changes).sum()))
     # a stamp says when its first sample was taken, to a sample
-    begin = float(np.median(t[changes + 1] - (changes + 1) / rate))
+    begin = float(np.median(t[changes + 1] - (changes + 1) / rate)) if changes.size else float(t[0])
     return resolution, begin + np.arange(t.size) / rate
