@@ -16,6 +16,28 @@ from sealscope.recordings.formats import text
 
 from .exports import TEXTS
 
+#: Cells that some readers of numbers take for one, and others do not.
+ODD = [
+    "1e5",
+    "1.5D+3",
+    "\u22125.0",
+    " 7 ",
+    "1 000.5",
+    "1'000",
+    "+.5",
+    "5.",
+    "nan",
+    "-NaN",
+    "NAN",
+    "#N/A",
+    "0x1F",
+    "1_000",
+    "\uff11",
+    "1f",
+    "--",
+    "1e400",
+    "''",
+]
 #: How loggers write moments; with a comma in place of the point where the log has one.
 STAMPS = {
     "month/day": "%m/%d/%Y %H:%M:%S.%f",
@@ -40,9 +62,11 @@ def outcome(path: Path, **given: object) -> tuple[object, ...]:
     return bits, dict(recording.units), recording.rate, dict(recording.provenance), recording.history
 
 
-def in_blocks(path: Path, size: int, **given: object) -> tuple[object, ...]:
+def in_blocks(path: Path, size: int, large: bool = False, **given: object) -> tuple[object, ...]:
+    """What reading in blocks of this size gives; a `large` log's plain blocks are read by pyarrow, if installed."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(text, "_CHUNK", size)
+        patch.setattr(text, "_LARGE", 0 if large else 2**40)
         return outcome(path, **given)
 
 
@@ -62,13 +86,16 @@ def clocked(form: str, start: datetime, step: timedelta, count: int) -> list[str
     day=st.datetimes(datetime(2024, 1, 1), datetime(2024, 12, 31)),
     step=st.sampled_from([timedelta(milliseconds=10), timedelta(minutes=50), timedelta(days=9)]),
     changes=st.lists(
-        st.tuples(st.integers(0, 39), st.sampled_from(["word", "missing", "no time", "comment", "blank", "heading"])),
+        st.tuples(
+            st.integers(0, 39), st.sampled_from(["OVERLOAD", "missing", "no time", "comment", "blank", "heading", *ODD])
+        ),
         max_size=4,
     ),
     comma=st.booleans(),
     quoted=st.booleans(),
     cut=st.integers(0, 12),
     size=st.sampled_from([1, 64, 500]),
+    large=st.booleans(),
 )
 def test_any_log_in_small_blocks(
     form: str,
@@ -79,6 +106,7 @@ def test_any_log_in_small_blocks(
     quoted: bool,
     cut: int,
     size: int,
+    large: bool,
     tmp_path: Path,
 ) -> None:
     times = (
@@ -92,18 +120,17 @@ def test_any_log_in_small_blocks(
     for row, change in changes:
         time = times[row]
         rows[row] = {
-            "word": f"{time};OVERLOAD;2.5",
             "missing": f"{time};;2.5",
             "no time": ";" * time.count(";") + ";3.;2.5",
             "comment": f"# pause\n{rows[row]}",
             "blank": f"\n{rows[row]}",
             "heading": f"{head}\n{rows[row]}",
-        }[change]
+        }.get(change, f"{time};{change};2.5")
     written = "\n".join(rows) + "\n"
     written = written.replace(".", ",") if comma else written
     path = tmp_path / "log.csv"
     path.write_text(f"{head}\n{written[: len(written) - cut]}")
-    assert in_blocks(path, size) == outcome(path)
+    assert in_blocks(path, size, large) == outcome(path)
 
 
 @pytest.mark.parametrize(

@@ -61,6 +61,8 @@ _OFFSET_OF_DATENUM = 693_960
 #: Seconds since 1904 begin here, in 2008: those since 1970 would be in 2074.
 _SINCE_1904, _FROM_1904_TO_1970 = 3.28e9, 2_082_844_800.0
 _EARLIEST_EPOCH = 1e8  # [s]: March 1973, and no recording lasts three years
+#: Times (n,) [s], what is known of the moment 0, and lines for the history.
+_Seconds = tuple[Array, dict[str, Any], list[str]]
 
 
 @dataclass
@@ -76,10 +78,6 @@ class LogTime:
     resolution: float | None = None
     last: Any = None
     end: float = 0.0
-
-
-#: Times (n,) [s], what is known of the moment 0, and lines for the history.
-_Seconds = tuple[Array, dict[str, Any], list[str]]
 
 
 def _parsed_stamp(text: str) -> dict[str, str | None] | None:
@@ -310,18 +308,15 @@ def _from_numbers(values: Array, unit: str | None, name: str, log: LogTime) -> _
 
 
 def _without_unit(values: Array, finite: Array, name: str, log: LogTime) -> _Seconds:
-    first = float(finite[0])
-    head = finite if log.head is None else log.head
+    first, begins = float(finite[0]), log.head is None
+    log.head = head = finite if log.head is None else log.head
     if (days := _days_since(head)) is not None:
-        origin, what = days
-        log.head = head
-        if origin is None:
-            first = first if log.last is None else log.last
-            return (values - first) * _DAY + log.end, {}, [f"column {name} read as {what}"]
+        origin, note = days[0], f"column {name} read as {days[1]}"
+        if origin is None:  # it has no start, and goes on
+            return (values - (first if log.last is None else log.last)) * _DAY + log.end, {}, [note]
         begin = {"start": str(origin + np.timedelta64(round(first * _DAY * 1e6), "us"))}
-        return (values - first) * _DAY, begin, [f"column {name} read as {what}"]
-    counted = log.head is None and finite.size == values.size and np.all(np.diff(finite) == 1)
-    log.head = head
+        return (values - first) * _DAY, begin, [note]
+    counted = begins and finite.size == values.size and np.all(np.diff(finite) == 1)
     if counted and abs(first) < _EARLIEST_EPOCH:
         raise InputError(
             f"time must be in seconds, got a count of rows {first:g}, {first + 1:g}, ... in column {name}: "
