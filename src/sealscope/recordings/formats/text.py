@@ -225,6 +225,7 @@ class _Log:
         self.fast = plain and numeric and path.stat().st_size >= _LARGE and find_spec("pyarrow") is not None
         self.stamped: bool | None = None
         self.day_first: bool | None = None
+        self.order = ""
         self.dated = False
         self.worded = Counter[int]()
         self.nulls, self.width, self.usual = ["", "NaN"], 0, 0
@@ -433,7 +434,10 @@ class _Log:
                     own.update(either_dates(self._moments(rows, column)))
                 if any(stated_order(own) is not None for own in dates):
                     break
-        return day_before_month(dates)
+        order = day_before_month(dates)
+        if all(stated_order(own) is None for own in dates):
+            self.order = f"dates read as {'day, month' if order else 'month, day'}: none has a number over 12"
+        return order
 
     def joined(self, blocks: list[_Block]) -> tuple[dict[int, NDArray[Any]], list[str]]:
         """Return the columns of blocks, which let go of them, and lines for the history; refuse many words."""
@@ -459,6 +463,7 @@ class _Log:
             cells = np.delete(cells, words[last]) if words[last] and self.kinds[last] == "time" else cells
             cells.setflags(write=False)  # made here: a recording takes it as it is
             columns[column] = cells
+        notes += [self.order] if self.order else []
         if self.dated and self.date is not None:
             notes.append(f"date and time joined from columns {labels[self.date].whole} and {labels[last].whole}")
         return columns, notes

@@ -263,25 +263,23 @@ def _from_stamps(values: NDArray[np.datetime64], name: str, log: LogTime) -> _Se
         steps = dict.fromkeys((-_HOUR, _HOUR), changed) if hour < _LATEST_CHANGE else {}
     notes = []
     for step, what in steps.items():
-        if (wrapped := _unwrapped(t, step)) is not None:
+        if (wrapped := _unwrapped(t, step, once=not undated)) is not None:
             t = wrapped
             notes.append(f"column {name} {what}")
     return t[1:] + log.end if goes_on else t, {} if undated else {"start": str(start)}, notes
 
 
-def _unwrapped(t: Array, step: float) -> Array | None:
-    """Return times (n,) without a single jump by `step` [s], to a few usual intervals; None where there is no such."""
+def _unwrapped(t: Array, step: float, once: bool) -> Array | None:
+    """Return times (n,) without jumps by `step` [s], to a few usual intervals; None without, or with several if `once`."""
     steps = np.diff(t)
     forward = steps[np.isfinite(steps) & (steps > 0)]
     if not forward.size:
         return None
     usual = float(np.median(forward))
     jumps = np.flatnonzero(np.abs(steps - step - usual) <= _NEAR * usual)
-    if len(jumps) != 1 or usual * _NEAR >= 0.1 * abs(step):
+    if not jumps.size or (once and jumps.size > 1) or usual * _NEAR >= 0.1 * abs(step):
         return None
-    result = t.copy()
-    result[jumps[0] + 1 :] -= step
-    return result
+    return t - step * np.searchsorted(jumps + 1, np.arange(t.size), side="right")
 
 
 def _from_numbers(values: Array, unit: str | None, name: str, log: LogTime) -> _Seconds:
