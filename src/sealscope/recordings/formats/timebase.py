@@ -270,7 +270,7 @@ def _from_stamps(values: NDArray[np.datetime64], name: str, log: LogTime) -> _Se
 
 
 def _unwrapped(t: Array, step: float, once: bool) -> Array | None:
-    """Return times (n,) without jumps by `step` [s], to a few usual intervals; None without, or with several if `once`."""
+    """Return times (n,) without jumps by `step` [s], to a few usual intervals; None without, or if not just `once`."""
     steps = np.diff(t)
     forward = steps[np.isfinite(steps) & (steps > 0)]
     if not forward.size:
