@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from typer import Argument, Context, Option, echo
 
-from sealscope.errors import InputError, SealscopeError, UnreadableFile
+from sealscope.errors import InputError, SealscopeError, UnreadableFile, printable
 from sealscope.simulation.arguments import Arguments
 
 if TYPE_CHECKING:
@@ -333,11 +333,6 @@ def verbose(context: Context) -> bool:
     return bool(context.find_root().params.get("verbose"))
 
 
-def printable(text: str, kept: str = "") -> str:
-    """Return a text without what a terminal would obey, whatever a file's name or header brought; `kept` stays."""
-    return "".join(c if c.isprintable() or c in kept else "\N{REPLACEMENT CHARACTER}" for c in text)
-
-
 def say(text: str) -> None:
     """Print lines on standard output."""
     echo(printable(text, "\n"))
@@ -370,11 +365,10 @@ def attempt(file: Path, work: Callable[[], T]) -> T | None:
 
 def check_folder(file: Path) -> None:
     """Refuse a file whose folder is not there before the long work, not after it; remove what a killed call left."""
-    if not file.parent.is_dir():
-        raise InputError(f"the folder of a file to write must exist, got {file.parent} ({file})")
-    from sealscope.storage.atomic import remove_temporaries
+    from sealscope.storage import atomic
 
-    remove_temporaries(file.parent, file.name)
+    atomic.check_folder(file)
+    atomic.remove_temporaries(file.parent, file.name)
 
 
 def write_text(file: Path, text: str) -> None:

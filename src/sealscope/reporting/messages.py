@@ -14,6 +14,7 @@ from typing import Any
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LEAKS, LEAST_SPECIFIC
 from sealscope.diagnosis.verdict.machine import AssumedMachine
+from sealscope.errors import printable
 from sealscope.recordings.formats.columns import counted, listed
 
 ABSENT = "–"
@@ -366,16 +367,12 @@ def _lines(diagnosis: Diagnosis, rows: list[tuple[str, str | None]], width: int)
     """Return a line with the verdict, and a paragraph for each row that has a text."""
     blank = " " * 12
     texts = [
-        fill(_printable(text), width, initial_indent=f"  {label:<10}", subsequent_indent=blank, break_on_hyphens=False)
+        fill(printable(text), width, initial_indent=f"  {label:<10}", subsequent_indent=blank, break_on_hyphens=False)
         for label, text in rows
         if text
     ]
-    first = say("terminal.diagnosis", file=_printable(diagnosis.file), summary=diagnosis.summary)
+    first = say("terminal.diagnosis", file=printable(diagnosis.file), summary=diagnosis.summary)
     return "\n".join((first, *texts))
-
-
-def _printable(text: str) -> str:
-    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 
 def flow(diagnosis: Diagnosis) -> str:
