@@ -116,7 +116,7 @@ def standstill_pressures(rig: Rig, force: float) -> tuple[float, float]:
 
 
 def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
-    """State (12,) at standstill with the piston at x_0 [m] from mid-stroke, under `push` [N] beside the rig's own load.
+    """State (14,) at standstill with the piston at x_0 [m] from mid-stroke, under `push` [N] beside the rig's own load.
 
     The pressures carry the load (`standstill_pressures`), the motor holds the pump against them: i = T_load/C_m, with
     the speed controller's integral at R_c i/K_i, which gives that current. A machine that leaks creeps from there.
