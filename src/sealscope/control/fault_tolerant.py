@@ -88,6 +88,8 @@ class FaultTolerant:
     @classmethod
     def of(cls, rig: Rig, inner: Controller | None = None, *, known: float | None = None) -> Self:
         """Return the controller for what a rig is said to be, around `inner`, by default `PositionPI`."""
+        from sealscope.physics.cylinder import volumes_at_middle
+
         c, sensors, makeup = rig.cylinder, rig.sensors, rig.makeup
         if rig.valve.spool == "present":
             raise InputError(
@@ -99,8 +101,7 @@ class FaultTolerant:
             rig.pump.q_b / (2.0 * math.pi),
             c.A_A,
             c.A_B,
-            c.V + c.V_hose_A,
-            c.V - c.V_rod + c.V_hose_B,
+            *volumes_at_middle(c),
             rig.fluid.K_oil,
             sensors.x.resolution,
             math.hypot(max(sensors.p_A.noise, sensors.p_B.noise), sensors.common_noise),

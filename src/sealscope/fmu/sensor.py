@@ -33,7 +33,7 @@ from sealscope.compiled import large_law, law, record_at
 from sealscope.diagnosis.inference.blocks import Columns
 from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.inference.row_weights import SUPPORT, Workspace, median, weigh, workspace_shapes
-from sealscope.diagnosis.inference.terms import ATMOSPHERE, HALF_DIFFERENCE, LEAST_ABSOLUTE
+from sealscope.diagnosis.inference.terms import HALF_DIFFERENCE, LEAST_ABSOLUTE
 from sealscope.diagnosis.inference.weak_form import LARGEST, SPAN, STRIDE, stride_samples, test_function
 from sealscope.diagnosis.live.balance import BLOCK_SECONDS, LEARNED, TELLS, WAKES, live_equations, size_error
 from sealscope.diagnosis.live.known import (
@@ -53,6 +53,7 @@ from sealscope.fmu.machine import unit_code
 from sealscope.fmu.variables import SENSOR_RESULTS, VALUES, Variable, inputs, outputs, parameter
 from sealscope.parameters import Rig
 from sealscope.recordings.channels import CHANNEL_UNITS, LONG_NAMES
+from sealscope.units import P_ATM
 
 #: Channels that a soft sensor reads, in the order of the samples.
 INPUTS = ("p_A", "p_B", "theta", "x")
@@ -247,7 +248,7 @@ def _increments(ring: Any, k: int, half: int, rate: float, displacement: float, 
     out[2], out[3] = (by_A - out_A) * dx, (1.0 - outward - by_A + out_A) * dx
     for side in range(2):
         before, after = ring[side, here], ring[side, there]
-        low, high = max(before + ATMOSPHERE, LEAST_ABSOLUTE), max(after + ATMOSPHERE, LEAST_ABSOLUTE)
+        low, high = max(before + P_ATM, LEAST_ABSOLUTE), max(after + P_ATM, LEAST_ABSOLUTE)
         at = 4 + 4 * side
         out[at], out[at + 1] = after - before, x * (after - before)
         out[at + 2], out[at + 3] = 1.0 / high - 1.0 / low, math.log(high) - math.log(low)
