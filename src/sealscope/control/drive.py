@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
@@ -54,14 +54,12 @@ def lagged(values: np.ndarray, fading: float, first: float, out: np.ndarray) -> 
         first = values[sample] + fading * (first - values[sample])
 
 
-def check_numbers(what: str, positive: dict[str, float], not_negative: dict[str, float]) -> None:
-    """Raise InputError for a number that is not finite, not > 0, or not >= 0; `what` has it."""
-    for name, value in positive.items():
-        if not (math.isfinite(value) and value > 0):
-            raise InputError(f"{name} of {what} must be > 0, got {value}")
-    for name, value in not_negative.items():
-        if not (math.isfinite(value) and value >= 0):
-            raise InputError(f"{name} of {what} must be >= 0, got {value}")
+def check_numbers(what: str, source: object, positive: Sequence[str], not_negative: Sequence[str] = ()) -> None:
+    """Raise InputError for a number of `source` that is not finite, not > 0, or not >= 0; `what` has it."""
+    for name in (*positive, *not_negative):
+        value = getattr(source, name)
+        if not (math.isfinite(value) and (value > 0 or (value == 0 and name in not_negative))):
+            raise InputError(f"{name} of {what} must be {'>' if name in positive else '>='} 0, got {value}")
 
 
 class _Invertible(ABC):
@@ -94,9 +92,7 @@ class Drive(_Invertible):
     droop: float
 
     def __post_init__(self) -> None:
-        positive = {"displacement": self.displacement, "omega_per_volt": self.omega_per_volt}
-        rest = {"shortfall": self.shortfall, "corner": self.corner, "droop": self.droop}
-        check_numbers("the drive", positive, rest)
+        check_numbers("the drive", self, ("displacement", "omega_per_volt"), ("shortfall", "corner", "droop"))
 
     @classmethod
     def of(cls, rig: Rig) -> Self:
@@ -160,8 +156,7 @@ class ValveDrive(_Invertible):
     p_s: float
 
     def __post_init__(self) -> None:
-        positive = {"Q_N": self.Q_N, "dp_N": self.dp_N, "u_N": self.u_N, "p_s": self.p_s}
-        check_numbers("the valve", positive, {})
+        check_numbers("the valve", self, ("Q_N", "dp_N", "u_N", "p_s"))
 
     @classmethod
     def of(cls, rig: Rig) -> Self:

@@ -87,7 +87,8 @@ class FaultTolerant:
     known: float | None = None
 
     def __post_init__(self) -> None:
-        check_numbers("the controller", {"u_max": self.u_max}, {"G_assumed": self.G_assumed, "known": self.known or 0})
+        given = ("G_assumed",) if self.known is None else ("G_assumed", "known")
+        check_numbers("the controller", self, ("u_max",), given)
 
     @classmethod
     def of(cls, rig: Rig, inner: Controller | None = None, *, known: float | None = None) -> Self:

@@ -74,8 +74,7 @@ class Flatness:
     v_max: float
 
     def __post_init__(self) -> None:
-        rest = {"M": self.M, "F_C": self.F_C, "F_v": self.F_v, "G": self.G, "C": self.C}
-        check_numbers("the controller", {"v_th": self.v_th, "v_max": self.v_max}, rest)
+        check_numbers("the controller", self, ("v_th", "v_max"), ("M", "F_C", "F_v", "G", "C"))
 
     @classmethod
     def of(cls, rig: Rig) -> Self:

@@ -74,8 +74,7 @@ class PositionPI:
 
     def __post_init__(self) -> None:
         positive, rest = ("area_A", "area_B", "u_max", "rate"), ("dead_volts", "k_v", "k_i", "dead_band", "delay")
-        groups = ({name: getattr(self, name) for name in names} for names in (positive, rest))
-        check_numbers("the controller", *groups)
+        check_numbers("the controller", self, positive, rest)
 
     @classmethod
     def of(cls, rig: Rig, **gains: float) -> Self:
