@@ -14,12 +14,12 @@ from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY
 from sealscope.diagnosis.inference.blocks import Columns, solve
 from sealscope.diagnosis.inference.detector import VolumeBalance
-from sealscope.diagnosis.inference.terms import ATMOSPHERE, equations
+from sealscope.diagnosis.inference.terms import equations
 from sealscope.diagnosis.inspection import Inspection
 from sealscope.diagnosis.verdict.machine import unstated
 from sealscope.recordings.oil import oil_temperature
 from sealscope.recordings.recording import Array, Recording
-from sealscope.units import BAR, LITRE_PER_MINUTE, from_si
+from sealscope.units import BAR, LITRE_PER_MINUTE, P_ATM, from_si
 
 if TYPE_CHECKING:
     from sealscope.diagnosis.learnt import Learnt
@@ -231,9 +231,9 @@ def _noise(values: Array) -> float:
 
 
 def _below_vacuum(part: Recording, name: str) -> str:
-    if part.units[name] != "Pa" or not (least := float(np.quantile(part[name], 0.01))) < -ATMOSPHERE:
+    if part.units[name] != "Pa" or not (least := float(np.quantile(part[name], 0.01))) < -P_ATM:
         return ""
-    off = (-ATMOSPHERE - least) / BAR
+    off = (-P_ATM - least) / BAR
     return f"{name} reads below vacuum: its zero is at least {off:.1g} bar too low"
 
 

@@ -14,7 +14,6 @@ from sealscope.diagnosis.inference.distribution import distribution
 from sealscope.diagnosis.inference.onset import FEWEST
 from sealscope.diagnosis.inference.row_weights import RIDGE, SUPPORT
 from sealscope.diagnosis.inference.terms import (
-    ATMOSPHERE,
     HALF_DIFFERENCE,
     LEAST_ABSOLUTE,
     START,
@@ -29,6 +28,7 @@ from sealscope.recordings.gaps import long_gaps
 from sealscope.recordings.quality import clipped
 from sealscope.recordings.recording import Array, Recording
 from sealscope.storage.plain_state import array_of, part_of, plain_array
+from sealscope.units import P_ATM
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -253,7 +253,7 @@ def _gauge_to_absolute(pressure: Array) -> float:
     """Return what makes a gauge pressure absolute: the atmosphere, or more where its zero is surely too low."""
     finite = pressure[np.isfinite(pressure)]
     lowest = float(np.min(finite)) if finite.size else 0.0
-    return max(ATMOSPHERE, LEAST_ABSOLUTE - lowest)
+    return max(P_ATM, LEAST_ABSOLUTE - lowest)
 
 
 def whole_samples(recording: Recording, names: Collection[str]) -> dict[str, Array]:

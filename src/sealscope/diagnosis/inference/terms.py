@@ -26,12 +26,11 @@ from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.recordings.channels import flow_source
 from sealscope.recordings.recording import Array
+from sealscope.units import P_ATM
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Pressure of the surroundings [Pa], by which a gauge pressure is less than the absolute one.
-ATMOSPHERE = 101325.0
 #: The least absolute pressure that the terms of air are computed for [Pa].
 LEAST_ABSOLUTE: float = beliefs("inference")["pressure"]["least"]
 #: Half the time over which speed and direction of motion are taken [s]: a few counts of an encoder at slow motion.
@@ -102,7 +101,7 @@ class Signals:
     def absolute(self) -> Mapping[str, Array]:
         """Absolute pressure [Pa] of each chamber, at least `LEAST_ABSOLUTE`."""
         return {
-            name: np.maximum(self._channels[name] + self._zeros.get(name, ATMOSPHERE), LEAST_ABSOLUTE)
+            name: np.maximum(self._channels[name] + self._zeros.get(name, P_ATM), LEAST_ABSOLUTE)
             for name in ("p_A", "p_B")
         }
 
@@ -333,8 +332,10 @@ def _of_side(side: str) -> tuple[Term, ...]:
 
 def _released(rig: Rig, share: Callable[[Signals], Array | float]) -> Term:
     """Return free air in both chambers at once, each by its volume; `share`: how far side A's balance counts."""
+    from sealscope.physics.cylinder import volumes_at_middle
+
     own = rig.cylinder
-    middle = {"A": own.V + own.V_hose_A, "B": own.V - own.V_rod + own.V_hose_B}
+    middle = dict(zip("AB", volumes_at_middle(own), strict=True))
     areas = {"A": own.A_A, "B": -own.A_B} if own.volumes == "position" else {"A": 0.0, "B": 0.0}
 
     def released(s: Signals) -> Array:
