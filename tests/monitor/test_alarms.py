@@ -28,13 +28,15 @@ LEAK = WatchedLeak(
 )
 
 
-def through(judge: AlarmJudge, flows: list[float | None], leak: WatchedLeak | None = LEAK) -> list[str]:
+def through(
+    judge: AlarmJudge, flows: list[float | None], leak: WatchedLeak | None = LEAK, settings: WatchSettings = SETTINGS
+) -> list[str]:
     """What happens as blocks of these flows follow each other."""
     happened = []
     for number, lpm in enumerate(flows):
         interval = None if lpm is None else (lpm, lpm)
         change = judge.take(
-            BlockEstimate(number, 3.0 * number, "alarm", lpm, interval, lpm, interval), leak, 1, SETTINGS
+            BlockEstimate(number, 3.0 * number, "alarm", lpm, interval, lpm, interval), leak, 1, settings
         )
         if change is not None and change[1]:
             happened.append(change[1])
@@ -87,6 +89,15 @@ def test_an_error_must_be_seen_again_and_becomes_a_warning_below():
     judge.marked("acknowledged", 50.0)
     assert through(judge, [0.0] * 2, None) == ["returned"]
     assert judge.alarm is None
+
+
+def test_an_error_returns_without_a_limit_for_errors_as_well():
+    """Settings of a restart may have none: the alarm then is a warning, or over where the leak is below that."""
+    for lpm, happens in ((0.005, ["returned"]), (0.03, ["warning"])):
+        judge = AlarmJudge("a")
+        through(judge, [0.02] * 2)
+        assert judge.alarm is not None and judge.alarm.level == "error"
+        assert through(judge, [lpm] * 6, settings=WatchSettings(warning_lpm=0.01)) == happens
 
 
 def test_without_litres_a_leak_is_a_warning():

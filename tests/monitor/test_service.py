@@ -8,6 +8,7 @@ import os
 import sqlite3
 import threading
 import time
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -223,6 +224,43 @@ def test_other_settings_begin_a_new_baseline(tmp_path):
     service, _ = served(read_settings(file))
     _, state, _ = service.store.checkpoint("press 1")
     assert (state["watch"]["baseline_version"], state["watch"]["blocks"]) == (2, 44)
+
+
+def test_another_rig_under_the_same_name_begins_a_new_baseline(tmp_path, caplog):
+    """What counts is what the file states, not its name: the same values elsewhere are the same machine."""
+    settings = settings_in(tmp_path)
+    press, moved_to = tmp_path / "press.toml", tmp_path / "settings" / "renamed.toml"
+    moved_to.parent.mkdir()
+
+    def watched(rig: Path, lines: bytes = b"") -> dict[str, Any]:
+        own = [actuator.model_copy(update={"rig": str(rig)}) for actuator in settings.actuator]
+        service, _ = served(settings.model_copy(update={"actuator": own}), lines)
+        return service.store.checkpoint("press 2")[1]["watch"]
+
+    text = (files("sealscope.parameters") / "rigs" / "thesis.toml").read_text()
+    for place in (press, moved_to):
+        place.write_text(text)
+    assert watched(press, LINES)["baseline"] is not None
+    assert (watched(moved_to)["baseline_version"], caplog.text) == (1, "")
+    assert "q_b = { value = 4.9e-6" in text
+    moved_to.write_text(text.replace("q_b = { value = 4.9e-6", "q_b = { value = 9.8e-6"))
+    again = watched(moved_to)
+    assert (again["baseline_version"], again["baseline"]) == (2, None)
+    assert "press 2: its rig or learn_hours are others than it learned with" in caplog.text
+
+
+def test_a_restart_with_other_thresholds_changes_nothing_that_was_said(tmp_path):
+    """A leak below the threshold is announced when the threshold is lowered: by the next block, and as raised."""
+    settings = settings_in(tmp_path)
+    lines = LINES.splitlines(keepends=True)
+    strict = [own.model_copy(update={"warning_lpm": 10.0, "error_lpm": 20.0}) for own in settings.actuator]
+    served(settings.model_copy(update={"actuator": strict}), b"".join(lines[:-10]))
+    service, _ = served(settings)
+    assert service.actuators.plain()["press 1"]["alarm"] is None
+    assert service.store.alarms() == []
+    service, _ = served(settings, b"".join(lines))
+    assert service.actuators.plain()["press 1"]["alarm"] == service.store.alarms()[0]["id"]
+    assert [event["event"] for _, event in service.store.events_since(0)] == ["raised"]
 
 
 def test_a_fleet_shares_its_budget_and_keeps_its_baselines(tmp_path):

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 from sqlalchemy.exc import IntegrityError
 
 from sealscope.diagnosis.live.estimates import BlockEstimate
@@ -24,7 +25,7 @@ from sealscope.monitor.alarms import Alarm, AlarmJudge
 from sealscope.monitor.database.machine_files import pass_on
 from sealscope.monitor.database.sharing import Share
 from sealscope.monitor.database.store import KEPT_IDENTITIES, MonitorStore, StoredRows, away
-from sealscope.monitor.settings import ActuatorSettings
+from sealscope.monitor.settings import ActuatorSettings, WatchSettings
 from sealscope.monitor.sources.source_block import SourceBlock, bytes_of, nothing
 from sealscope.monitor.supervisor import Supervisor
 from sealscope.recordings.recording import Recording
@@ -60,7 +61,9 @@ class _Actuator:
     judged_s: float | None = None
     kept: list[Recording] = field(default_factory=list)
 
-    def judged(self, samples: Recording, follows: bool) -> tuple[list[BlockEstimate], list[tuple[Alarm, str, float]]]:
+    def judged(
+        self, samples: Recording, follows: bool, settings: WatchSettings
+    ) -> tuple[list[BlockEstimate], list[tuple[Alarm, str, float]]]:
         """Return the estimates of samples, and what happened to alarms: the same whenever it is gone through."""
         estimates, happened = [], []
         self.pending += 1
@@ -71,7 +74,7 @@ class _Actuator:
                 self.oil_celsius = float(known.mean()) - 273.15
         for estimate, leak in self.watch.each(samples, follows=follows):
             version = 0 if self.watch.baseline is None else self.watch.baseline.version
-            change = self.judge.take(estimate, leak, version, self.settings)
+            change = self.judge.take(estimate, leak, version, settings)
             estimates.append(estimate)
             self.last = estimate
             if estimate.judged or self.judged_s is None or self.judged_s > estimate.t:  # the clock may be set back
@@ -126,6 +129,14 @@ class _Actuator:
         }
 
 
+def _settings_of(stored: str) -> WatchSettings | None:
+    """Return the settings of a checkpoint, None where an earlier Sealscope stored others."""
+    try:
+        return WatchSettings.model_validate_json(stored)
+    except ValidationError:
+        return None
+
+
 class _Repeated(Exception):  # noqa: N818 (says what happened)
     """One of the blocks is stored already."""
 
@@ -161,7 +172,8 @@ class WatchedActuators:
         fresh = watch(settings.rig, false_alarms_per_1000_h=rate, learn_hours=settings.learn_hours)
         actuator, anew = _Actuator(settings, fresh, AlarmJudge(name), taken=taken), True
         if state is not None:
-            learned_with, own, pending = state
+            stored, own, pending = state
+            before = _settings_of(stored)
             actuator.judge = restored(AlarmJudge, own["judge"], "alarm")
             if (version := part_of(own["watch"], "version", int)) != STATE_VERSION:
                 _log.warning("%s: its state has version %s, not %d, begins anew", name, version, STATE_VERSION)
@@ -171,12 +183,12 @@ class WatchedActuators:
                 actuator.watch = Watch.from_state(own["watch"])
                 actuator.last = None if own["last"] is None else restored(BlockEstimate, own["last"], "last")
                 actuator.oil_celsius, actuator.judged_s = own.get("oil_celsius"), own.get("judged_s")
-                for samples, follows in pending:
-                    actuator.judged(samples, follows)
-                anew = actuator.watch.false_alarms_per_1000_h != rate
+                for samples, follows in pending:  # as they were judged before
+                    actuator.judged(samples, follows, before or settings)
+                anew = before != settings.watched_with
                 actuator.watch.false_alarms_per_1000_h = rate  # with the same baseline
-                if learned_with != settings.learned_with:
-                    _log.warning("%s: learned with %s, begins anew with other settings", name, learned_with)
+                if actuator.watch.learned_with != fresh.learned_with:
+                    _log.warning("%s: its rig or learn_hours are others than it learned with, begins anew", name)
                     fresh.continue_from(actuator.watch.blocks, actuator.watch.baseline_version)
                     actuator.watch, anew = fresh, True
         if anew:
@@ -306,7 +318,7 @@ class WatchedActuators:
     def _taken(self, rows: StoredRows, actuator: _Actuator, samples: Recording, follows: bool) -> None:
         """Add to the rows what samples make of an actuator."""
         name = actuator.settings.name
-        estimates, happened = actuator.judged(samples, follows)
+        estimates, happened = actuator.judged(samples, follows, actuator.settings)
         rows.add_estimates(name, estimates, actuator.oil_celsius)
         for alarm, kind, t in happened:
             rows.add_alarm(alarm, kind, t)
@@ -320,7 +332,7 @@ class WatchedActuators:
     def _checkpoint(self, actuator: _Actuator, rows: StoredRows) -> None:
         """Add the state to the rows, and what is old then."""
         settings = actuator.settings
-        rows.add_checkpoint(settings.name, settings.learned_with, actuator.state())
+        rows.add_checkpoint(settings.name, settings.watched_with.model_dump_json(), actuator.state())
         self._show(actuator, rows)
         kept = self._keep_s / actuator.watch.block_seconds
         rows.old[settings.name] = actuator.taken - KEPT_IDENTITIES, math.floor(actuator.watch.blocks - kept)

@@ -149,7 +149,7 @@ class AlarmJudge:
                 by_chance_per_1000_h=by_chance,
             )
             return self.alarm, "raised"
-        limit = settings.warning_lpm if self.alarm.level == "warning" else (settings.error_lpm or 0.0)
+        limit = settings.warning_lpm if self.alarm.level == "warning" else (settings.error_lpm or math.inf)
         low = leak is None or (lpm is not None and lpm < settings.return_share * limit)
         self.below = self.below + 1 if low else 0
         now, happened = replace(self.alarm, updated_s=estimate.t), ""

@@ -104,6 +104,29 @@ def test_a_recording_is_added_once_and_never_a_leaking_one(machine, folder):
         machine.with_healthy(ss.simulate(command="3 sin(4t)", duration="20 s", leak="0.1 L/min", seed=31))
 
 
+def test_the_date_in_a_file_s_name_is_that_of_what_it_teaches(machine):
+    new = replace(ss.simulate(command="3 sin(4t)", duration="20 s", seed=32), provenance={})
+    taught = machine.with_healthy(new, file="press_20240531.csv")
+    assert [own.file for own in taught.since(1.7171e9).healthy] == ["press_20240531.csv"]
+
+
+def test_what_was_left_out_is_known_whenever_the_file_is_written(folder, tmp_path):
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "good.nc").write_bytes((folder / "run1.nc").read_bytes())
+    (tmp_path / "runs" / "torn.csv").write_text("no recording")
+    machine = ss.commission(tmp_path / "runs", rig="thesis")
+    assert "torn.csv" in machine.left_out[0]
+    path = ss.write_machine(machine, tmp_path / "machine.toml")
+    again = ss.load_machine(path)
+    assert (again.left_out, again.summary.problems) == (machine.left_out, machine.summary.problems)
+    ss.write_machine(again, path)
+    assert ss.load_machine(path).summary.problems == machine.summary.problems
+
+
+def test_a_machine_without_recordings_says_so():
+    assert "0 healthy" in str(ss.CommissionedMachine("a", ()))
+
+
 def test_the_map_of_raw_counts_goes_with_the_machine(folder, tmp_path):
     """A log of another program, in counts of its converter, is read by the machine's file alone."""
     recording = ss.read(folder / "run1.nc")

@@ -58,6 +58,12 @@ class JudgedAlarm(NamedTuple):
         return f"{self.alarm} {self.mark} {_date(self.date_s)}{since}{self.reason and f' ({self.reason})'}".strip()
 
 
+def _is_taken_back(word: JudgedAlarm, later: Iterable[JudgedAlarm]) -> bool:
+    """Whether a later word calls the alarm invalid; a new alarm of the same name begins after this word."""
+    own = (each for each in later if each.alarm == word.alarm and each.onset_s <= word.date_s)
+    return any(each.mark == "invalid" for each in own)
+
+
 def _date(moment: float) -> str:
     return datetime.fromtimestamp(moment, UTC).isoformat(" ", "minutes").removesuffix("+00:00")
 
@@ -166,7 +172,9 @@ class CommissionedMachine:
     def _leak_at(self, moment: float) -> JudgedAlarm | None:
         """Return the alarm of a leak that a person found, and that was not repaired at a moment [s since 1970]."""
         repairs = [own.date_s for own in self.alarms if own.mark == "repaired"]
-        leaks = (own for own in self.alarms if own.mark != "invalid" and own.onset_s <= moment)
+        words = enumerate(self.alarms, 1)
+        found = (own for k, own in words if own.mark != "invalid" and not _is_taken_back(own, self.alarms[k:]))
+        leaks = (own for own in found if own.onset_s <= moment)
         return next((own for own in leaks if not any(own.onset_s <= at <= moment for at in repairs)), None)
 
     def since(self, start_s: float) -> CommissionedMachine:
@@ -258,7 +266,7 @@ def learn(recording: Recording, rig: Rig, file: str, checksum: str = "") -> Lear
         raise InputError(f"a healthy recording must hold channels that a method reads, got none such ({file})")
     units = {name: part.units[name] for name in part.channels}
     about = {"sha256": checksum, **about_recording(recording, inspection)}
-    start = start_seconds(recording)
+    start = start_seconds(recording, file)
     return Learnt(file, inspection.digest, units, part.rate, recording.duration, start, lessons, about)
 
 

@@ -122,7 +122,7 @@ _ALARM = _table(
     reason=(str, None),
 )
 _FILE = _table(
-    machine=_table(format=Literal[1], name=str, rate=(float, None), limit=(str, None)),
+    machine=_table(format=Literal[1], name=str, rate=(float, None), limit=(str, None), left_out=(list[str], None)),
     map=(dict[str, str], None),
     healthy=Annotated[list[_HEALTHY], Field(min_length=1)],  # type: ignore[valid-type]
     alarms=(list[_ALARM], None),  # type: ignore[valid-type]
@@ -179,7 +179,8 @@ def _tree(machine: CommissionedMachine) -> dict[str, Any]:
 
     summary, columns, now = machine.summary, machine.channel_map, datetime.now(UTC).isoformat(timespec="seconds")
     head = {"format": 1, "name": machine.name, "sealscope": version("sealscope"), "written": now}
-    tree: dict[str, Any] = {"machine": head | {"rate": machine.rate, "limit": machine.limit}}
+    head |= {"rate": machine.rate, "limit": machine.limit, "left_out": machine.left_out or None}
+    tree: dict[str, Any] = {"machine": head}
     if columns:
         tree["map"] = {REST: columns} if isinstance(columns, str) else columns
     if machine.rig is not None:
@@ -282,5 +283,6 @@ def load_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
         channel_map=columns,
         rate=head.get("rate"),
         limit=head.get("limit"),
+        left_out=tuple(head.get("left_out", ())),
         alarms=tuple(JudgedAlarm(**row) for row in stated.get("alarms", ())),
     )

@@ -40,13 +40,14 @@ def pass_on(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording]) -> 
             leak = None if mark == "invalid" else alarm.leak_lpm
             said = JudgedAlarm(alarm.id, mark, time.time(), alarm.onset_s + shift, leak, alarm.reason)
             machine, done = load_machine(path), "written down"
+            machine = replace(machine, alarms=(*machine.alarms, said))
             if mark == "invalid":
                 try:
                     machine = machine.with_healthy(_recording(samples, shift), file=alarm.id)
                     done = "taught as healthy"
                 except SealscopeError as error:
                     done = f"not taught: {error}"
-            write_machine(replace(machine, alarms=(*machine.alarms, said)), path)
+            write_machine(machine, path)
     except (SealscopeError, ValueError, OverflowError, OSError) as error:
         done = f"not written: {error}"
     return f"{path.name}: {done}"
