@@ -78,6 +78,25 @@ def test_it_returns_well_below_its_threshold():
     assert judge.alarm is None
 
 
+def test_what_rises_again_before_anybody_saw_it_is_the_same_alarm():
+    judge = AlarmJudge("a")
+    through(judge, [0.003] * 2)
+    judge.marked("shelved", 3.0, until=1e4)
+    assert through(judge, [0.0] * 2 + [0.003] * 2) == ["returned", "raised"]
+    assert judge.alarm is not None
+    assert (judge.alarm.id, judge.alarm.active, judge.alarm.shelved, judge.raised) == ("a-1", True, True, 1)
+
+
+def test_a_clock_that_is_set_back_shelves_no_longer():
+    judge = AlarmJudge("a")
+    block = BlockEstimate(1, 1e6, "alarm", 0.003, None, 0.003, None)
+    for _ in range(2):
+        judge.take(block, LEAK, 1, SETTINGS)
+    judge.marked("shelved", 1e6, until=1e6 + 3600.0)
+    shelved = [judge.take(replace(block, t=t), LEAK, 1, SETTINGS)[0].shelved for t in (100.0, 3600.0, 3800.0)]
+    assert shelved == [True, True, False]
+
+
 def test_an_error_must_be_seen_again_and_becomes_a_warning_below():
     judge = AlarmJudge("a")
     through(judge, [0.003] * 2)
@@ -87,7 +106,7 @@ def test_an_error_must_be_seen_again_and_becomes_a_warning_below():
     assert (judge.alarm.state, judge.alarm.status_word) == ("new", 6)
     assert through(judge, [0.004] * 2) == ["warning"]
     judge.marked("acknowledged", 50.0)
-    assert through(judge, [0.0] * 2, None) == ["returned"]
+    assert through(judge, [0.0] * 2) == ["returned"]
     assert judge.alarm is None
 
 
@@ -119,7 +138,8 @@ def test_a_valid_alarm_stays_so_until_its_cause_is_over_or_repaired():
     assert judge.over_s == 20.0
     through(judge, [0.003] * 2)
     judge.marked("valid", 30.0)
-    assert through(judge, [0.0] * 2, None) == ["returned"]
+    assert through(judge, [0.0] * 20, None) == []  # the detector began anew, and says nothing of the leak
+    assert through(judge, [0.0] * 2) == ["returned"]
     assert (judge.alarm, judge.raised) == (None, 2)
 
 

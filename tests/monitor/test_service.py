@@ -15,16 +15,19 @@ from typing import Any
 import pytest
 from sqlalchemy.exc import DataError, OperationalError
 
+from sealscope.diagnosis.live.estimates import BlockEstimate, WatchedLeak
 from sealscope.diagnosis.live.watch import STATE_VERSION
 from sealscope.errors import InputError
+from sealscope.monitor.alarms import AlarmJudge
 from sealscope.monitor.database.store import MonitorStore, StoredRows
 from sealscope.monitor.outputs.prometheus import metrics_text
 from sealscope.monitor.service import Service
-from sealscope.monitor.settings import read_settings, template
+from sealscope.monitor.settings import WatchSettings, read_settings, template
 from sealscope.monitor.sources.source_block import digest_of
 from sealscope.simulation.simulate import simulate
 
-from .plant import LINES, WORN, kill_often, lines_of, rows_of, served, settings_in, until, write_files
+from ..diagnosis.balance_machine import machine
+from .plant import LINES, WORN, kill_often, lines_of, moved, rows_of, served, settings_in, until, write_files
 
 
 def test_a_leak_becomes_one_alarm_with_litres_per_minute(undisturbed_run):
@@ -247,6 +250,33 @@ def test_another_rig_under_the_same_name_begins_a_new_baseline(tmp_path, caplog)
     again = watched(moved_to)
     assert (again["baseline_version"], again["baseline"]) == (2, None)
     assert "press 2: its rig or learn_hours are others than it learned with" in caplog.text
+
+
+def test_a_leak_is_not_over_because_the_detector_begins_anew(tmp_path):
+    settings = settings_in(tmp_path)
+    served(settings, LINES)
+    own = [actuator.model_copy(update={"learn_hours": 0.01}) for actuator in settings.actuator]
+    later = moved(machine(3, G=3.0e-13, duration=60.0, rate=50.0), 130.0)
+    service, _ = served(settings.model_copy(update={"actuator": own}), lines_of({"press 1": later}, 150))
+    assert service.actuators.plain()["press 1"]["baseline"]["version"] == 2
+    assert [event["event"] for _, event in service.store.events_since(0)] == ["raised"]
+    assert service.actuators.plain()["press 1"]["state"]["name"] == "maintenance required"
+
+
+def test_a_clock_that_is_set_back_hides_nothing_that_is_new(tmp_path):
+    store = MonitorStore(str(tmp_path / "monitor.db"))
+    rows, judge = StoredRows(), AlarmJudge("a")
+    for number, t in enumerate([9e5, 9e5 + 3.0, 0.0, 3.0], 1):
+        rows.add_estimates("a", [BlockEstimate(number, t, "alarm", 0.003, None, 0.003, None)], None)
+    leak = WatchedLeak(10.0, 9.0, (8.0, 10.0), 0.003, (0.002, 0.004), 1e-13, 1e-15, "step", "leak", "", 50.0, 28.0)
+    for t in (9e5, 3.0):
+        block = BlockEstimate(1, t, "alarm", 0.003, None, 0.003, None)
+        alarm, _ = judge.take(block, leak, 1, WatchSettings(debounce_blocks=1))
+        rows.add_alarm(alarm, "raised", t)
+        rows.add_alarm(judge.marked("repaired", t), "repaired", t)
+    store.keep(rows)
+    assert [row["t"] for row in store.course("a", seconds=60.0)] == [0.0, 3.0]
+    assert [alarm["id"] for alarm in store.alarms()] == ["a-2", "a-1"]
 
 
 def test_a_restart_with_other_thresholds_changes_nothing_that_was_said(tmp_path):

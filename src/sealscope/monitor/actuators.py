@@ -365,7 +365,8 @@ class WatchedActuators:
             if name not in self.held:
                 raise InputError(f"{name} is watched by another monitor; mark its alarm on that one's page")
             actuator, rows = self._actuator(name), StoredRows()
-            at, kept = actuator.last.t if actuator.last is not None else 0.0, list(actuator.kept)
+            at = getattr(actuator.last, "t", getattr(actuator.judge.alarm, "updated_s", 0.0))
+            kept = list(actuator.kept)
             alarm = actuator.judge.marked(mark, at, until=at + hours * 3600.0, reason=text)
             try:
                 if mark == "invalid":

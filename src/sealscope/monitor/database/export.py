@@ -34,7 +34,7 @@ def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
         for _, event in batch:
             events[event["alarm"]["id"]].append(event)
     rows, labelled = [], defaultdict[str, list[tuple[float, float, dict[str, str]]]](list)
-    for alarm in reversed(store.alarms()):
+    for alarm in sorted(reversed(store.alarms()), key=lambda alarm: float(alarm["raised_s"])):
         own = events[alarm["id"]]
         judged = next((event for event in reversed(own) if event["event"] in _LABELS), None)
         onset, leak = alarm["onset_interval_s"] or (None, None), alarm["leak_interval_lpm"] or (None, None)
