@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+from sealscope.diagnosis.commissioned.machine import JUDGEMENTS
 from sealscope.diagnosis.live.estimates import BlockEstimate, Interval, WatchedLeak
 from sealscope.diagnosis.verdict.states import state_of
 from sealscope.errors import InputError
@@ -26,7 +27,7 @@ _CONDITIONS: dict[Level, str] = {"warning": "leak", "error": "leak over the limi
 #: Bits of the status word.
 WARNING_BIT, ERROR_BIT, NEW_BIT = 1, 2, 4
 #: What a person may say of an alarm.
-MARKS = ("acknowledged", "comment", "shelved", "valid", "invalid", "repaired")
+MARKS = ("acknowledged", "comment", "shelved", *JUDGEMENTS)
 
 
 @dataclass(frozen=True)

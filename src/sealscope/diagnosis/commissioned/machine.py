@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -38,11 +38,16 @@ NO_RECORDINGS = frozenset({".toml", ".html", ".htm", ".pdf", ".png", ".svg", ".m
 _WRITTEN = re.compile(rb'\s*\{\s*"(verdict|file)":|file,time[, ]')
 
 
+#: What a person may say of an alarm's leak.
+Judgement = Literal["valid", "invalid", "repaired"]
+JUDGEMENTS: tuple[Judgement, ...] = get_args(Judgement)
+
+
 class JudgedAlarm(NamedTuple):
     """What a person said of an alarm of the monitor.
 
-    `alarm`: its name, "" for a repair without one; `mark`: "valid", "invalid" or "repaired", said at `date_s`; of a
-    leak since `onset_s` [s since 1970]; `leak_lpm` [L/min] and `reason`, where they are known.
+    `alarm`: its name, "" for a repair without one; `mark`, said at `date_s`; of a leak since `onset_s` [s since 1970];
+    `leak_lpm` [L/min] and `reason`, where they are known.
     """
 
     alarm: str

@@ -12,13 +12,13 @@ import os
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PositiveFloat, create_model
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.commissioned.machine import CommissionedMachine, JudgedAlarm
+from sealscope.diagnosis.commissioned.machine import CommissionedMachine, JudgedAlarm, Judgement
 from sealscope.diagnosis.learnt import Learnt
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
@@ -31,9 +31,6 @@ from sealscope.storage.toml_file import read_toml
 
 #: Largest file read [bytes]: some 10 kB a recording.
 LARGEST = 50_000_000
-#: What persons say of alarms.
-Mark = Literal["valid", "invalid", "repaired"]
-MARKS: tuple[Mark, ...] = get_args(Mark)
 _HEAD = """\
 # A machine commissioned by Sealscope: what its healthy recordings have taught. [machine], [map] and [rig] may be
 # edited; [learnt] is written anew with each change; [[healthy]] is what diagnoses compare with.
@@ -115,7 +112,7 @@ _HEALTHY = _table(
 )
 _ALARM = _table(
     alarm=str,
-    mark=Mark,
+    mark=Judgement,
     date_s=Annotated[_Moment, Field(alias="date")],
     onset_s=Annotated[_Moment, Field(alias="onset")],
     leak_lpm=(float, None),

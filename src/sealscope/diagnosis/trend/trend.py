@@ -29,6 +29,7 @@ from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.diagnosis.verdict.states import state_of
 from sealscope.errors import InputError
+from sealscope.recordings.formats.columns import listed
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
 from sealscope.storage.plain_values import plain
@@ -286,7 +287,7 @@ def _with_levels(trend: Trend) -> Trend:
     apart = "apart from the recordings before and after: it counts as if it were near"
     findings = [*trend.findings]
     if alone.size:
-        files = ", ".join(points[rows[k]].file for k in alone[:3])
+        files = listed((points[rows[k]].file for k in alone), 3)
         text = f"{alone.size} of {len(points)} {apart} ({files})"
         findings.append(Finding("outlier", "warning", None, alone.size, None, text))
     for k, row in enumerate(rows):

@@ -20,6 +20,7 @@ from sealscope.monitor import sparkplug as spb
 from sealscope.monitor.database.store import MonitorStore
 from sealscope.monitor.mqtt_client import KEEP_ALIVE_S, check_mqtt, check_running, client_of, published
 from sealscope.monitor.settings import BrokerSettings, SparkplugSettings, topic_part
+from sealscope.recordings.formats.timebase import counts_from_1970
 
 _log = logging.getLogger(__name__)
 _NAME, _BIRTHS = "sparkplug", "sparkplug bdSeq"
@@ -188,7 +189,7 @@ def _table(name: str) -> Mapping[str, Mapping[str, str]]:
 
 def _clock(t: float | None) -> int:
     """Return a clock of samples [s] in [ms]; where it does not count from 1970, the present."""
-    return round(1000.0 * (t if t is not None and 1e8 < t < 1e11 else time.time()))
+    return round(1000.0 * (t if t is not None and counts_from_1970(t) else time.time()))
 
 
 def _values(table: str, values: Mapping[str, Any]) -> dict[str, Any]:
