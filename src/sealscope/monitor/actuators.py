@@ -1,4 +1,9 @@
-"""Every actuator's detector and alarm, and the database behind them: a block is taken whole or not at all."""
+"""Every actuator's detector and alarm, and the database behind them: a block is taken whole or not at all.
+
+Each transaction stores blocks' identities, estimates, alarms and pending samples; every 16 blocks or 400 kB of an
+actuator, and with each mark, its whole state takes the place of the pending samples. So a restart is the last state and
+the pending samples gone through once more, with the settings that they were judged by.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +13,14 @@ import math
 import threading
 import time
 import zlib
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
+from sqlalchemy import Connection
 from sqlalchemy.exc import IntegrityError
 
 from sealscope.diagnosis.live.estimates import BlockEstimate
@@ -23,10 +29,9 @@ from sealscope.diagnosis.verdict.states import LEAKING, MachineState, state_of
 from sealscope.errors import InputError
 from sealscope.monitor.alarms import Alarm, AlarmJudge
 from sealscope.monitor.database.machine_files import pass_on
-from sealscope.monitor.database.sharing import Share
 from sealscope.monitor.database.store import KEPT_IDENTITIES, MonitorStore, StoredRows, away
 from sealscope.monitor.settings import ActuatorSettings, WatchSettings
-from sealscope.monitor.sources.source_block import SourceBlock, bytes_of, nothing
+from sealscope.monitor.sources.source_block import SourceBlock, bytes_of
 from sealscope.monitor.supervisor import Supervisor
 from sealscope.recordings.recording import Recording
 from sealscope.storage.plain_state import part_of, restored, saved
@@ -35,8 +40,8 @@ _log = logging.getLogger(__name__)
 _LONGEST_TEXT = 2000
 #: Blocks of samples between two checkpoints, and their bytes.
 PENDING_BLOCKS, PENDING_BYTES = 16, 400_000
-#: How long blocks of others' actuators are kept, in leases: until a takeover, with time to spare.
-_KEPT_LEASES = 4.0
+#: What a block is counted under that raised an error.
+DROPPED = "blocks that raised an error"
 #: How long the samples of an alarm are kept [s].
 _KEPT_S = 120.0
 
@@ -144,26 +149,15 @@ class _Repeated(Exception):  # noqa: N818 (says what happened)
 class WatchedActuators:
     """The actuators of a monitor, restored from its database, which keeps estimates of `keep_days` of operation."""
 
-    def __init__(
-        self,
-        settings: list[ActuatorSettings],
-        store: MonitorStore,
-        keep_days: float = 90.0,
-        share: Share | None = None,
-    ) -> None:
-        self.store, self._share = store, share
-        self.settings = {each.name: each for each in settings}
-        #: When the last block of each came [s], and those of others' actuators with the clock at which they came.
-        self._heard = dict.fromkeys(self.settings, time.monotonic())
-        self._elsewhere = {name: deque[tuple[float, SourceBlock]]() for name in self.settings}
+    def __init__(self, settings: list[ActuatorSettings], store: MonitorStore, keep_days: float = 90.0) -> None:
+        self.store, self.settings = store, {each.name: each for each in settings}
+        self._heard = dict.fromkeys(self.settings, time.monotonic())  # when the last block of each came [s]
         self._keep_s = keep_days * 86_400.0
         self._counters, self._counting = Counter[str](), threading.Lock()
         self._changes, self.changed, self.closed = itertools.count(1), 0, False
         self.supervisor = Supervisor(away, self._tell)
         self._lock = threading.RLock()
-        self._actuators: dict[str, _Actuator] = {}
-        if share is None:
-            self._actuators = {name: self._restored(each) for name, each in self.settings.items()}
+        self._actuators = {name: self._restored(self.settings[name]) for name in self.settings if name in self.held}
 
     def _restored(self, settings: ActuatorSettings) -> _Actuator:
         """Return an actuator as its last transaction left it, or begun anew where it is new or the settings changed."""
@@ -209,56 +203,20 @@ class WatchedActuators:
         with self._counting:
             return dict(self._counters)
 
-    def renew(self) -> None:
-        """Renew the share in the actuators; of one that is taken over the blocks since then are taken at once.
-
-        Raises what the database raises.
-        """
-        assert self._share is not None
-        with self._lock:
-            gained, lost = self._share.renew()
-            for name in gained | lost:
-                self._actuators.pop(name, None)  # the database knows better
-            for name in sorted(self._share.held & set(self.settings)):
-                self._take_over(name)
-
-    def _take_over(self, name: str) -> None:
-        """Take the blocks that came while another monitor watched an actuator; those it stored are passed over."""
-        waiting = self._elsewhere[name]
-        for _ in range(len(waiting)):
-            self._take([waiting[0][1]])
-            waiting.popleft()
-
-    def _keep_elsewhere(self, block: SourceBlock) -> None:
-        """Keep a block of another monitor's actuator for as long as its takeover may last."""
-        assert self._share is not None
-        self.count("blocks of another monitor's actuator")
-        waiting, now = self._elsewhere[block.actuator], time.monotonic()
-        waiting.append((now, replace(block, done=nothing)))
-        while waiting and waiting[0][0] < now - _KEPT_LEASES * self._share.lease_s:
-            waiting.popleft()
-
     def take(self, blocks: Sequence[SourceBlock]) -> None:
         """Take blocks in one transaction: samples, estimates, alarms and the blocks' identities, or nothing of it.
 
         Raises what the database raises; the blocks can then be taken again.
         """
         with self._lock:
-            known, held = [block for block in blocks if block.actuator in self.settings], self.held
-            mine = [block for block in known if block.actuator in held]
+            known = [block for block in blocks if block.actuator in self.settings]
             for name in {block.actuator for block in known}:
                 self._heard[name] = time.monotonic()
-            if self._share is not None:
-                for name in {block.actuator for block in mine}:
-                    self._take_over(name)
-            self._take(mine)
-            for block in known:
-                if block.actuator not in held:
-                    self._keep_elsewhere(block)
+            self._take(known)
             self.count("blocks of an actuator that is not in the settings", len(blocks) - len(known))
 
     def _take(self, blocks: Sequence[SourceBlock]) -> None:
-        """Take blocks of actuators that are this monitor's to watch.
+        """Take blocks of known actuators.
 
         None of them is likely to be stored: that is asked only where the database refuses to store one again.
         """
@@ -268,34 +226,31 @@ class WatchedActuators:
         fresh = [block for block in blocks if new[block.actuator, block.identity] is block]
         try:
             try:
-                lost = self._stored(fresh)
+                self._stored(fresh)
             except _Repeated:
                 known = self.store.known(new)
                 fresh = [block for block in fresh if (block.actuator, block.identity) not in known]
-                lost = self._stored(fresh)
+                self._stored(fresh)
         except BaseException:
             # what the detectors took is not stored: the next blocks begin at the last transaction
             for name in {block.actuator for block in blocks}:
                 self._actuators.pop(name, None)
             raise
-        for block in fresh:
-            if block.actuator in lost:
-                self._actuators.pop(block.actuator, None)
-                self._keep_elsewhere(block)
         self.count("blocks stored already", len(blocks) - len(fresh))
         self._tell()
 
-    def _stored(self, blocks: Sequence[SourceBlock]) -> set[str]:
-        """Take blocks in one transaction; return the actuators whose lease is another's.
+    def _own(self, blocks: Sequence[SourceBlock], connection: Connection) -> Sequence[SourceBlock]:
+        """Return the blocks that are this monitor's to store, in the transaction that stores them."""
+        return blocks
+
+    def _stored(self, blocks: Sequence[SourceBlock]) -> None:
+        """Take blocks in one transaction.
 
         Raises _Repeated, and no detector has taken anything, where one of the blocks is stored already.
         """
-        rows, lost = StoredRows(), set[str]()
+        rows = StoredRows()
         with self.store.writing() as connection:
-            if (share := self._share) is not None:
-                names = sorted({block.actuator for block in blocks})
-                lost = {name for name in names if not share.holds(connection, name)}
-            mine = [(block, self._actuator(block.actuator)) for block in blocks if block.actuator not in lost]
+            mine = [(block, self._actuator(block.actuator)) for block in self._own(blocks, connection)]
             numbers = {actuator.settings.name: itertools.count(actuator.taken + 1) for _, actuator in mine}
             numbered = [(block.actuator, block.identity, next(numbers[block.actuator])) for block, _ in mine]
             if numbered:
@@ -308,7 +263,6 @@ class WatchedActuators:
                 if block.samples is not None:
                     self._taken(rows, actuator, block.samples, block.follows)
             self.store.keep_rows(connection, rows)
-        return lost
 
     def _actuator(self, name: str) -> _Actuator:
         if name not in self._actuators:
@@ -389,8 +343,8 @@ class WatchedActuators:
 
     @property
     def held(self) -> frozenset[str]:
-        """The actuators that this monitor watches: all of its settings, or its share of them."""
-        return frozenset(self.settings) & (frozenset(self.settings) if self._share is None else self._share.held)
+        """The actuators that this monitor watches."""
+        return frozenset(self.settings)
 
     @property
     def false_alarms_per_1000_h(self) -> float:
