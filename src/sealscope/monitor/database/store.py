@@ -168,6 +168,9 @@ class MonitorStore:
         if rows.actuators:
             before = tables.pending.delete().where(tables.pending.c.actuator == of)
             connection.execute(before, [{"of": name} for name in rows.actuators])
+        if rows.events and self.engine.dialect.name == "postgresql":
+            # events become known in the order of their numbers: an output that is past one never looks back
+            connection.execute(sa.text("lock table events in exclusive mode"))
         for new in (tables.estimates, tables.pending, tables.events):
             if values := getattr(rows, new.name):
                 connection.execute(new.insert(), values)

@@ -74,6 +74,8 @@ class SparkplugNode:
             except BaseException:
                 self._due.set()
                 raise
+        if self._born != self._birth_number:  # connected a moment ago
+            return
         self._store.pass_on(_NAME, self._sent_event)
         if time.monotonic() >= self._next:
             self._next = time.monotonic() + self._settings.every_s
