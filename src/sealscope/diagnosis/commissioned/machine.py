@@ -162,7 +162,7 @@ class CommissionedMachine:
         if self.healthy and (result := self.diagnose(recording)).verdict == "leak":
             raise InputError(f"a healthy recording must not leak, got one that does: {result.reason} ({file})")
         start_s = start_seconds(recording, file)
-        if start_s is not None and (leak := self._leak_at(start_s)) is not None:
+        if start_s is not None and (leak := self._leak_in(start_s, start_s + recording.duration)) is not None:
             raise InputError(f"a healthy recording must be of a time without a leak, got {leak} ({file})")
         return added
 
@@ -174,13 +174,13 @@ class CommissionedMachine:
         healthy = sorted((*self.healthy, learnt), key=lambda own: (own.start_s or 0.0, own.file))
         return replace(self, healthy=tuple(healthy))
 
-    def _leak_at(self, moment: float) -> JudgedAlarm | None:
-        """Return the alarm of a leak that a person found, and that was not repaired at a moment [s since 1970]."""
+    def _leak_in(self, start_s: float, end_s: float) -> JudgedAlarm | None:
+        """Return the alarm of a leak that a person found, and that was not repaired, in a time [s since 1970]."""
         repairs = [own.date_s for own in self.alarms if own.mark == "repaired"]
         words = enumerate(self.alarms, 1)
         found = (own for k, own in words if own.mark != "invalid" and not _is_taken_back(own, self.alarms[k:]))
-        leaks = (own for own in found if own.onset_s <= moment)
-        return next((own for own in leaks if not any(own.onset_s <= at <= moment for at in repairs)), None)
+        leaks = (own for own in found if own.onset_s <= end_s)
+        return next((own for own in leaks if not any(own.onset_s <= at <= start_s for at in repairs)), None)
 
     def since(self, start_s: float) -> CommissionedMachine:
         """Return the machine without the recordings of before a repair, `start_s` [s since 1970].

@@ -234,6 +234,8 @@ def _value(value: Any) -> str:
         return "[" + ", ".join(map(_value, value)) + "]"
     if isinstance(value, float):
         return repr(value)
+    if isinstance(value, str):  # names of files may be no text
+        value = value.encode("utf-8", "backslashreplace").decode()
     return json.dumps(value, ensure_ascii=False, default=str).replace("\x7f", "\\u007f")
 
 
