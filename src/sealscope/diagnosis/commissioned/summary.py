@@ -68,17 +68,18 @@ class Summary:
 
     def text(self, healthy: Sequence[Learnt], rig: Rig | None) -> str:
         """Return it in some ten lines."""
+        units = healthy[0].units if healthy else {}
         starts = [own.start_s for own in healthy if own.start_s is not None]
         dates = sorted(datetime.fromtimestamp(at, UTC).date().isoformat() for at in starts)
         span = f", {' to '.join(dict.fromkeys((dates[0], dates[-1])))}" if dates else ""
         noise = []
         for name, value in self.noise.items():
-            unit = healthy[0].units.get(name, "")
+            unit = units.get(name, "")
             shown = {"Pa": "bar", "m": "mm"}.get(unit, unit)
             noise.append(f"{name} {from_si(value, shown, unit):.2g} {shown}")
         rows = [
             ("recordings", f"{len(healthy)} healthy, {sum(own.seconds for own in healthy):.4g} s in all{span}"),
-            ("channels", ", ".join(f"{name} [{unit}]" for name, unit in healthy[0].units.items())),
+            ("channels", ", ".join(f"{name} [{unit}]" for name, unit in units.items())),
             ("machine", _stated(rig)),
             ("duty", _duty(healthy)),
             ("noise", ", ".join(noise)),

@@ -60,7 +60,7 @@ _LARGEST_STEP, _LARGEST_STEP_OF_DAYS = 2e-6, 1.2e-5
 _OFFSET_OF_DATENUM = 693_960
 #: Seconds since 1904 begin here, in 2008: those since 1970 would be in 2074.
 _SINCE_1904, _FROM_1904_TO_1970 = 3.28e9, 2_082_844_800.0
-_EARLIEST_EPOCH = 1e8  # [s]: March 1973, and no recording lasts three years
+_EARLIEST_EPOCH, _LATEST_EPOCH = 1e8, 1e11  # [s]: March 1973, and no recording lasts three years; the year 5138
 #: Times (n,) [s], what is known of the moment 0, and lines for the history.
 _Seconds = tuple[Array, dict[str, Any], list[str]]
 
@@ -180,6 +180,11 @@ def _is_moment(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def counts_from_1970(clock: float) -> bool:
+    """Return whether a clock [s] is that of a date, as opposed to one that counts from the start of a machine."""
+    return _EARLIEST_EPOCH < clock < _LATEST_EPOCH
 
 
 def seconds_of(stamp: str) -> float | None:
