@@ -166,7 +166,8 @@ class BlockStream:
         """Return the sign of each left side: an encoder, or the sides, may be connected the other way round.
 
         Friction takes work, so that p_A - p_B goes with the flow into A; and oil leaks from the higher pressure to the
-        lower. Either is a number in its deviations, and the signs' likelihoods are those of both.
+        lower. Either is a number z in its deviations, whose sign is right with probability Phi(z) but for the share of
+        machines where something else makes it.
         """
         signs = []
         for balance, columns, own in zip(self._balances, self.columns, rows, strict=True):
@@ -175,7 +176,7 @@ class BlockStream:
             parts = (pressure - pressure.mean()) * left if len(own) else np.zeros(1)
             size = max(float(np.linalg.norm(parts)) * np.sqrt(OVERLAP), np.finfo(float).tiny)
             work = balance.takes * float(parts.sum()) / size
-            odds = sum(np.square(z) * np.sign(z) for z in (work, _leaks(gram, columns, len(own))))
+            odds = _odds(work, "work") + _odds(_leaks(gram, columns, len(own)), "leak")
             signs.append(-1.0 if odds < 0.0 else 1.0)
         return tuple(signs)
 
@@ -234,6 +235,14 @@ class _Cut(NamedTuple):
     whole: NDArray[np.bool_]
     flow: Array
     pressures: Array
+
+
+def _odds(z: float, what: str) -> float:
+    """Return the logarithm of the odds that a sign is right."""
+    from scipy.special import ndtr
+
+    other = 0.5 * beliefs("inference")["sense"][what]
+    return float(np.log((ndtr(z) + other) / (ndtr(-z) + other)))
 
 
 def _leaks(gram: Array, columns: Columns, count: int) -> float:
