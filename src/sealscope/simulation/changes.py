@@ -199,21 +199,9 @@ class Shape(Protocol):
         """Return the change at times t [s] (any shape); 0 at t = 0."""
         ...
 
-
-@dataclass(frozen=True)
-class Linear:
-    """An even change of `size` over `duration` [s], going on as long as the run does."""
-
-    size: float
-    duration: float
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.size) and self.duration > 0):
-            raise InputError(f"a linear drift must be finite and last > 0 s, got {self.size} over {self.duration} s")
-
-    def at(self, t: Array) -> Array:
-        """Return the change at times t [s]."""
-        return self.size / self.duration * np.maximum(t, 0.0)
+    def bends(self) -> tuple[float, ...]:
+        """Return the times [s] at which it jumps or bends."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -244,6 +232,10 @@ class Wander:
                 before, term = term, turn * term - before
         return change
 
+    def bends(self) -> tuple[float, ...]:
+        """Return no times: it is smooth."""
+        return ()
+
     def scaled(self, size: float) -> Wander:
         """Return the same path with the distance `size` between its highest and lowest point within the duration."""
         path = self.at(np.linspace(0.0, self.duration, 1001))
@@ -260,22 +252,9 @@ class Wander:
         return Wander(tuple(a + b for a, b in pairs), self.duration, self.slope + other.slope)
 
 
-@dataclass(frozen=True, eq=False)
-class TabulatedDrift:
-    """A change linear between the points of a table; constant before the first and after the last."""
-
-    t: Array
-    change: Array
-
-    def __post_init__(self) -> None:
-        if self.t.size != self.change.size or self.t.size < 1 or np.any(np.diff(self.t) < 0):
-            raise InputError("a drift table must have one change for each time, and its times must rise")
-        if not (np.all(np.isfinite(self.t)) and np.all(np.isfinite(self.change))):
-            raise InputError("times and changes of a drift table must be finite, got NaN or infinity")
-
-    def at(self, t: Array) -> Array:
-        """Return the change at times t [s]."""
-        return np.interp(t, self.t, self.change)
+def linear(size: float, duration: float) -> Wander:
+    """Return an even change of `size` over `duration` [s], going on as long as the run does."""
+    return Wander((), duration, size)
 
 
 #: Most that a number that drifts in its own unit changes from one block of the solver to the next.
@@ -314,7 +293,7 @@ class ParameterDrift:
             raise InputError(f"a drift of {self.parameter} must be {wanted}")
 
     def __str__(self) -> str:
-        return f"{self.parameter} drifts, {type(self.shape).__name__.lower()}"
+        return f"{self.parameter} drifts"
 
     def _of_instruments(self) -> bool:
         return self.parameter.startswith("sensors.") and self.parameter.rpartition(".")[2] in _OF_INSTRUMENTS
@@ -326,8 +305,7 @@ class ParameterDrift:
 
     def effects(self) -> tuple[Effect, ...]:
         """Return what it changes, in the machine or at the instruments."""
-        table = isinstance(self.shape, TabulatedDrift) and self.shape.t.size < 1000
-        jumps = tuple(map(float, self.shape.t)) if table else ()  # type: ignore[attr-defined]
+        jumps = self.shape.bends()
 
         def effect(field: str, power: float) -> Effect:
             if self.absolute:

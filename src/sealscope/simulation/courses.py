@@ -11,7 +11,7 @@ import numpy as np
 
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
-from sealscope.simulation.commands import NUMBER, UNSIGNED, Command, Recorded, Sine, parse_command, plain_text
+from sealscope.simulation.commands import NUMBER, UNSIGNED, Command, Sine, parse_command, plain_text, recorded
 from sealscope.storage.opening import open_regular
 from sealscope.units import to_si
 
@@ -138,7 +138,7 @@ def parse_position(text: str) -> Position | None:
         recording = read(path)
         if "x" not in recording or recording.units["x"] != "m":
             raise InputError(f"a recorded position must have the channel x with a unit of length, got {path} without")
-        return Position(Recorded(recording.t - recording.t[0], recording["x"], path), words)
+        return Position(recorded(recording.t - recording.t[0], recording["x"], path), words)
     return Position(_course(words, _LENGTHS, "position"), words)
 
 
@@ -171,7 +171,7 @@ def _recorded_force(path: str, words: str) -> Force:
     s = to_si(table[:, 0], columns[over[0]][1], unit, name=over[0], place=path)
     F = to_si(table[:, 1], columns["F"][1], "N", name="F", place=path)
     if over[0] == "t":
-        return Force(Recorded(s - s[:1], F, path), words)
+        return Force(recorded(s - s[:1], F, path), words)
     if s.size > 1 and s[0] > s[-1]:
         s, F = s[::-1], F[::-1]
     if not (2 <= s.size <= MOST_ROWS and np.all(np.diff(s) > 0) and np.all(np.isfinite(table))):

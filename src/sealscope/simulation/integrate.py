@@ -99,7 +99,7 @@ class RunInputs:
         for leak in self._leaks:
             if not leak.coefficient or t.max(initial=-math.inf) < leak.opening.onset():
                 continue
-            more = leak.coefficient * leak.opening.share(t)
+            more = leak.coefficient * leak.opening.at(t)
             G, C = (G + more, C) if leak.law == "laminar" else (G, C + more)
         return G, C
 

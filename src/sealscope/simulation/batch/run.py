@@ -37,7 +37,7 @@ from sealscope.simulation.integrate import (
     refuse_unresolved,
     steps_per_output,
 )
-from sealscope.simulation.leaks import From, Growing, Leak
+from sealscope.simulation.leaks import Leak
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -96,7 +96,7 @@ def refuse(experiment: Experiment, place: int) -> None:
         missing.append(f"a command, got a target for a controller ({experiment.command})")
     if len(leaks) > 1:
         missing.append(f"at most one leak, got {len(leaks)}")
-    if leaks and not isinstance(leaks[0].opening, From | Growing):
+    if leaks and leaks[0].opening.rise is None:
         missing.append(f"a leak that opens abruptly or evenly, got {leaks[0].opening}")
     if rig.motor.integrator == "euler":
         missing.append("motor.integrator = state, got euler")
@@ -177,11 +177,8 @@ def leak_rows(members: Sequence[Member], sizes: Array, measured: Array) -> Array
     for member, size, accounted in zip(members, sizes, measured, strict=True):
         leak = member.leak
         laminar = leak.law == "laminar"
-        opening = leak.opening
-        if isinstance(opening, Growing):
-            when = (opening.start, 1.0 / (opening.stop - opening.start))
-        else:
-            when = (opening.onset(), ABRUPT)
+        start, stop = leak.opening.rise or (0.0, 0.0)
+        when = start, (1.0 / (stop - start) if stop > start else ABRUPT)
         laws = (size, 0.0, accounted, 0.0) if laminar else (0.0, size, 0.0, accounted)
         rows.append([laws[0], laws[1], *when, laws[2], laws[3]])
     return np.array(rows)

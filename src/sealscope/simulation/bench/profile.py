@@ -14,7 +14,7 @@ from sealscope.parameters import declared_names
 from sealscope.parameters.fields import choices_of, unit_of
 from sealscope.parameters.names import resolve
 from sealscope.parameters.rig import declared
-from sealscope.simulation.changes import Linear, ParameterDrift, drifts_absolutely
+from sealscope.simulation.changes import ParameterDrift, drifts_absolutely, linear
 from sealscope.simulation.courses import Position, command_or_target, parse_force
 from sealscope.storage.plain_values import as_type
 from sealscope.storage.toml_file import read_toml
@@ -190,7 +190,7 @@ def _values(entry: _NuisanceEntry, choices: tuple[str, ...], si_unit: str) -> tu
 def _drift(entry: _DriftEntry, parameters: tuple[str, ...], si_unit: str) -> DriftRange:
     absolute = drifts_absolutely(parameters[0])
     for parameter in parameters:
-        ParameterDrift(parameter, Linear(0.0, 1.0), absolute)
+        ParameterDrift(parameter, linear(0.0, 1.0), absolute)
     low, high = (to_si(value, entry.unit, si_unit if absolute else "1", name="drift") for value in entry.size)
     falls = entry.oil != 1.0  # with the oil alone, which warms, it only rises
     if low < 0 or (not absolute and falls and high >= 1):
