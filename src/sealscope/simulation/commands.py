@@ -224,6 +224,10 @@ class Chirp:
         return f"chirp {amplitude} from {f_0} Hz to {f_1} Hz over {duration} s"
 
 
+#: SplitMix64: the step from state to state, and by which shifts and factors a state is mixed.
+GOLDEN, MIX = 0x9E3779B97F4A7C15, ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB))
+
+
 @dataclass(frozen=True)
 class PseudoRandom:
     """Pseudo-random binary command: +amplitude or -amplitude, drawn anew every `hold` [s] from `seed`.
@@ -244,9 +248,9 @@ class PseudoRandom:
         """Return u [V] at times t [s]."""
         slot = np.clip(np.floor(t / self.hold), 0.0, 2.0**63).astype(np.uint64)
         start = np.random.SeedSequence(self.seed).generate_state(1, np.uint64)
-        z = start + (slot + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
-        z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        z = start + (slot + np.uint64(1)) * np.uint64(GOLDEN)
+        for shift, factor in MIX:
+            z = (z ^ (z >> np.uint64(shift))) * np.uint64(factor)
         signs = np.where((z ^ (z >> np.uint64(31))) >> np.uint64(63), 1.0, -1.0)
         return np.where(t >= 0, self.amplitude * signs, 0.0)
 
@@ -359,10 +363,7 @@ def _sines(text: str) -> Sine | MultiSine | None:
 def parse_command(text: str) -> Command:
     """Read a command from text.
 
-    The forms are ``3 sin(4t)``, ``3 sin(4t) + 1 sin(9t)``, ``6 periods of 5 sin(2t), 10 periods of 3 sin(4t)`` (in
-    turn, again and again), ``step 5 at 1 s``, ``ramp 5 from 1 s to 3 s``, ``trapezoid 3 within 1 s every 8 s``,
-    ``chirp 3 from 0.1 Hz to 5 Hz over 60 s``, ``prbs 2 every 0.5 s seed 1``, and ``file LOG`` (the channel u of a
-    recording). Raises InputError that shows the forms when the text is none of them.
+    Raises InputError that shows the forms when the text is none of them.
     """
     stripped = text.strip()
     if stripped.lower().startswith("file "):
@@ -384,7 +385,8 @@ def parse_command(text: str) -> Command:
         if match:
             return make(list(match.groups()))
     raise InputError(
-        "command must be like '3 sin(4t)', 'step 5 at 1 s', 'ramp 5 from 1 s to 3 s', 'chirp 3 from 0.1 Hz to 5 "
-        "Hz over 60 s', "
-        f"'prbs 2 every 0.5 s seed 1' or 'file LOG', got {text!r}"
+        "command must be like '3 sin(4t)', '3 sin(4t) + 1 sin(9t)', '6 periods of 5 sin(2t), 10 periods of 3 sin(4t)' "
+        "(in turn, again and again), 'step 5 at 1 s', 'ramp 5 from 1 s to 3 s', 'trapezoid 3 within 1 s every 8 s', "
+        "'chirp 3 from 0.1 Hz to 5 Hz over 60 s', 'prbs 2 every 0.5 s seed 1' or 'file LOG' (channel u of a "
+        f"recording), got {text!r}"
     )

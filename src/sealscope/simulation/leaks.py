@@ -125,9 +125,8 @@ def opening_of(part: Part) -> Polyline:
 def parse_leak(text: str) -> Leak | None:
     """Read a leak from text; None for ``none``.
 
-    The forms are ``0.0042 L/min from 90 s``, ``0.01[L/min] orifice growing from 1 min to 2 min``, ``G = 6.1e-13 from 90
-    s``, ``C = 2e-10``, and ``table LEAK.csv`` (columns `t [s]` and `q_leak [L/min]`: the mean flow asked for at each
-    time). Raises InputError that shows the forms when the text is none of them.
+    The columns of a table are `t [s]` and `q_leak [L/min]`, the mean flow asked for at each time. Raises InputError
+    that shows the forms when the text is none of them.
     """
     stripped = text.strip()
     if stripped.lower() in ("none", "0", "no leak"):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from sealscope.control import controller_named, drive_of
+from sealscope.control import Drive, controller_named, drive_of
 from sealscope.errors import InputError
 from sealscope.simulation.bench.profile import DriftRange, Nuisance, NuisanceChoice, Profile, load_profile
 from sealscope.simulation.changes import ParameterDrift, Wander
@@ -68,29 +68,17 @@ def centred_start(rig: Rig, command: Command | Position | str, duration: float) 
 
     That of a target is where the target begins.
 
-    The piston goes with the pump's flow, A v = q_b omega/(2 pi), and an unloaded motor without inertia follows its PI
-    loop: (k_p + C_e) omega = k_p omega_d + K_i I, dI/dt = omega_d - omega (eqs. 4.2-4.5). Behind a servo valve it goes
-    with the valve's flow without a load.
+    The piston goes with the flow that pump (`Drive.flow`) or servo valve gives without a load.
     """
     command = parse_command(command) if isinstance(command, str) else command
-    motor, cylinder = rig.motor, rig.cylinder
+    cylinder, drive = rig.cylinder, drive_of(rig)
     dt, half = 0.05, 0.5 * cylinder.L
     if isinstance(command, Position):
         return float(np.clip(command.at(np.zeros(())), -half, half))
-    area = 0.5 * (cylinder.A_A + cylinder.A_B)
-    if rig.valve.spool == "present":
-        moved = dt * np.cumsum(command.volts(np.arange(0.0, duration + dt, dt))) * drive_of(rig).largest(1.0) / area
-        return float(np.clip(-0.5 * (min(moved.min(), 0.0) + max(moved.max(), 0.0)), -half, half))
-    demand = motor.omega_per_volt * command.volts(np.arange(0.0, duration + dt, dt))
-    gain = motor.k_p + motor.C_e
-    integral = angle = lowest = highest = 0.0
-    for omega_d in map(float, demand):
-        omega = (motor.k_p * omega_d + motor.K_i * integral) / gain
-        integral += dt * (omega_d - omega)
-        angle += dt * omega
-        lowest, highest = min(lowest, angle), max(highest, angle)
-    stroke = rig.pump.q_b / (2.0 * np.pi) / area
-    return float(np.clip(-0.5 * stroke * (lowest + highest), -half, half))
+    volts = command.volts(np.arange(0.0, duration + dt, dt))
+    flow = drive.flow(volts, np.zeros_like(volts), 1.0 / dt) if isinstance(drive, Drive) else drive.largest(1.0) * volts
+    moved = dt * np.cumsum(flow) / (0.5 * (cylinder.A_A + cylinder.A_B))
+    return float(np.clip(-0.5 * (min(moved.min(), 0.0) + max(moved.max(), 0.0)), -half, half))
 
 
 def _random(seed: int, name: str) -> np.random.Generator:
