@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -47,13 +47,15 @@ class Position:
 
 @dataclass(frozen=True)
 class Force:
-    """A load beside the rig's own: F = course(t) [N] against +x; `words` as it was given."""
+    """A load beside the rig's own: F = course(t) [N] against +x; `words` as it was given.
+
+    `over_x`, `over_v`: what is linear between bends over position [m] and velocity [m/s] of the piston is added.
+    """
 
     course: Command
     words: str
-    #: What depends on the position and on the velocity of the piston (`ForceOver`).
-    over_x: ClassVar[Bends] = ()
-    over_v: ClassVar[Bends] = ()
+    over_x: Bends = ()
+    over_v: Bends = ()
 
     def at(self, t: Array) -> Array:
         """Return the force [N] at times t [s], but for what depends on the piston."""
@@ -87,14 +89,6 @@ def state_under(rig: Rig, load: Force | None, x: float) -> Array:
     if tables is not None:
         force = float(force + force_over(x, tables[0]) + force_over(0.0, tables[1]))
     return initial_state(rig, x, force)
-
-
-@dataclass(frozen=True)
-class ForceOver(Force):
-    """A load that also depends on the piston: course(t) and what is linear between bends over x [m] and v [m/s]."""
-
-    over_x: Bends = ()  # type: ignore[misc]
-    over_v: Bends = ()  # type: ignore[misc]
 
 
 def bends_of(s: Array, F: Array) -> Bends:
@@ -179,7 +173,7 @@ def _recorded_force(path: str, words: str) -> Force:
             f"a load over {over[0]} must have 2 to {MOST_ROWS} rows of finite numbers whose {over[0]} rises, got "
             f"{s.size} rows ({path})"
         )
-    return ForceOver(_NO_FORCE, words, **{f"over_{over[0]}": bends_of(s, F)})
+    return Force(_NO_FORCE, words, **{f"over_{over[0]}": bends_of(s, F)})
 
 
 _NO_FORCE = Sine(0.0, 0.0)
@@ -219,10 +213,9 @@ def parse_force(text: str) -> Force:
         if pattern.search(rest):
             over[f"over_{letter}"] = ((0.0, line), *bends)
         rest = pattern.sub("", rest)
-    if not over:
-        return Force(_course(words, _FORCES, "load"), words)
-    rest = re.sub(r"^\s*\+|[+]\s*$", "", rest).strip()
-    return ForceOver(_course(rest, _FORCES, "load") if rest else _NO_FORCE, words, **over)
+    if over:
+        rest = re.sub(r"^\s*\+|[+]\s*$", "", rest).strip()
+    return Force(_NO_FORCE if over and not rest else _course(rest, _FORCES, "load"), words, **over)
 
 
 def _spelled(unit: str, units: Mapping[str, float]) -> str:

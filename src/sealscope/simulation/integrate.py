@@ -172,11 +172,11 @@ def _unsized(leaks: Sequence[Leak]) -> tuple[Leak, ...]:
     return tuple(leak if leak.mean is None else replace(leak, mean=None, coefficient=0.0) for leak in leaks)
 
 
-def sized_leaks(experiment: Experiment, progress: Callable[[str, float], None] | None = None) -> tuple[Leak, ...]:
+def sized_leaks(experiment: Experiment) -> tuple[Leak, ...]:
     """Return the experiment's leaks with a coefficient each, so that each one's mean is what was asked for."""
     if not any(leak.mean for leak in experiment.leaks):
         return _unsized(experiment.leaks)
-    return sized_run(experiment, progress)[0]
+    return sized_run(experiment)[0]
 
 
 def sized_run(

@@ -110,7 +110,7 @@ def leak_bound(experiment: Experiment, unknown: Sequence[str] = (), covariance: 
     """
     R = noise_covariance(experiment.rig) if covariance is None else covariance
     sensitivities = [leak_sensitivity(experiment), *(parameter_sensitivity(experiment, name) for name in unknown)]
-    fisher = information(np.stack([sensitivity.slope for sensitivity in sensitivities]), R)
+    fisher = information(np.stack(sensitivities), R)
     return math.sqrt(cramer_rao(fisher)[0, 0])
 
 
