@@ -21,7 +21,7 @@ import numpy as np
 from fmpy.fmi2 import FMU2Slave
 
 import sealscope as ss
-from sealscope.simulation.commands import Recorded
+from sealscope.simulation.commands import recorded
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.integrate import trajectory
 
@@ -77,7 +77,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "unit.fmu"
             ss.write_fmu(path, rig=rig, step=step)
-            command = Recorded(np.r_[t, t[-1] + 1.0], np.r_[u, u[-1]])
+            command = recorded(np.r_[t, t[-1] + 1.0], np.r_[u, u[-1]])
             same = Experiment.of(rig=rig, command=command, duration=chosen.seconds, rate=1 / SPAN, step=step)
             run = trajectory(same, ())
             every = round(SPAN * (run.t.size - 1) / run.t[-1])

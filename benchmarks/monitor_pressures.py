@@ -35,7 +35,8 @@ from scipy.special import gammaincinv
 from threadpoolctl import threadpool_limits
 
 import sealscope as ss
-from sealscope.simulation.changes import ParameterDrift, TabulatedDrift
+from sealscope.simulation.changes import ParameterDrift
+from sealscope.simulation.commands import tabulated
 
 RESULTS = Path(__file__).parent / "results" / "monitor_pressures.csv"
 ONSET_S = 720.0
@@ -111,9 +112,9 @@ class Machine:
             seed=self._seeds + self.pieces + (500 if fails else 0),
             **fails,
             drifts=[
-                *(ParameterDrift(name, TabulatedDrift(t, course / course[0] - 1)) for name, course in courses.items()),
+                *(ParameterDrift(name, tabulated(t, course / course[0] - 1)) for name, course in courses.items()),
                 *(
-                    ParameterDrift(f"sensors.{name}.offset", TabulatedDrift(t, zero), absolute=True)
+                    ParameterDrift(f"sensors.{name}.offset", tabulated(t, zero), absolute=True)
                     for name, zero in zeros.items()
                 ),
             ],

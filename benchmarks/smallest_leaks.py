@@ -24,7 +24,7 @@ import sealscope as ss
 from sealscope.campaigns.smallest import PlannedDuty, experiment_of, findable
 from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.parameters import load_rig
-from sealscope.simulation.leaks import From, Leak
+from sealscope.simulation.leaks import Leak, from_time
 from sealscope.simulation.simulate import simulate_with_truth
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -88,7 +88,7 @@ def main() -> None:
         predicted = findable(rig, duty, given.duration)
         counts = []
         for factor in FACTORS:
-            leak = Leak("laminar", coefficient=factor * predicted.conductance, opening=From(0.5 * given.duration))
+            leak = Leak("laminar", coefficient=factor * predicted.conductance, opening=from_time(0.5 * given.duration))
             detected = 0
             for seed in range(given.seeds):
                 experiment = replace(experiment_of(rig, duty, given.duration, 1000 + seed), leaks=(leak,))

@@ -21,7 +21,7 @@ from sealscope.control import Flatness, registry
 from sealscope.errors import InputError
 from sealscope.simulation.bench.machines import draw
 from sealscope.simulation.bench.profile import load_profile
-from sealscope.simulation.commands import Recorded
+from sealscope.simulation.commands import recorded
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.integrate import trajectory
 
@@ -197,7 +197,7 @@ def test_the_bound_of_a_closed_loop_is_that_of_its_voltages(monkeypatch):
     monkeypatch.setattr("sealscope.campaigns.cases.bound.unknown_of", lambda rig: ("fluid.K_oil",))
     closed = Experiment.of(rig="thesis-closed-loop", command="position 20 mm sin(2t)", duration=4.0)
     a = trajectory(closed, ())
-    opened = replace(closed, command=Recorded(a.t, a.volts, "as controlled"), controller=None)
+    opened = replace(closed, command=recorded(a.t, a.volts, "as controlled"), controller=None)
     b = trajectory(opened, ())
     assert np.max(np.abs(a["x"] - b["x"])) < 1e-4
     sizes = [change_bound(one, 60.0, 60.0, 0.1e6) for one in (closed, opened)]

@@ -13,7 +13,7 @@ from sealscope.campaigns.smallest import Findable, PlannedDuty, RecordingPlan, e
 from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
-from sealscope.simulation.leaks import From, Leak
+from sealscope.simulation.leaks import Leak, from_time
 from sealscope.simulation.simulate import simulate_with_truth
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -34,7 +34,7 @@ def test_what_is_planned_is_found(rig: Rig, minute: Findable) -> None:
     """1.3 times the size is found in most recordings made afresh, and a third of it in none."""
     result = []
     for factor in (1.3, 1.0 / 3.0):
-        leak = Leak("laminar", coefficient=factor * minute.conductance, opening=From(30.0))
+        leak = Leak("laminar", coefficient=factor * minute.conductance, opening=from_time(30.0))
         runs = [replace(experiment_of(rig, DUTY, 60.0, seed), leaks=(leak,)) for seed in range(10, 14)]
         records = [simulate_with_truth(run).recording for run in runs]
         result.append(sum(VolumeBalance(rig).examine(own, [], 0.01).verdict == "leak" for own in records))

@@ -56,7 +56,7 @@ def test_wrong_settings_are_one_line(call, tmp_path):
     file = tmp_path / "monitor.toml"
     assert "must be readable" in call("monitor", file).refused()
     file.write_text("[[actuator]]\nname = 3\n")
-    assert call("monitor", file).refused().startswith("actuator.0.name: Input should be a valid string, got '3'")
+    assert call("monitor", file).refused().startswith("actuator[1].name must be a valid string, got 3")
     file.write_text('database = "nowhere/monitor.db"\n[[actuator]]\nname = "a"\n')
     assert "nowhere" in call("monitor", file, "--once").refused()
 

@@ -13,7 +13,7 @@ import pytest
 
 import sealscope as ss
 from sealscope.fmu.build import PLATFORMS, compiler, this_platform
-from sealscope.simulation.commands import Recorded
+from sealscope.simulation.commands import recorded
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.integrate import trajectory
 
@@ -114,7 +114,7 @@ def test_a_unit_runs_as_simulate_does(rig, folder):
     extended = np.r_[t, t[-1] + 1.0], np.r_[u, u[-1]]
     same = Experiment.of(
         rig=rig,
-        command=Recorded(*extended),
+        command=recorded(*extended),
         leak="G = 6.1e-13 from 20 s",
         duration=seconds,
         rate=1 / span,

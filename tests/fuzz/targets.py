@@ -106,7 +106,7 @@ def _command(text: str) -> None:
 def _leak(text: str) -> None:
     leak = parse_leak(text)
     if leak is not None:
-        leak.opening.share(T)
+        leak.opening.at(T)
         str(leak)
 
 

@@ -16,7 +16,7 @@ from sealscope.diagnosis.live.estimates import BlockEstimate
 from sealscope.diagnosis.live.watch import Watch
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
-from sealscope.simulation.changes import Linear, ParameterDrift
+from sealscope.simulation.changes import ParameterDrift, linear
 
 from .plant import moved
 
@@ -150,9 +150,9 @@ def test_a_position_that_comes_with_the_second_block_is_used():
 @pytest.mark.slow
 def test_oil_that_warms_is_no_leak():
     warm = [
-        ParameterDrift("pump.G_pump", Linear(0.5, 600.0)),
-        ParameterDrift("friction.F_v", Linear(-0.3, 600.0)),
-        ParameterDrift("fluid.K_oil", Linear(-0.05, 600.0)),
+        ParameterDrift("pump.G_pump", linear(0.5, 600.0)),
+        ParameterDrift("friction.F_v", linear(-0.3, 600.0)),
+        ParameterDrift("fluid.K_oil", linear(-0.05, 600.0)),
     ]
     watch, estimates = run(simulated(duration=600.0, drifts=warm), 50_000)
     assert watch.leak is None

@@ -138,7 +138,7 @@ def test_parts_made_by_hand_obey_the_same_rules() -> None:
     assert Motor(**values) == RIG.motor
     with pytest.raises(InputError, match=r"^R_c must be greater than 0 ohm, got -1.0$"):
         Motor(**{**values, "R_c": -1.0})
-    with pytest.raises(InputError, match=r"^R_d is not a parameter$"):
+    with pytest.raises(InputError, match=r"^R_d is not known$"):
         Motor(**values, R_d=1.0)
     with pytest.raises(InputError, match=r"^R_c is missing$"):
         Motor(**{name: value for name, value in values.items() if name != "R_c"})

@@ -34,7 +34,7 @@ from sealscope.physics.standstill import initial_state
 from sealscope.simulation.batch.batch import simulate_batch
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults import Fault, parse_fault
-from sealscope.simulation.leaks import Between
+from sealscope.simulation.leaks import from_time
 from sealscope.simulation.simulate import simulate_with_truth
 
 LINES = {"orifices": "present", "closed_A": "50 %", "closed_B": "50 %", "p_charge": "2 MPa"}
@@ -341,4 +341,4 @@ def test_operations_are_read_back_from_their_own_words():
     for fault in (*OPERATED, "filter A x10 growing from 1 s to 3 s", "oil -5 K from 1 s"):
         assert str(parse_fault(str(parse_fault(fault)))) == str(parse_fault(fault))
     assert parse_fault(OPERATED[0]) == Fault("shut-off", 0.0, "A", parse_fault(OPERATED[0]).opening)
-    assert parse_fault("circulation") == Fault("circulation", opening=Between(0.0))
+    assert parse_fault("circulation") == Fault("circulation", opening=from_time(0.0))

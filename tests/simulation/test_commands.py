@@ -13,14 +13,14 @@ from sealscope.simulation.commands import (
     Chirp,
     MultiSine,
     PseudoRandom,
-    Ramp,
-    Recorded,
     Sine,
-    Step,
     Trapezoid,
     check_command,
     parse_command,
+    ramp,
+    recorded,
     recorded_command,
+    step,
 )
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate, simulate_with_truth
@@ -29,8 +29,8 @@ number = st.floats(-1e6, 1e6, allow_subnormal=False)
 positive = st.floats(1e-6, 1e6)
 commands = st.one_of(
     st.builds(Sine, number, number, number, number),
-    st.builds(Step, number, number),
-    st.tuples(number, number, positive).map(lambda n: Ramp(n[0], n[1], np.nextafter(n[1] + n[2], np.inf))),
+    st.builds(step, number, number),
+    st.tuples(number, number, positive).map(lambda n: ramp(n[0], n[1], np.nextafter(n[1] + n[2], np.inf))),
     st.builds(Chirp, number, st.floats(0, 1e4), st.floats(0, 1e4), positive),
     st.lists(st.builds(Sine, number, number, number), min_size=1, max_size=3).flatmap(
         lambda sines: st.builds(Sine, number, number, number, number).map(lambda last: MultiSine((*sines, last)))
@@ -57,10 +57,10 @@ def test_a_command_s_words_read_back_as_the_same_command(command):
         ("2 sin(4t -1e-05)+1e-05", Sine(2.0, 4.0, -1e-5, 1e-5)),
         ("2 sin(3t) - sin(7t+1) + 0.5 V", MultiSine((Sine(2.0, 3.0), Sine(-1.0, 7.0, 1.0, 0.5)))),
         ("trapezoid 5 within 1 s every 8 s", Trapezoid(5.0, 1.0, 8.0)),
-        ("step 5", Step(5.0, 0.0)),
-        ("step -5 V at 1 s", Step(-5.0, 1.0)),
-        ("ramp 5 from 1 s to 3 s", Ramp(5.0, 1.0, 3.0)),
-        ("ramp 5 over 3", Ramp(5.0, 0.0, 3.0)),
+        ("step 5", step(5.0, 0.0)),
+        ("step -5 V at 1 s", step(-5.0, 1.0)),
+        ("ramp 5 from 1 s to 3 s", ramp(5.0, 1.0, 3.0)),
+        ("ramp 5 over 3", ramp(5.0, 0.0, 3.0)),
         ("chirp 3 from 0.1 Hz to 5 Hz over 60 s", Chirp(3.0, 0.1, 5.0, 60.0)),
         ("prbs 2 every 0.5 s seed 7", PseudoRandom(2.0, 0.5, 7)),
     ],
@@ -93,10 +93,10 @@ def test_other_words_are_refused_in_one_line(text):
 def test_each_form_in_time():
     t = np.array([0.0, 0.5, 1.0, 2.0, 3.0, 4.0])
     np.testing.assert_allclose(Sine(2.0, 3.0, 0.1, 1.0).volts(t), 1 + 2 * np.sin(3 * t + 0.1))
-    np.testing.assert_array_equal(Step(5.0, 1.0).volts(t), [0, 0, 5, 5, 5, 5])
-    np.testing.assert_allclose(Ramp(6.0, 1.0, 3.0).volts(t), [0, 0, 0, 3, 6, 6])
+    np.testing.assert_array_equal(step(5.0, 1.0).volts(t), [0, 0, 5, 5, 5, 5])
+    np.testing.assert_allclose(ramp(6.0, 1.0, 3.0).volts(t), [0, 0, 0, 3, 6, 6])
     np.testing.assert_allclose(
-        Recorded(t[:3], np.array([1.0, 3.0, 2.0])).volts(np.array([0.25, 0.75, 9.0])), [2, 2.5, 2]
+        recorded(t[:3], np.array([1.0, 3.0, 2.0])).volts(np.array([0.25, 0.75, 9.0])), [2, 2.5, 2]
     )
 
 
@@ -129,7 +129,7 @@ def test_a_command_beyond_the_converter_is_refused_with_value_and_time():
     ):
         Experiment.of(command="10.5 sin(4t)", duration=5.0)
     Experiment.of(command="10 sin(4t)", duration=5.0)
-    for bad in (Step(float("nan")), Step(float("inf"))):
+    for bad in (step(float("nan")), step(float("inf"))):
         with pytest.raises(InputError):
             check_command(bad, np.array([0.0, 1.0]), 10.0)
 
@@ -156,7 +156,7 @@ def test_a_recorded_command_drives_the_rig_like_the_original():
 )
 def test_an_impossible_recorded_command_is_refused(t, u):
     with pytest.raises(InputError):
-        Recorded(np.array(t), np.array(u), "log.csv")
+        recorded(np.array(t), np.array(u), "log.csv")
 
 
 @pytest.mark.parametrize("blank", ["\t", "\n", "\u00a0", " \t "])

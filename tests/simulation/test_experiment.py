@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from sealscope.errors import InputError, SimulationFailed
-from sealscope.simulation.commands import Recorded, Sine
+from sealscope.simulation.commands import Sine, recorded, tabulated
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.integrate import trajectory
-from sealscope.simulation.leaks import Leak, Tabulated
+from sealscope.simulation.leaks import Leak
 from sealscope.simulation.simulate import prove, simulate, simulate_with_truth
 
 THROTTLED = {"orifices": "present", "closed_A": "50 %", "closed_B": "50 %"}
@@ -47,10 +47,10 @@ def test_the_key_tells_experiments_apart_to_the_last_digit():
     experiments = [
         Experiment.of(**common),
         Experiment.of(**common, command=Sine(3.0, 4.0 + 1e-9)),
-        Experiment.of(**common, command=Recorded(t, u, "log.csv")),
-        Experiment.of(**common, command=Recorded(t, nudged, "log.csv")),
-        Experiment.of(**common, leak=Leak(coefficient=1e-13, opening=Tabulated(t, opening))),
-        Experiment.of(**common, leak=Leak(coefficient=1e-13, opening=Tabulated(t, distorted))),
+        Experiment.of(**common, command=recorded(t, u, "log.csv")),
+        Experiment.of(**common, command=recorded(t, nudged, "log.csv")),
+        Experiment.of(**common, leak=Leak(coefficient=1e-13, opening=tabulated(t, opening))),
+        Experiment.of(**common, leak=Leak(coefficient=1e-13, opening=tabulated(t, distorted))),
         Experiment.of(**common, leak=["G = 1e-13", "C = 1e-10"]),
         Experiment.of(**common, seed=1),
         Experiment.of(**common, step=1e-4),
@@ -63,7 +63,7 @@ def test_the_key_tells_experiments_apart_to_the_last_digit():
     keys = [one.key() for one in experiments]
     assert len(set(keys)) == len(keys)
     assert Experiment.of(**common).key() == keys[0]
-    assert Experiment.of(**common, command=Recorded(t.copy(), u.copy(), "log.csv")).key() == keys[2]
+    assert Experiment.of(**common, command=recorded(t.copy(), u.copy(), "log.csv")).key() == keys[2]
 
 
 def test_a_run_is_told_in_its_provenance():

@@ -16,7 +16,7 @@ from sealscope.physics.rig import rig_numbers
 from sealscope.simulation.batch.run import refuse
 from sealscope.simulation.bench.machines import draw
 from sealscope.simulation.bench.profile import load_profile
-from sealscope.simulation.changes import Linear, ParameterDrift
+from sealscope.simulation.changes import ParameterDrift, linear
 from sealscope.simulation.commands import Alternating, Sine, parse_command
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.instruments import at_jittered, lagging
@@ -131,7 +131,7 @@ def test_the_springs_force_is_that_of_its_deflection():
 def test_a_load_that_drifts_moves_the_pressures_by_its_force():
     """Between a run with a growing force and one without, the mean pressure difference grows by force over area."""
     size, duration = 60.0, 12.0
-    drift = ParameterDrift("F_l", Linear(size, duration), absolute=True)
+    drift = ParameterDrift("F_l", linear(size, duration), absolute=True)
     loaded, free = (simulate(duration=duration, seed=2, drifts=drifts) for drifts in ((drift,), ()))
     change = (loaded["p_A"] - loaded["p_B"]) - (free["p_A"] - free["p_B"])
     whole = round(2 * math.pi / 4.0 * 500)  # one stroke back and forth
@@ -139,7 +139,7 @@ def test_a_load_that_drifts_moves_the_pressures_by_its_force():
     early, late = change[:whole].mean(), change[-whole:].mean()
     assert late - early == pytest.approx(size * (duration - whole / 500) / duration / area, rel=0.1)
     with pytest.raises(InputError, match="F_l must be absolute"):
-        ParameterDrift("F_l", Linear(0.1, 1.0))
+        ParameterDrift("F_l", linear(0.1, 1.0))
 
 
 @pytest.mark.parametrize("lag", [0.0005, 0.004, 0.03])

@@ -9,10 +9,10 @@ import pytest
 
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig
-from sealscope.simulation.commands import Sine, Step
+from sealscope.simulation.commands import Sine, step, tabulated
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults import Fault, parse_fault
-from sealscope.simulation.leaks import Between, From, Growing, Tabulated
+from sealscope.simulation.leaks import from_time, growing
 from sealscope.simulation.simulate import simulate_with_truth, write_truth
 
 PSI = 6894.757293168361
@@ -27,21 +27,21 @@ LEAKING_PUMP = {"G_pump": 2.4e-13}
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
-        ("pump leak x3 from 90 s", Fault("pump leak", 3.0, opening=From(90.0))),
-        ("pump leakage +50 % growing from 1 s to 3 s", Fault("pump leak", 1.5, opening=Growing(1.0, 3.0))),
+        ("pump leak x3 from 90 s", Fault("pump leak", 3.0, opening=from_time(90.0))),
+        ("pump leakage +50 % growing from 1 s to 3 s", Fault("pump leak", 1.5, opening=growing(1.0, 3.0))),
         ("pump leak G = 5e-13", Fault("pump leak G", 5e-13)),
-        ("rod seal A 0.012 L/min from 90 s", Fault("rod seal", 0.012 * LPM, "A", From(90.0))),
-        ("external leak B G = 2e-13 from 90", Fault("rod seal G", 2e-13, "B", From(90.0))),
-        ("friction x1.3 from 90 s", Fault("friction", 1.3, opening=From(90.0))),
+        ("rod seal A 0.012 L/min from 90 s", Fault("rod seal", 0.012 * LPM, "A", from_time(90.0))),
+        ("external leak B G = 2e-13 from 90", Fault("rod seal G", 2e-13, "B", from_time(90.0))),
+        ("friction x1.3 from 90 s", Fault("friction", 1.3, opening=from_time(90.0))),
         ("friction -20 %", Fault("friction", 0.8)),
-        ("air 1 % growing from 60 s to 120 s", Fault("air", 0.01, opening=Growing(60.0, 120.0))),
-        ("sensor p_A offset -2 psi from 90 s", Fault("sensor offset", -13789.514586336723, "p_A", From(90.0))),
+        ("air 1 % growing from 60 s to 120 s", Fault("air", 0.01, opening=growing(60.0, 120.0))),
+        ("sensor p_A offset -2 psi from 90 s", Fault("sensor offset", -13789.514586336723, "p_A", from_time(90.0))),
         ("sensor x offset 1 mm", Fault("sensor offset", 1e-3, "x")),
-        ("sensor p_B gain +1 % from 9 s", Fault("sensor gain", 0.01, "p_B", From(9.0))),
-        ("sensor p_1 stuck from 90 s to 100 s", Fault("sensor stuck", 0.0, "p_1", Between(90.0, 100.0))),
-        ("sensor q_leak stuck", Fault("sensor stuck", 0.0, "q_leak", Between(0.0))),
-        ("duty amplitude x1.5 from 90 s", Fault("duty", 1.5, opening=From(90.0))),
-        ("duty amplitude x0.5 frequency x2 growing from 1 s to 2 s", Fault("duty", 0.5, "", Growing(1.0, 2.0), 2.0)),
+        ("sensor p_B gain +1 % from 9 s", Fault("sensor gain", 0.01, "p_B", from_time(9.0))),
+        ("sensor p_1 stuck from 90 s to 100 s", Fault("sensor stuck", 0.0, "p_1", from_time(90.0, 100.0))),
+        ("sensor q_leak stuck", Fault("sensor stuck", 0.0, "q_leak", from_time(0.0))),
+        ("duty amplitude x1.5 from 90 s", Fault("duty", 1.5, opening=from_time(90.0))),
+        ("duty amplitude x0.5 frequency x2 growing from 1 s to 2 s", Fault("duty", 0.5, "", growing(1.0, 2.0), 2.0)),
         ("duty frequency x0.8", Fault("duty", 1.0, pace=0.8)),
     ],
 )
@@ -101,8 +101,8 @@ def test_a_fault_that_cannot_be_on_this_rig_is_refused():
         Experiment.of(fault="pump leak x3 from 90 s")
     with pytest.raises(InputError, match=r"command must stay within \+-10 V, got -?1\d"):
         Experiment.of(fault="duty amplitude x2 from 90 s", command="7 sin(4t)")
-    with pytest.raises(InputError, match="got a table"):
-        Fault("duty", 2.0, opening=Tabulated(np.array([0.0]), np.array([1.0])))
+    with pytest.raises(InputError, match="got table"):
+        Fault("duty", 2.0, opening=tabulated(np.array([0.0]), np.array([1.0])))
 
 
 def pair(fault: str, *, values: dict | None = None, duration: float = 8.0, **others):
@@ -201,15 +201,15 @@ def test_a_faulty_sensor_errs_as_it_says_and_the_machine_does_not_know():
 
 def test_a_changed_duty_changes_size_and_pace_without_a_jump_in_phase():
     t = np.arange(0.0, 20.0, 1e-3)
-    command = Fault("duty", 1.5, "", From(10.0), 0.5).commanded(Sine(3.0, 4.0))
+    command = Fault("duty", 1.5, "", from_time(10.0), 0.5).commanded(Sine(3.0, 4.0))
     u = command.volts(t)
     np.testing.assert_allclose(u[t < 10], 3 * np.sin(4 * t[t < 10]))
     np.testing.assert_allclose(u[t >= 10], 4.5 * np.sin(40 + 2 * (t[t >= 10] - 10)), atol=1e-9)
-    gradual = Fault("duty", 1.0, "", Growing(5.0, 10.0), 2.0).commanded(Sine(1.0, 3.0))
+    gradual = Fault("duty", 1.0, "", growing(5.0, 10.0), 2.0).commanded(Sine(1.0, 3.0))
     pace = np.gradient(gradual.clock(t), t)
     np.testing.assert_allclose(pace, 1.0 + np.clip((t - 5) / 5, 0, 1), atol=2e-3)
     assert np.abs(np.diff(gradual.volts(t))).max() < 6.5e-3
-    assert Step(1.0).volts(t).shape == Fault("duty", 2.0).commanded(Step(1.0)).volts(t).shape
+    assert step(1.0).volts(t).shape == Fault("duty", 2.0).commanded(step(1.0)).volts(t).shape
     recorded = simulate_with_truth(
         Experiment.of(duration=4.0, fault="duty amplitude x1.5 frequency x0.5 from 2 s")
     ).recording

@@ -9,9 +9,10 @@ import pytest
 
 from sealscope.errors import InputError
 from sealscope.simulation.bench.machines import draw
+from sealscope.simulation.commands import tabulated
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.integrate import sized_leaks, trajectory
-from sealscope.simulation.leaks import From, Growing, Leak, Tabulated, parse_leak
+from sealscope.simulation.leaks import Leak, from_time, growing, parse_leak
 from sealscope.simulation.simulate import simulate_with_truth
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -54,14 +55,14 @@ def test_two_leaks_at_once_each_get_their_mean():
     leaks = sized_leaks(experiment)
     path = trajectory(experiment, leaks)
     for leak, lpm in zip(leaks, (0.01, 0.05), strict=True):
-        inside = path.t >= leak.opening.at
+        inside = path.t >= leak.opening.onset()
         assert flow(leak, path)[inside].mean() / LITRE_PER_MINUTE == pytest.approx(lpm, rel=1e-3)
     together = np.abs(path["q_leak"])
     np.testing.assert_allclose(together[path.t >= 6], sum(flow(leak, path) for leak in leaks)[path.t >= 6], rtol=1e-9)
 
 
 def test_a_growing_leak_and_a_table_are_sized_at_full_opening():
-    for opening in (Growing(2.0, 8.0), Tabulated(np.array([0.0, 2.0, 8.0]), np.array([0.0, 0.0, 1.0]))):
+    for opening in (growing(2.0, 8.0), tabulated(np.array([0.0, 2.0, 8.0]), np.array([0.0, 0.0, 1.0]))):
         experiment = Experiment.of(leak=Leak(mean=0.02 * LITRE_PER_MINUTE, opening=opening), duration=12.0)
         truth = simulate_with_truth(experiment).truth
         assert truth.mean_leak_lpm == pytest.approx(0.02, rel=1e-3)
@@ -99,16 +100,21 @@ def test_no_leak_and_a_leak_of_nothing_have_no_onset():
 @pytest.mark.parametrize(
     ("text", "leak"),
     [
-        ("0.0042 L/min from 90 s", Leak("laminar", mean=0.0042 * LITRE_PER_MINUTE, opening=From(90.0))),
-        ("4.2 mL/min orifice", Leak("orifice", mean=4.2e-3 * LITRE_PER_MINUTE, opening=From(0.0))),
+        ("0.0042 L/min from 90 s", Leak("laminar", mean=0.0042 * LITRE_PER_MINUTE, opening=from_time(90.0))),
+        ("4.2 mL/min orifice", Leak("orifice", mean=4.2e-3 * LITRE_PER_MINUTE, opening=from_time(0.0))),
         (
             "0.01 L/min orifice growing from 60 s to 120 s",
-            Leak("orifice", mean=0.01 * LITRE_PER_MINUTE, opening=Growing(60.0, 120.0)),
+            Leak("orifice", mean=0.01 * LITRE_PER_MINUTE, opening=growing(60.0, 120.0)),
         ),
+<<<<<<< HEAD
         ("G = 6.1e-13 from 90 s", Leak("laminar", coefficient=6.1e-13, opening=From(90.0))),
         ("C=2e-10", Leak("orifice", coefficient=2e-10, opening=From(0.0))),
         ("g = 6.1e-13 Laminar From 90 S", Leak("laminar", coefficient=6.1e-13, opening=From(90.0))),
         ("4.2 mL/min Orifice", Leak("orifice", mean=4.2e-3 * LITRE_PER_MINUTE, opening=From(0.0))),
+=======
+        ("G = 6.1e-13 from 90 s", Leak("laminar", coefficient=6.1e-13, opening=from_time(90.0))),
+        ("C=2e-10", Leak("orifice", coefficient=2e-10, opening=from_time(0.0))),
+>>>>>>> hsim
     ],
 )
 def test_leaks_are_read_from_words(text, leak):
@@ -155,7 +161,7 @@ def test_an_impossible_leak_is_refused(parts):
 @pytest.mark.parametrize(("t", "share"), [([0, 1], [0.0]), ([1, 0], [0, 1]), ([0, 1], [0, 1.5]), ([0, 1], [0, -0.1])])
 def test_an_impossible_table_is_refused(t, share):
     with pytest.raises(InputError):
-        Tabulated(np.array(t, dtype=float), np.array(share, dtype=float))
+        Leak(coefficient=1e-13, opening=tabulated(np.array(t, dtype=float), np.array(share, dtype=float)))
 
 
 def test_a_leak_is_sized_where_friction_sticks_under_a_controller():

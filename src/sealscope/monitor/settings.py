@@ -223,7 +223,7 @@ def read_settings(path: Path) -> MonitorSettings:
     try:
         return MonitorSettings.model_validate(values, context={"folder": path.resolve().parent})
     except ValidationError as error:
-        raise InputError(f"{one_line(error, 'settings')} ({path})") from None
+        raise InputError(f"{one_line(error, lambda entry: entry or 'settings')} ({path})") from None
 
 
 def template() -> str:

@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
 from sealscope.errors import InputError
+from sealscope.storage.plain_values import one_line
 
 
 def quantity(name: str, unit: str, *, absent: float | None = None, **bounds: float) -> Any:
@@ -58,15 +59,10 @@ def with_unit(number: float, unit: str) -> str:
 def rule_broken(error: ValidationError, model: type[BaseModel]) -> str:
     """Return pydantic's first message on values of `model` as "SYMBOL must be ..., got ...", bounds with their unit."""
     first = error.errors(include_url=False)[0]
-    if first["type"] == "value_error":
-        return str(first["ctx"]["error"])
-    symbol = ".".join(str(part) for part in first["loc"])
-    if plain := {"missing": "is missing", "extra_forbidden": "is not a parameter"}.get(first["type"]):
-        return f"{symbol} {plain}"
-    bounded = symbol in model.model_fields and any(key in first.get("ctx", {}) for key in ("gt", "ge", "lt", "le"))
+    symbol = ".".join(map(str, first["loc"]))
+    bounded = symbol in model.model_fields and first.get("ctx", {}).keys() & {"gt", "ge", "lt", "le"}
     unit = unit_of(model.model_fields[symbol]) if bounded else ""
-    rule = first["msg"].replace("Input should be", "must be", 1)
-    return f"{symbol} {rule}{'' if unit in ('', '1') else ' ' + unit}, got {first.get('input')!r}"
+    return one_line(error, unit="" if unit in ("", "1") else f" {unit}")
 
 
 class PartsDisagreeError(InputError):

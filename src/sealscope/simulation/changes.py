@@ -80,37 +80,26 @@ def values_of(effects: Sequence[Effect], base: RigNumbers, t: Array) -> dict[str
     return {name: changed(np.full(t.size, float(getattr(base, name))), effects, name, t) for name in names}
 
 
-def moved_per_block(effect: Effect, bounds: np.ndarray, rate: float) -> Array:
-    """Return how many resolutions an effect moves in each block between `bounds` (outputs at `rate` [Hz]), rounded up.
+def blocks_of(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarray:
+    """Return the bounds (n + 1,) in outputs at `rate` [Hz] of the blocks over which changing numbers are held.
 
-    Times are taken from inside the block, so that a jump at its bound is no slope.
+    A block is at most `LONGEST_BLOCK` long, and so short (down to the effect's shortest) that no effect moves by more
+    than its resolution; a jump falls on a block's boundary, within one output interval.
     """
-    inside = 1e-6 / rate
-    moved = np.abs(effect.change(bounds[1:] / rate - inside) - effect.change(bounds[:-1] / rate + inside))
-    return np.asarray(np.ceil(moved / effect.resolution - 1e-9))
-
-
-def jumps_of(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarray:
-    """Return the outputs (at `rate` [Hz], within 0 .. `n_out`) at which the effects may jump or bend."""
+    if not effects:
+        return np.array([0, n_out], dtype=np.int64)
     jumps = np.array([jump for effect in effects for jump in effect.jumps if math.isfinite(jump)], dtype=np.float64)
-    outputs = np.ceil(jumps * rate * (1.0 - 1e-12)).astype(np.int64)
-    return outputs[(outputs > 0) & (outputs < n_out)]
-
-
-def refined(bounds: np.ndarray, effects: Sequence[Effect], rate: float) -> np.ndarray:
-    """Return the bounds with each block cut so that no effect moves further than its resolution in one."""
+    grid = np.arange(0, n_out, max(1, round(LONGEST_BLOCK * rate)))
+    bounds = np.unique(np.clip(np.r_[grid, n_out, np.ceil(jumps * rate * (1.0 - 1e-12))], 0, n_out))
     starts, stops = bounds[:-1], bounds[1:]
+    inside = 1e-6 / rate  # so that a jump at a bound is no slope
     parts = np.ones(starts.size)
     for effect in effects:
-        least = max(1, round(effect.shortest * rate))
-        most = np.maximum(1, (stops - starts) // least)
-        parts = np.maximum(parts, np.minimum(moved_per_block(effect, bounds, rate), most))
-    cuts = [
-        np.linspace(a, b, n, endpoint=False)
-        for a, b, n in zip(starts, stops, parts.astype(np.int64), strict=True)
-        if n > 1
-    ]
-    return np.unique(np.r_[bounds, np.rint(np.concatenate([*cuts, bounds[:0]])).astype(np.int64)])
+        moved = np.abs(effect.change(stops / rate - inside) - effect.change(starts / rate + inside))
+        most = np.maximum(1, (stops - starts) // max(1, round(effect.shortest * rate)))
+        parts = np.maximum(parts, np.minimum(np.ceil(moved / effect.resolution - 1e-9), most))
+    cuts = [np.linspace(a, b, int(n), endpoint=False) for a, b, n in zip(starts, stops, parts, strict=True)]
+    return np.unique(np.rint(np.concatenate([*cuts, [n_out]])).astype(np.int64))
 
 
 def extremes(effects: Sequence[Effect], base: RigNumbers) -> tuple[RigNumbers, ...]:
@@ -125,19 +114,15 @@ def extremes(effects: Sequence[Effect], base: RigNumbers) -> tuple[RigNumbers, .
 class Schedule:
     """The rig's numbers over a run, constant within blocks: `bounds` (n + 1,) output indices, one number set a block.
 
-    A block is at most 0.5 s long, and so short (down to the effect's shortest) that no effect moves by more than its
-    resolution; a jump falls on a block's boundary, within one output interval. Within a block a number has its value at
-    the middle. Neighbours with the same numbers are one block.
+    The blocks are those of `blocks_of`; within one a number has its value at the middle. Neighbours with the same
+    numbers are one block.
     """
 
     def __init__(self, effects: Sequence[Effect], base: RigNumbers, n_out: int, rate: float) -> None:
-        cell = max(1, round(LONGEST_BLOCK * rate))
-        self.bounds = np.array([0, n_out], dtype=np.int64)
+        self.bounds = blocks_of(effects, n_out, rate)
         self.numbers = [base]
         if not effects:
             return
-        coarse = np.unique(np.r_[np.arange(0, n_out, cell), n_out, jumps_of(effects, n_out, rate)])
-        self.bounds = refined(coarse, effects, rate)
         middles: Array = np.asarray(0.5 * (self.bounds[:-1] + self.bounds[1:]) / rate, dtype=np.float64)
         values = values_of(effects, base, middles)
         table = np.array(list(values.values()))
@@ -199,21 +184,9 @@ class Shape(Protocol):
         """Return the change at times t [s] (any shape); 0 at t = 0."""
         ...
 
-
-@dataclass(frozen=True)
-class Linear:
-    """An even change of `size` over `duration` [s], going on as long as the run does."""
-
-    size: float
-    duration: float
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.size) and self.duration > 0):
-            raise InputError(f"a linear drift must be finite and last > 0 s, got {self.size} over {self.duration} s")
-
-    def at(self, t: Array) -> Array:
-        """Return the change at times t [s]."""
-        return self.size / self.duration * np.maximum(t, 0.0)
+    def bends(self) -> tuple[float, ...]:
+        """Return the times [s] at which it jumps or bends."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -244,6 +217,10 @@ class Wander:
                 before, term = term, turn * term - before
         return change
 
+    def bends(self) -> tuple[float, ...]:
+        """Return no times: it is smooth."""
+        return ()
+
     def scaled(self, size: float) -> Wander:
         """Return the same path with the distance `size` between its highest and lowest point within the duration."""
         path = self.at(np.linspace(0.0, self.duration, 1001))
@@ -260,22 +237,9 @@ class Wander:
         return Wander(tuple(a + b for a, b in pairs), self.duration, self.slope + other.slope)
 
 
-@dataclass(frozen=True, eq=False)
-class TabulatedDrift:
-    """A change linear between the points of a table; constant before the first and after the last."""
-
-    t: Array
-    change: Array
-
-    def __post_init__(self) -> None:
-        if self.t.size != self.change.size or self.t.size < 1 or np.any(np.diff(self.t) < 0):
-            raise InputError("a drift table must have one change for each time, and its times must rise")
-        if not (np.all(np.isfinite(self.t)) and np.all(np.isfinite(self.change))):
-            raise InputError("times and changes of a drift table must be finite, got NaN or infinity")
-
-    def at(self, t: Array) -> Array:
-        """Return the change at times t [s]."""
-        return np.interp(t, self.t, self.change)
+def linear(size: float, duration: float) -> Wander:
+    """Return an even change of `size` over `duration` [s], going on as long as the run does."""
+    return Wander((), duration, size)
 
 
 #: Most that a number that drifts in its own unit changes from one block of the solver to the next.
@@ -314,7 +278,7 @@ class ParameterDrift:
             raise InputError(f"a drift of {self.parameter} must be {wanted}")
 
     def __str__(self) -> str:
-        return f"{self.parameter} drifts, {type(self.shape).__name__.lower()}"
+        return f"{self.parameter} drifts"
 
     def _of_instruments(self) -> bool:
         return self.parameter.startswith("sensors.") and self.parameter.rpartition(".")[2] in _OF_INSTRUMENTS
@@ -326,8 +290,7 @@ class ParameterDrift:
 
     def effects(self) -> tuple[Effect, ...]:
         """Return what it changes, in the machine or at the instruments."""
-        table = isinstance(self.shape, TabulatedDrift) and self.shape.t.size < 1000
-        jumps = tuple(map(float, self.shape.t)) if table else ()  # type: ignore[attr-defined]
+        jumps = self.shape.bends()
 
         def effect(field: str, power: float) -> Effect:
             if self.absolute:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -120,39 +120,81 @@ class Alternating:
         return ", ".join(f"{periods} periods of {sine}" for periods, sine in self.parts)
 
 
-@dataclass(frozen=True)
-class Step:
-    """u = 0 before `at` [s], `level` [V] from then on."""
+@dataclass(frozen=True, eq=False)
+class Polyline:
+    """What is linear over time between points, and constant before the first and after the last.
 
-    level: float
-    at: float = 0.0
+    `t`, `y`: (n,) times [s] that do not fall, and values; of two points at one time the later holds from there on.
+    `words`: what it is called, in the form that parsers read. Of two equal ones all three are the same.
+    """
 
-    def volts(self, t: Array) -> Array:
-        """Return u [V] at times t [s]."""
-        return np.where(t >= self.at, self.level, 0.0)
+    t: Array
+    y: Array
+    words: str
 
-    def __str__(self) -> str:
-        return f"step {number_text(self.level)} at {number_text(self.at)} s"
-
-
-@dataclass(frozen=True)
-class Ramp:
-    """u rises evenly from 0 at `start` [s] to `level` [V] at `stop` [s] and stays there."""
-
-    level: float
-    start: float
-    stop: float
-
-    def __post_init__(self) -> None:
-        if not self.stop > self.start:
-            raise InputError(f"a ramp must stop after it starts, got {self.start:g} s to {self.stop:g} s")
+    def at(self, t: Array) -> Array:
+        """Return the values at times t [s] (any shape)."""
+        return np.interp(t, self.t, self.y)
 
     def volts(self, t: Array) -> Array:
         """Return u [V] at times t [s]."""
-        return self.level * np.clip((t - self.start) / (self.stop - self.start), 0.0, 1.0)
+        return self.at(t)
+
+    def bends(self) -> tuple[float, ...]:
+        """Return the times [s] at which it jumps or bends; none for a table too long to follow each."""
+        return tuple(map(float, np.unique(self.t))) if self.t.size < _LONGEST_FOLLOWED else ()
+
+    def onset(self) -> float:
+        """Return the time [s] from which it leaves 0: 0 where it never was, infinity where it never does."""
+        first = int(np.argmax(self.y > 0)) if np.any(self.y > 0) else -1
+        return math.inf if first < 0 else float(self.t[first - 1]) if first else 0.0
+
+    @property
+    def rise(self) -> tuple[float, float] | None:
+        """When [s] an even rise from 0 to 1 begins and ends, None where it is another course."""
+        return (float(self.t[0]), float(self.t[1])) if self.y.tolist() == [0.0, 1.0] else None
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Polyline):
+            return NotImplemented
+        return self.words == other.words and np.array_equal(self.t, other.t) and np.array_equal(self.y, other.y)
+
+    def __hash__(self) -> int:
+        return hash((self.words, self.t.size))
 
     def __str__(self) -> str:
-        return f"ramp {number_text(self.level)} from {number_text(self.start)} s to {number_text(self.stop)} s"
+        return self.words
+
+
+_LONGEST_FOLLOWED = 1000
+
+
+def polyline(points: Sequence[tuple[float, float]], words: str) -> Polyline:
+    """Return the course through points (t, y)."""
+    t, y = np.array(points, dtype=np.float64).T
+    return Polyline(t, y, words)
+
+
+def tabulated(t: Array, y: Array, what: str = "a table") -> Polyline:
+    """Return the course through the points of a table; InputError where its times fall, or a value is not finite."""
+    if t.ndim != 1 or t.shape != y.shape or t.size < 1 or np.any(np.diff(t) < 0):
+        raise InputError(f"{what} must have one value for each time, and its times must rise")
+    if not (np.all(np.isfinite(t)) and np.all(np.isfinite(y))):
+        raise InputError(f"times and values of {what} must be finite, got NaN or infinity")
+    return Polyline(t, y, f"table of {t.size} points over {t[0]:g}..{t[-1]:g} s")
+
+
+def step(level: float, at: float = 0.0) -> Polyline:
+    """Return u = 0 before `at` [s], `level` [V] from then on."""
+    return polyline([(at, 0.0), (at, level)], f"step {number_text(level)} at {number_text(at)} s")
+
+
+def ramp(level: float, start: float, stop: float) -> Polyline:
+    """Return u that rises evenly from 0 at `start` [s] to `level` [V] at `stop` [s] and stays there."""
+    if not stop > start:
+        raise InputError(f"a ramp must stop after it starts, got {start:g} s to {stop:g} s")
+    words = f"ramp {number_text(level)} from {number_text(start)} s to {number_text(stop)} s"
+    return polyline([(start, 0.0), (stop, level)], words)
 
 
 @dataclass(frozen=True)
@@ -182,6 +224,10 @@ class Chirp:
         return f"chirp {amplitude} from {f_0} Hz to {f_1} Hz over {duration} s"
 
 
+#: SplitMix64: the step from state to state, and by which shifts and factors a state is mixed.
+GOLDEN, MIX = 0x9E3779B97F4A7C15, ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB))
+
+
 @dataclass(frozen=True)
 class PseudoRandom:
     """Pseudo-random binary command: +amplitude or -amplitude, drawn anew every `hold` [s] from `seed`.
@@ -202,9 +248,9 @@ class PseudoRandom:
         """Return u [V] at times t [s]."""
         slot = np.clip(np.floor(t / self.hold), 0.0, 2.0**63).astype(np.uint64)
         start = np.random.SeedSequence(self.seed).generate_state(1, np.uint64)
-        z = start + (slot + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
-        z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        z = start + (slot + np.uint64(1)) * np.uint64(GOLDEN)
+        for shift, factor in MIX:
+            z = (z ^ (z >> np.uint64(shift))) * np.uint64(factor)
         signs = np.where((z ^ (z >> np.uint64(31))) >> np.uint64(63), 1.0, -1.0)
         return np.where(t >= 0, self.amplitude * signs, 0.0)
 
@@ -212,33 +258,16 @@ class PseudoRandom:
         return f"prbs {number_text(self.amplitude)} every {number_text(self.hold)} s seed {self.seed}"
 
 
-@dataclass(frozen=True, eq=False)
-class Recorded:
-    """A command that was recorded: linear between its samples, its last value afterwards."""
-
-    t: Array
-    u: Array
-    origin: str = "recorded"
-
-    def __post_init__(self) -> None:
-        if self.t.shape != self.u.shape or self.t.ndim != 1 or self.t.size < 2:
-            raise InputError(
-                f"a recorded command needs two samples or more in t and u, got {self.t.size} ({self.origin})"
-            )
-        if not (np.all(np.isfinite(self.u)) and np.all(np.diff(self.t) > 0)):
-            raise InputError(f"a recorded command must be finite and its time must rise ({self.origin})")
-
-    def volts(self, t: Array) -> Array:
-        """Return u [V] at times t [s]."""
-        return np.interp(t, self.t, self.u)
-
-    def __str__(self) -> str:
-        return f"file {self.origin}"
+def recorded(t: Array, u: Array, origin: str = "recorded") -> Polyline:
+    """Return a course that was recorded: linear between its samples, its last value afterwards."""
+    if t.size < 2 or np.any(np.diff(t) == 0):
+        raise InputError(f"a recorded course must have two samples or more, one at a time, got {t.size} ({origin})")
+    return replace(tabulated(t, u, f"a recorded course ({origin})"), words=f"file {origin}")
 
 
-def recorded_command(recording: Recording, origin: str) -> Recorded:
+def recorded_command(recording: Recording, origin: str) -> Polyline:
     """Return the command channel `u` of a recording as a command of its own; the first sample is at t = 0."""
-    return Recorded(recording.t - recording.t[0], recording["u"], origin)
+    return recorded(recording.t - recording.t[0], recording["u"], origin)
 
 
 #: Samples of a command that are looked at together, so that a long one does not fill the memory.
@@ -273,10 +302,10 @@ _FORMS: tuple[tuple[str, Callable[[list[str | None]], Command]], ...] = (
         rf"trapezoid\s+({_N})\s*v?\s+within\s+({_T})\s+every\s+({_T})",
         lambda g: Trapezoid(_number(g[0], 0.0), seconds(g[1]), seconds(g[2])),
     ),
-    (rf"step\s+({_N})\s*v?(?:\s+at\s+({_T}))?", lambda g: Step(_number(g[0], 0.0), seconds(g[1]))),
+    (rf"step\s+({_N})\s*v?(?:\s+at\s+({_T}))?", lambda g: step(_number(g[0], 0.0), seconds(g[1]))),
     (
         rf"ramp\s+({_N})\s*v?\s+(?:from\s+({_T})\s+)?(?:to|over)\s+({_T})",
-        lambda g: Ramp(_number(g[0], 0.0), seconds(g[1]), seconds(g[2])),
+        lambda g: ramp(_number(g[0], 0.0), seconds(g[1]), seconds(g[2])),
     ),
     (
         rf"chirp\s+({_N})\s*v?\s+from\s+({_N})\s*(?:hz)?\s+to\s+({_N})\s*(?:hz)?\s+over\s+({_T})",
@@ -339,10 +368,7 @@ def _sines(text: str) -> Sine | MultiSine | None:
 def parse_command(text: str) -> Command:
     """Read a command from text.
 
-    The forms are ``3 sin(4t)``, ``3 sin(4t) + 1 sin(9t)``, ``6 periods of 5 sin(2t), 10 periods of 3 sin(4t)`` (in
-    turn, again and again), ``step 5 at 1 s``, ``ramp 5 from 1 s to 3 s``, ``trapezoid 3 within 1 s every 8 s``,
-    ``chirp 3 from 0.1 Hz to 5 Hz over 60 s``, ``prbs 2 every 0.5 s seed 1``, and ``file LOG`` (the channel u of a
-    recording). Raises InputError that shows the forms when the text is none of them.
+    Raises InputError that shows the forms when the text is none of them.
     """
     stripped = text.strip()
     if stripped.lower().startswith("file "):
@@ -364,7 +390,8 @@ def parse_command(text: str) -> Command:
         if match:
             return make(list(match.groups()))
     raise InputError(
-        "command must be like '3 sin(4t)', 'step 5 at 1 s', 'ramp 5 from 1 s to 3 s', 'chirp 3 from 0.1 Hz to 5 "
-        "Hz over 60 s', "
-        f"'prbs 2 every 0.5 s seed 1' or 'file LOG', got {text!r}"
+        "command must be like '3 sin(4t)', '3 sin(4t) + 1 sin(9t)', '6 periods of 5 sin(2t), 10 periods of 3 sin(4t)' "
+        "(in turn, again and again), 'step 5 at 1 s', 'ramp 5 from 1 s to 3 s', 'trapezoid 3 within 1 s every 8 s', "
+        "'chirp 3 from 0.1 Hz to 5 Hz over 60 s', 'prbs 2 every 0.5 s seed 1' or 'file LOG' (channel u of a "
+        f"recording), got {text!r}"
     )

@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
-from sealscope.simulation.commands import NUMBER, UNSIGNED, Command, Recorded, Sine, parse_command, plain_text
+from sealscope.simulation.commands import NUMBER, UNSIGNED, Command, Sine, parse_command, plain_text, recorded
 from sealscope.storage.opening import open_regular
 from sealscope.units import to_si
 
@@ -47,13 +47,15 @@ class Position:
 
 @dataclass(frozen=True)
 class Force:
-    """A load beside the rig's own: F = course(t) [N] against +x; `words` as it was given."""
+    """A load beside the rig's own: F = course(t) [N] against +x; `words` as it was given.
+
+    `over_x`, `over_v`: what is linear between bends over position [m] and velocity [m/s] of the piston is added.
+    """
 
     course: Command
     words: str
-    #: What depends on the position and on the velocity of the piston (`ForceOver`).
-    over_x: ClassVar[Bends] = ()
-    over_v: ClassVar[Bends] = ()
+    over_x: Bends = ()
+    over_v: Bends = ()
 
     def at(self, t: Array) -> Array:
         """Return the force [N] at times t [s], but for what depends on the piston."""
@@ -87,14 +89,6 @@ def state_under(rig: Rig, load: Force | None, x: float) -> Array:
     if tables is not None:
         force = float(force + force_over(x, tables[0]) + force_over(0.0, tables[1]))
     return initial_state(rig, x, force)
-
-
-@dataclass(frozen=True)
-class ForceOver(Force):
-    """A load that also depends on the piston: course(t) and what is linear between bends over x [m] and v [m/s]."""
-
-    over_x: Bends = ()  # type: ignore[misc]
-    over_v: Bends = ()  # type: ignore[misc]
 
 
 def bends_of(s: Array, F: Array) -> Bends:
@@ -138,7 +132,7 @@ def parse_position(text: str) -> Position | None:
         recording = read(path)
         if "x" not in recording or recording.units["x"] != "m":
             raise InputError(f"a recorded position must have the channel x with a unit of length, got {path} without")
-        return Position(Recorded(recording.t - recording.t[0], recording["x"], path), words)
+        return Position(recorded(recording.t - recording.t[0], recording["x"], path), words)
     return Position(_course(words, _LENGTHS, "position"), words)
 
 
@@ -171,7 +165,7 @@ def _recorded_force(path: str, words: str) -> Force:
     s = to_si(table[:, 0], columns[over[0]][1], unit, name=over[0], place=path)
     F = to_si(table[:, 1], columns["F"][1], "N", name="F", place=path)
     if over[0] == "t":
-        return Force(Recorded(s - s[:1], F, path), words)
+        return Force(recorded(s - s[:1], F, path), words)
     if s.size > 1 and s[0] > s[-1]:
         s, F = s[::-1], F[::-1]
     if not (2 <= s.size <= MOST_ROWS and np.all(np.diff(s) > 0) and np.all(np.isfinite(table))):
@@ -179,7 +173,7 @@ def _recorded_force(path: str, words: str) -> Force:
             f"a load over {over[0]} must have 2 to {MOST_ROWS} rows of finite numbers whose {over[0]} rises, got "
             f"{s.size} rows ({path})"
         )
-    return ForceOver(_NO_FORCE, words, **{f"over_{over[0]}": bends_of(s, F)})
+    return Force(_NO_FORCE, words, **{f"over_{over[0]}": bends_of(s, F)})
 
 
 _NO_FORCE = Sine(0.0, 0.0)
@@ -219,10 +213,9 @@ def parse_force(text: str) -> Force:
         if pattern.search(rest):
             over[f"over_{letter}"] = ((0.0, line), *bends)
         rest = pattern.sub("", rest)
-    if not over:
-        return Force(_course(words, _FORCES, "load"), words)
-    rest = re.sub(r"^\s*\+|[+]\s*$", "", rest).strip()
-    return ForceOver(_course(rest, _FORCES, "load") if rest else _NO_FORCE, words, **over)
+    if over:
+        rest = re.sub(r"^\s*\+|[+]\s*$", "", rest).strip()
+    return Force(_NO_FORCE if over and not rest else _course(rest, _FORCES, "load"), words, **over)
 
 
 def _spelled(unit: str, units: Mapping[str, float]) -> str:

@@ -20,8 +20,8 @@ import numpy as np
 from sealscope.errors import InputError
 from sealscope.recordings.recording import CHANNEL_UNITS, Array
 from sealscope.simulation.changes import RESOLUTION, SHORTEST_BLOCK, THROTTLES, Effect, Hold, fields_of
-from sealscope.simulation.commands import NUMBER, TIME, UNSIGNED, Command, number_text, plain_text, seconds
-from sealscope.simulation.leaks import WHEN, Between, From, Growing, Opening, Part, opening_of
+from sealscope.simulation.commands import NUMBER, TIME, UNSIGNED, Command, Polyline, number_text, plain_text
+from sealscope.simulation.leaks import WHEN, Part, from_time, opening_of
 from sealscope.units import LITRE_PER_MINUTE, parse_quantity
 
 if TYPE_CHECKING:
@@ -91,12 +91,7 @@ class FaultRow:
         part = match.groupdict()
         at = part.get("at") or ""
         at = at if self.of_sensor else at.upper()
-        if self.when == "grows":
-            opening: Opening = opening_of(part)
-        else:
-            until = math.inf if part["until"] is None else seconds(part["until"])
-            opening = Between(seconds(part["since"]), until, seconds(part.get("ramp")))
-        return Fault(self.name, self._value(part), at, opening, _number(part.get("pace") or "1"))
+        return Fault(self.name, self._value(part), at, opening_of(part), _number(part.get("pace") or "1"))
 
     def _value(self, part: Part) -> float:
         if part.get("size") is not None:
@@ -121,7 +116,7 @@ class Fault:
     name: str
     value: float = 0.0
     at: str = ""
-    opening: Opening = field(default_factory=From)
+    opening: Polyline = field(default_factory=from_time)
     pace: float = 1.0
 
     def __post_init__(self) -> None:
@@ -134,8 +129,8 @@ class Fault:
             raise InputError(f"{row.what} must {row.allowed}, got {self.value:g}")
         if not 0.0 <= self.pace <= sys.float_info.max:
             raise InputError(f"a duty's frequency must change by a factor >= 0, got {self.pace:g}")
-        if self.name == "duty" and not isinstance(self.opening, From | Growing):
-            raise InputError("a duty must change at one time or grow from one to another, got a table")
+        if self.name == "duty" and self.opening.rise is None:
+            raise InputError(f"a duty must change at one time or grow from one to another, got {self.opening}")
 
     @property
     def row(self) -> FaultRow:
@@ -167,7 +162,7 @@ class Fault:
         return tuple(
             Effect(
                 name.format(at=self.at, gain=GAINS.get(self.at)),
-                lambda t: whole + size * self.opening.share(t),
+                lambda t: whole + size * self.opening.at(t),
                 step,
                 added=not row.factor,
                 jumps=self.opening.bends(),
@@ -180,8 +175,8 @@ class Fault:
         """Return the readings that it makes repeat themselves."""
         if self.name != "sensor stuck":
             return ()
-        assert isinstance(self.opening, Between)
-        return (Hold(self.at, self.opening.start, self.opening.stop),)
+        stop = math.inf if self.opening.y[-1] > 0 else float(self.opening.t[-1])
+        return (Hold(self.at, self.onset(), stop),)
 
     def commanded(self, command: Command) -> Command:
         """Return the command that the rig gets instead of `command`."""
@@ -204,7 +199,7 @@ class Fault:
         return ratio
 
     def _warmth(self, rig: Rig, t: Array) -> Array:
-        return np.asarray(rig.fluid.T_oil + self.value * self.opening.share(t))
+        return np.asarray(rig.fluid.T_oil + self.value * self.opening.at(t))
 
     def __str__(self) -> str:
         words = self.row.words
@@ -227,7 +222,7 @@ class ChangedDuty:
 
     def clock(self, t: Array) -> Array:
         """Return the time on the command's own clock: t + (pace - 1) x integral of the opening."""
-        start, stop = (*self.change.opening.bends(), self.change.opening.onset())[:2]
+        start, stop = self.change.opening.rise or (math.inf, math.inf)
         since = np.maximum(t - start, 0.0)
         if stop > start:
             grown = np.minimum(since, stop - start)
@@ -236,7 +231,7 @@ class ChangedDuty:
 
     def volts(self, t: Array) -> Array:
         """Return u [V] at times t [s]."""
-        size = 1.0 + (self.change.value - 1.0) * self.change.opening.share(t)
+        size = 1.0 + (self.change.value - 1.0) * self.change.opening.at(t)
         return np.asarray(size * self.before.volts(self.clock(t)))
 
     def __str__(self) -> str:
@@ -259,7 +254,7 @@ def _shut_off(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
         own = c if before >= 1.0 else behind_shut_off(c, c_line, before)
 
         def change(t: Array) -> Array:
-            s = before + (fault.value - before) * fault.opening.share(t)
+            s = before + (fault.value - before) * fault.opening.at(t)
             return np.asarray(np.where(s >= 1.0, c, behind_shut_off(c, c_line, s)) - own)
 
         return Effect(name, change, 1e-6 * c, added=True, jumps=fault.opening.bends(), shortest=_VALVE_BLOCK)
@@ -300,12 +295,8 @@ FAULTS: Mapping[str, FaultRow] = {
 def parse_fault(text: str) -> Fault | None:
     """Read a fault from text; None for ``none``.
 
-    The forms are ``pump leak x3 from 90 s``, ``pump leak G = 5e-13``, ``rod seal A 0.01 L/min from 90 s`` (flow at the
-    charge pressure), ``friction +20 % growing from 60 s to 120 s``, ``air 1 % from 90 s``, ``sensor p_A offset 2 psi
-    from 90 s``, ``sensor p_A gain -1 %``, ``sensor p_A stuck from 90 s to 100 s``, and ``duty amplitude x1.5 frequency
-    x0.8 from 90 s``. Operations that are no faults: ``shut-off A to 0 % from 60 s to 90 s within 0.5 s``, ``circulation
-    from 60 s to 90 s within 0.5 s``, ``filter A x10 growing from 1 min to 5 min``, ``oil +20 K growing from 0 s to 10
-    min``. Raises InputError that shows the forms when the text is none of them.
+    A rod seal's flow is that at the charge pressure; operations such as `circulation` are no faults. Raises InputError
+    that shows the forms when the text is none of them.
     """
     stripped = plain_text(text, "fault")
     if stripped.lower() in ("none", "no fault"):
@@ -314,8 +305,9 @@ def parse_fault(text: str) -> Fault | None:
         if fault := row.read(stripped):
             return fault
     raise InputError(
-        "fault must be like 'pump leak x3 from 90 s', 'rod seal A 0.01 L/min from 90 s', 'friction +20 % growing from "
-        "60 s to 120 s', 'air 1 % from 90 s', 'sensor p_A offset 2 psi from 90 s', 'sensor p_A gain 1 %', 'sensor p_A "
-        "stuck from 90 s', 'duty amplitude x1.5 from 90 s', 'shut-off A to 0 % from 60 s to 90 s within 0.5 s', "
-        f"'circulation from 60 s', 'filter A x10 from 90 s', 'oil +20 K from 90 s' or 'none', got {text!r}"
+        "fault must be like 'pump leak x3 from 90 s', 'pump leak G = 5e-13', 'rod seal A 0.01 L/min from 90 s', "
+        "'friction +20 % growing from 60 s to 120 s', 'air 1 % from 90 s', 'sensor p_A offset 2 psi from 90 s', "
+        "'sensor p_A gain 1 %', 'sensor p_A stuck from 90 s to 100 s', 'duty amplitude x1.5 frequency x0.8 from 90 s', "
+        "'shut-off A to 0 % from 60 s to 90 s within 0.5 s', 'circulation from 60 s', 'filter A x10 from 90 s', 'oil "
+        f"+20 K from 90 s' or 'none', got {text!r}"
     )

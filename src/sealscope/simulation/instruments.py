@@ -115,7 +115,7 @@ def read_pressure(
     daq: Daq,
     rate: float,
     random: np.random.Generator,
-    of: Callable[[str, float], Array | float] = lambda _, own: own,
+    of: Callable[[str, float], Array | float],
 ) -> Array:
     """Return what one pressure channel reads [Pa].
 

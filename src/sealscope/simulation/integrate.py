@@ -99,7 +99,7 @@ class RunInputs:
         for leak in self._leaks:
             if not leak.coefficient or t.max(initial=-math.inf) < leak.opening.onset():
                 continue
-            more = leak.coefficient * leak.opening.share(t)
+            more = leak.coefficient * leak.opening.at(t)
             G, C = (G + more, C) if leak.law == "laminar" else (G, C + more)
         return G, C
 
@@ -172,11 +172,11 @@ def _unsized(leaks: Sequence[Leak]) -> tuple[Leak, ...]:
     return tuple(leak if leak.mean is None else replace(leak, mean=None, coefficient=0.0) for leak in leaks)
 
 
-def sized_leaks(experiment: Experiment, progress: Callable[[str, float], None] | None = None) -> tuple[Leak, ...]:
+def sized_leaks(experiment: Experiment) -> tuple[Leak, ...]:
     """Return the experiment's leaks with a coefficient each, so that each one's mean is what was asked for."""
     if not any(leak.mean for leak in experiment.leaks):
         return _unsized(experiment.leaks)
-    return sized_run(experiment, progress)[0]
+    return sized_run(experiment)[0]
 
 
 def sized_run(
@@ -243,9 +243,9 @@ def integrate(
     A `step` [s] that is given is taken (the largest that divides the output interval and is not above it); else the
     largest is chosen, from `LONGEST_STEP` down to `FINEST` of it, that passes the check: in short windows spread over
     the run (`windows`) half the step moves no pressure by more than `error` [Pa rms] and no detail's RMS by more than
-    0.1 % (`Judge`). The finest step is taken whatever the check says; `Trajectory.error` is what it found. `error` None
-    leaves the check of a given step out. Inputs may jump at a step's boundary: the step's
-    first and last node are looked up just inside it. `effects` are numbers of the rig that change within the run, held
+    0.1 % (`StepErrorCheck`). The finest step is taken whatever the check says; `Trajectory.error` is what it found.
+    `error` None leaves the check of a given step out. Inputs may jump at a step's boundary: the step's first and last
+    node are looked up just inside it. `effects` are numbers of the rig that change within the run, held
     over short blocks (`Schedule`). `load` acts beside the rig's own, `feedback` gives the command in place of `inputs`.
     `progress` is called with the time reached [s].
 
@@ -278,7 +278,7 @@ def integrate(
     pressures = slice(P_A, P_2 + 1)
     while True:
         run.refuse_unresolved(every)
-        judge = Judge(rig, rate, error or PRESSURE_TOLERANCE)
+        check = StepErrorCheck(rig, rate, error or PRESSURE_TOLERANCE)
         times = 0.0
         rows, y = np.empty((n_out, len(OUTPUTS))), start_state.copy()
         if feedback is not None:
@@ -289,18 +289,18 @@ def integrate(
                 if start <= first and end <= stop:
                     before, fine = rows[first, : len(STATES)].copy(), np.empty((end - first, len(OUTPUTS)))
                     run.advance(before, first, end, 2 * every, fine, first)
-                    times = max(times, judge.beyond(rows[first:end, pressures], fine[:, pressures]))
+                    times = max(times, check.beyond(rows[first:end, pressures], fine[:, pressures]))
             if times > 1.0 and every < finest and step is None:
                 break
         h = 1.0 / (rate * every)
         if times <= 1.0 or every >= finest or (step is not None and allow_unresolved):
             volts = None if feedback is None else feedback.volts(n_out)
             flow = None if feedback is None else feedback.compensated(n_out)
-            moved = judge.moved if checks else math.nan
+            moved = check.moved if checks else math.nan
             return Trajectory(np.arange(n_out) / rate, rows, run.method, h, moved, volts, flow)
         if step is not None:
             raise SimulationFailed(
-                f"the run is under-resolved: halving the step of {h:.3g} s ({run.method}) moves {judge.worst()}; take "
+                f"the run is under-resolved: halving the step of {h:.3g} s ({run.method}) moves {check.worst()}; take "
                 "a smaller step, or state an error instead of a step"
             )
         # of order four, or near it; a step far too long tells little
@@ -422,7 +422,7 @@ def windows(n_out: int, rate: float) -> list[tuple[int, int]]:
     return checked
 
 
-class Judge:
+class StepErrorCheck:
     """Compares windows of a run at one step with those at half of it.
 
     `moved` [Pa rms]: how far a pressure moved at most; `changed`: how far a detail's RMS did, as a share of it.

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from sealscope.errors import InputError, SimulationFailed
-from sealscope.recordings.chambers import CHAMBERS, PRESSURES
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.signals.windows import rms
 from sealscope.simulation.experiment import Experiment
@@ -34,51 +34,28 @@ LINEARITY = 0.02
 _MOST_HALVINGS = 8
 
 
-@dataclass(frozen=True, eq=False)
-class Sensitivity:
-    """A derivative of the channels: `slope` (c, n), in the channels' units for one unit of the parameter.
+def clean_channels(experiment: Experiment, leaks: Sequence[Leak] = ()) -> Array:
+    """Return p_A and p_B (2, n) without noise, at the recording's samples, behind transducers and anti-alias filter.
 
-    `step`: the step h it was taken with; `nonlinearity`: rms(D(h) - D(h/2)) / rms(D), how far the answer is from a
-    straight line over that step.
-    """
-
-    parameter: str
-    channels: tuple[str, ...]
-    slope: Array
-    step: float
-    nonlinearity: float
-
-
-def clean_channels(
-    experiment: Experiment, leaks: Sequence[Leak] = (), channels: Sequence[str] = CHAMBERS, *, step: float | None = None
-) -> Array:
-    """Return the channels (c, n) without noise, at the recording's samples, behind transducers and anti-alias filter.
-
-    `leaks` take the place of the experiment's and have coefficients; `step` [s] of the solver, default its own.
-    Raises SimulationFailed as `sealscope.simulation.simulate.simulate_with_truth` does.
+    `leaks` take the place of the experiment's and have coefficients. Raises SimulationFailed as
+    `sealscope.simulation.simulate.simulate_with_truth` does.
     """
     n = round(experiment.duration * experiment.rate)
-    path = trajectory(experiment, tuple(leaks), step=step)
+    path = trajectory(experiment, tuple(leaks))
     factor, sensors = oversampling(experiment), experiment.rig.sensors
-    behind = [
-        lagging(path[name], getattr(sensors, name).lag, experiment.rate * factor) if name in PRESSURES else path[name]
-        for name in channels
-    ]
+    behind = [lagging(path[name], getattr(sensors, name).lag, experiment.rate * factor) for name in CHAMBERS]
     return np.stack([decimate(values, factor, n) for values in behind])
 
 
-def _settled(name: str, channels: tuple[str, ...], first: float, quotient: Callable[[float], Array]) -> Sensitivity:
-    """Return the derivative at a step over which the answer is a straight line.
-
-    The caller's `quotient` extrapolates both orders of difference.
-    """
+def _settled(name: str, first: float, quotient: Callable[[float], Array]) -> tuple[Array, float]:
+    """Return the quotient at h/2, and the step h, over which the answer is a straight line."""
     step, coarse = first, quotient(first)
     for _ in range(_MOST_HALVINGS):
         fine = quotient(step / 2.0)
         size = rms(fine.ravel())
         nonlinearity = rms((coarse - fine).ravel()) / size if size > 0.0 else 0.0
         if nonlinearity <= LINEARITY:
-            return Sensitivity(name, channels, fine, step, nonlinearity)
+            return fine, step
         step, coarse = step / 2.0, fine
     raise SimulationFailed(
         f"the channels must answer in proportion to a small change of {name}, got {100 * nonlinearity:.2g} % apart "
@@ -86,25 +63,24 @@ def _settled(name: str, channels: tuple[str, ...], first: float, quotient: Calla
     )
 
 
-def leak_sensitivity(experiment: Experiment, channels: Sequence[str] = CHAMBERS) -> Sensitivity:
-    """Return d channel / d G at G = 0 of a laminar leak open over the whole run: (c, n) [Pa per m^3/(s Pa)].
+def leak_sensitivity(experiment: Experiment) -> Array:
+    """Return d channel / d G at G = 0 of a laminar leak open over the whole run: (2, n) [Pa per m^3/(s Pa)].
 
     ``D(h) = (y(h) - y(0)) / h``; returned is ``2 D(h/2) - D(h)``, whose error is O(h^2). h begins at `FIRST_LEAK`
     over `REFERENCE_DP` and is halved until D(h) and D(h/2) are within `LINEARITY`. Leaks of the experiment are left
     out. Raises SimulationFailed where no step is small enough.
     """
-    names = tuple(channels)
-    none = clean_channels(experiment, (), names)
+    none = clean_channels(experiment)
 
     def quotient(h: float) -> Array:
-        return np.asarray((clean_channels(experiment, (Leak("laminar", coefficient=h),), names) - none) / h)
+        return np.asarray((clean_channels(experiment, (Leak("laminar", coefficient=h),)) - none) / h)
 
-    sensitivity = _settled("G", names, FIRST_LEAK / REFERENCE_DP, quotient)
-    return replace(sensitivity, slope=2.0 * sensitivity.slope - quotient(sensitivity.step))
+    fine, step = _settled("G", FIRST_LEAK / REFERENCE_DP, quotient)
+    return np.asarray(2.0 * fine - quotient(step))
 
 
-def parameter_sensitivity(experiment: Experiment, name: str, channels: Sequence[str] = CHAMBERS) -> Sensitivity:
-    """Return d channel / d ln(parameter), no leak: (c, n) [Pa] for pressures; central difference from `FIRST_SHARE` on.
+def parameter_sensitivity(experiment: Experiment, name: str) -> Array:
+    """Return d channel / d ln(parameter), no leak: (2, n) [Pa]; central difference from `FIRST_SHARE` on.
 
     Raises InputError for a parameter that is a choice or zero (its logarithm has no derivative), SimulationFailed
     where no step is small enough.
@@ -112,13 +88,9 @@ def parameter_sensitivity(experiment: Experiment, name: str, channels: Sequence[
     value = experiment.rig[name]
     if isinstance(value, str) or not (math.isfinite(value) and value != 0.0):
         raise InputError(f"a sensitivity needs a parameter whose value is a number other than 0, got {name} = {value}")
-    names = tuple(channels)
 
     def at(share: float) -> Array:
         rig = experiment.rig.with_overrides({name: value * (1.0 + share)}, source="varied for a sensitivity")
-        return clean_channels(replace(experiment, rig=rig), (), names)
+        return clean_channels(replace(experiment, rig=rig))
 
-    def quotient(h: float) -> Array:
-        return np.asarray((at(h) - at(-h)) / (2.0 * h))
-
-    return _settled(name, names, FIRST_SHARE, quotient)
+    return _settled(name, FIRST_SHARE, lambda h: np.asarray((at(h) - at(-h)) / (2.0 * h)))[0]

@@ -24,7 +24,7 @@ def leak_flow(leak: Leak, t: Array, dp: Array, dp_0: float) -> Array:
     """Return |Q_L| [m^3/s] of a leak with a known coefficient under the chambers' pressure difference `dp` [Pa]."""
     from sealscope.physics.leakage import laminar_leakage, leakage_series
 
-    size = (leak.coefficient or 0.0) * leak.opening.share(t)
+    size = (leak.coefficient or 0.0) * leak.opening.at(t)
     if leak.law == "laminar":
         return np.asarray(np.abs(laminar_leakage(dp, size)))  # type: ignore[arg-type]
     return np.asarray(np.abs(leakage_series(np.ascontiguousarray(dp), np.zeros_like(size), size, dp_0)))
@@ -32,7 +32,7 @@ def leak_flow(leak: Leak, t: Array, dp: Array, dp_0: float) -> Array:
 
 def mean_while_open(leak: Leak, t: Array, flow: Array) -> float:
     """Return the mean flow [m^3/s] while open, per unit of opening: the sum of |Q_L| over the sum of the opening."""
-    opening = leak.opening.share(t)
+    opening = leak.opening.at(t)
     total = float(opening.sum())
     return float(flow.sum()) / total if total > 0 else 0.0
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -48,26 +49,45 @@ def _adapter(kind: Any) -> Any:
     return TypeAdapter(kind)
 
 
-def as_type(kind: type[_T], value: Any) -> _T:
-    """Return plain values as the dataclass `kind`; ValueError of one line where a value has no place in it."""
+def as_type(kind: type[_T], value: Any, named: Callable[[str], str] = str) -> _T:
+    """Return plain values as the dataclass `kind`; ValueError of one line where a value has no place in it.
+
+    `named`: name in the error of an entry of `value`.
+    """
     from pydantic import ValidationError
 
     if is_dataclass(kind) and isinstance(value, dict):
         unknown = sorted(map(str, value.keys() - {field.name for field in fields(kind)}))
         if unknown:
-            raise ValueError(f"{unknown[0][:60]}: not known")
+            raise ValueError(f"{named(unknown[0][:60])} is not known")
     try:
         return _adapter(kind).validate_python(value)  # type: ignore[no-any-return, arg-type]
     except ValidationError as error:
-        raise ValueError(one_line(error)) from None
+        raise ValueError(one_line(error, named)) from None
 
 
-def one_line(error: ValidationError, whole: str = "value") -> str:
-    """Return what pydantic says first of values: place (`whole` for all of them), rule and value."""
+_PLAIN_RULES = {
+    "missing": "is missing",
+    "missing_argument": "is missing",
+    "extra_forbidden": "is not known",
+    "unexpected_keyword_argument": "is not known",
+}
+
+
+def one_line(error: ValidationError, named: Callable[[str], str] = str, unit: str = "") -> str:
+    """Return what pydantic says first of values: entry, rule and value, as "ENTRY must be ..., got ...".
+
+    `named`: name of an entry of the whole ("" for this); `unit`: of the rule.
+    """
     first = error.errors(include_url=False)[0]
-    place, rule = ".".join(map(str, first["loc"])) or whole, first["msg"].removeprefix("Value error, ")
-    value = "" if first["type"] in ("value_error", "missing") else f", got {str(first['input'])[:60]!r}"
-    return f"{place}: {rule}{value}"
+    entry, *inner = map(str, first["loc"] or ("",))
+    place = "".join([named(entry), *(f"[{int(part) + 1}]" if part.isdigit() else f".{part}" for part in inner)])
+    if plain_rule := _PLAIN_RULES.get(first["type"]):
+        return f"{place} {plain_rule}"
+    rule = re.sub(r"^\w+ should", "must", first["msg"].removeprefix("Value error, ")).replace("tuple", "list") + unit
+    value = "" if first["type"] == "value_error" else f", got {repr(first['input'])[:60]}"
+    separator = "" if not place else " " if rule.startswith("must ") else ": "
+    return f"{place}{separator}{rule}{value}"
 
 
 def plain(value: Any) -> Any:

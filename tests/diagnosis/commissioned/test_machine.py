@@ -197,8 +197,8 @@ def test_a_file_is_whole_whenever_its_writer_is_killed(machine, folder, tmp_path
 HOSTILE = {
     "format = 1": ("format = 7", "machine.format"),
     'name = "actuator7"': ("name = 7", "machine.name"),
-    "seconds = 20": ("seconds = nan\nlater = 20", "healthy.0.seconds"),
-    'digest = "': ('digest = 3 # "', "healthy.0.digest"),
+    "seconds = 20": ("seconds = nan\nlater = 20", "healthy[1].seconds"),
+    'digest = "': ('digest = 3 # "', "healthy[1].digest"),
     "\npressure = ": ("\npressure = inf # ", "pressure"),
     "sums = [[[": ("sums = [[[[", "must be TOML"),
     'terms = ["': ('terms = ["x", "', "sums must be of the shape"),

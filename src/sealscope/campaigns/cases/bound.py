@@ -19,7 +19,7 @@ from sealscope.evaluation.checks import share
 from sealscope.parameters import Rig
 from sealscope.recordings.chambers import CHAMBERS, PRESSURES
 from sealscope.recordings.recording import Array
-from sealscope.simulation.commands import Recorded
+from sealscope.simulation.commands import recorded
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.integrate import trajectory
 from sealscope.simulation.sensitivity import REFERENCE_DP, leak_sensitivity, parameter_sensitivity
@@ -110,7 +110,7 @@ def leak_bound(experiment: Experiment, unknown: Sequence[str] = (), covariance: 
     """
     R = noise_covariance(experiment.rig) if covariance is None else covariance
     sensitivities = [leak_sensitivity(experiment), *(parameter_sensitivity(experiment, name) for name in unknown)]
-    fisher = information(np.stack([sensitivity.slope for sensitivity in sensitivities]), R)
+    fisher = information(np.stack(sensitivities), R)
     return math.sqrt(cramer_rao(fisher)[0, 0])
 
 
@@ -141,7 +141,7 @@ def _opened(run: Experiment) -> Experiment:
         return run
     path = trajectory(run, ())
     assert path.volts is not None
-    return replace(run, command=Recorded(path.t, path.volts, str(run.command)), controller=None)
+    return replace(run, command=recorded(path.t, path.volts, str(run.command)), controller=None)
 
 
 def smallest_detectable(deviation: float, false_alarm: float, detection: float = 0.9) -> float:

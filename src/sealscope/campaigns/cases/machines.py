@@ -17,7 +17,7 @@ from sealscope.simulation.commands import Sine
 from sealscope.simulation.courses import command_or_target, parse_force
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.integrate import sized_leaks
-from sealscope.simulation.leaks import From, Leak
+from sealscope.simulation.leaks import Leak, from_time
 from sealscope.units import LITRE_PER_MINUTE
 
 #: Length [s] of the run that sizes a leak on its machine; two periods of the slowest of the thesis's commands.
@@ -30,7 +30,7 @@ def leak_of(plan: SimulatedPlan, case: CampaignCase) -> tuple[Leak, ...]:
         return ()
     laws: tuple[Any, ...] = ("laminar", "orifice") if case.law == "mixture" else (case.law,)
     mean = case.leak_lpm * LITRE_PER_MINUTE / len(laws)
-    return tuple(Leak(law, mean=mean, opening=From(plan.onset_s)) for law in laws)
+    return tuple(Leak(law, mean=mean, opening=from_time(plan.onset_s)) for law in laws)
 
 
 def unsized(plan: SimulatedPlan, case: CampaignCase, profile: Profile | None = None) -> Experiment:
@@ -79,7 +79,7 @@ def sizing_run(experiment: Experiment) -> Experiment:
     return replace(
         experiment,
         duration=min(experiment.duration, SIZING_SECONDS),
-        leaks=tuple(replace(leak, opening=From(0.0)) for leak in experiment.leaks),
+        leaks=tuple(replace(leak, opening=from_time(0.0)) for leak in experiment.leaks),
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -121,20 +120,15 @@ def _part(
 
     `second`: another table, and which of the entries stand there.
     """
+
+    def named(field: str) -> str:
+        entry = _ENTRIES.get(field, field)
+        return f"{second[0] if entry in second[1] else name}.{entry}" if entry else name
+
     try:
-        return as_type(kind, {_FIELDS.get(entry, entry): value for entry, value in entries.items()})
+        return as_type(kind, {_FIELDS.get(entry, entry): value for entry, value in entries.items()}, named)
     except ValueError as error:
-        field, _, rule = str(error).partition(": ")
-        entry, *inner = field.split(".")
-        rule = re.sub(r"^\w+ should", "must", rule.removeprefix("Value error, "))
-        if rule == "not known" or rule.startswith("Field required"):
-            rule = "is not known" if rule == "not known" else "is missing"
-        if rule.count(", got ") > 1:
-            rule = rule.rpartition(", got ")[0]
-        entry = _ENTRIES.get(entry, entry)
-        table = second[0] if entry in second[1] else name
-        where = ".".join([table, *([] if entry == "value" else [entry]), *inner])
-        raise InputError(f"{where}{' ' if rule.startswith(('must', 'is ')) else ': '}{rule} ({place})") from None
+        raise InputError(f"{error} ({place})") from None
 
 
 def _beside(name: Any, place: str) -> Any:

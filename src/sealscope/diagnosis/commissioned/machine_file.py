@@ -274,7 +274,7 @@ def load_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
         check_call(columns, head.get("rate"))
         RepairLimit.of(head.get("limit"))
     except ValueError as error:
-        raise InputError(f"{str(error).replace(': Input should be', ' must be')} ({place})") from None
+        raise InputError(f"{error} ({place})") from None
     return CommissionedMachine(
         name=head["name"],
         healthy=tuple(Learnt(**{"start_s": None, **row}) for row in stated["healthy"]),

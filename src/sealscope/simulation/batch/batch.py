@@ -109,11 +109,6 @@ def _place(name: str, names: tuple[str, ...], what: str) -> int:
     return names.index(name)
 
 
-def halves(experiment: Experiment) -> Array:
-    """Bounds [s] of the two halves of a record."""
-    return np.array([0.0, 0.5, 1.0]) * experiment.duration
-
-
 @checked_call
 def simulate_batch(
     experiments: Iterable[Experiment],
@@ -170,7 +165,7 @@ def simulate_batch(
             raise InputError(f"a batch must have experiments (Experiment.of(...) makes one), got {experiment!r}")
     sets = sets_of(experiments)
     first = experiments[0]
-    edges = np.asarray(halves(first) if bounds is None else bounds, dtype=np.float64)
+    edges = np.array([0.0, 0.5, 1.0]) * first.duration if bounds is None else np.asarray(bounds, dtype=np.float64)
     inside = edges.ndim == 1 and edges.size >= 2 and np.all(np.isfinite(edges)) and np.all(np.diff(edges) > 0)
     if not (inside and edges[0] >= 0 and edges[-1] <= first.duration):
         raise InputError(f"bounds must rise within 0 .. {first.duration:g} s, got {edges.tolist()}")

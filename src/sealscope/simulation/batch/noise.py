@@ -17,10 +17,10 @@ from numba import types
 from sealscope.compiled import contracted
 from sealscope.physics.lanes import LANES, WIDTH, lowered, select
 from sealscope.recordings.recording import Array
+from sealscope.simulation.commands import GOLDEN, MIX
 
 _WORDS, _DOUBLES = ir.VectorType(ir.IntType(64), WIDTH), ir.VectorType(ir.DoubleType(), WIDTH)
 _ONE_BITS, _MANTISSA = 0x3FF0000000000000, 0x000FFFFFFFFFFFFF
-_GOLDEN, _MIX = 0x9E3779B97F4A7C15, ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB))
 
 
 def _constant(value: int) -> Any:
@@ -40,11 +40,11 @@ def uniform(key: Any, place: int) -> Any:
 def _uniform(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
     word = ir.IntType(64)
     step = context.cast(builder, values[1], kinds[1], types.int64)
-    step = builder.mul(builder.add(step, ir.Constant(word, 1)), ir.Constant(word, _GOLDEN))
+    step = builder.mul(builder.add(step, ir.Constant(word, 1)), ir.Constant(word, GOLDEN))
     lane = builder.insert_element(ir.Constant(_WORDS, ir.Undefined), step, ir.Constant(ir.IntType(32), 0))
     step = builder.shuffle_vector(lane, lane, ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH))
     z = builder.add(builder.bitcast(values[0], _WORDS), step)
-    for shift, factor in _MIX:
+    for shift, factor in MIX:
         z = builder.mul(builder.xor(z, builder.lshr(z, _constant(shift))), _constant(factor))
     z = builder.xor(z, builder.lshr(z, _constant(31)))
     bits = builder.or_(builder.lshr(z, _constant(12)), _constant(_ONE_BITS))

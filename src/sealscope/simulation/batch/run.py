@@ -15,17 +15,7 @@ import numpy as np
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
-from sealscope.simulation.changes import (
-    LONGEST_BLOCK,
-    SHORTEST_BLOCK,
-    Effect,
-    Readings,
-    extremes,
-    jumps_of,
-    moved_per_block,
-    refined,
-    values_of,
-)
+from sealscope.simulation.changes import Effect, Readings, blocks_of, extremes, values_of
 from sealscope.simulation.commands import Command, Sine
 from sealscope.simulation.courses import numbers_under, state_under
 from sealscope.simulation.experiment import Experiment, choose_method, exact
@@ -37,7 +27,7 @@ from sealscope.simulation.integrate import (
     refuse_unresolved,
     steps_per_output,
 )
-from sealscope.simulation.leaks import From, Growing, Leak
+from sealscope.simulation.leaks import Leak
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -94,7 +84,7 @@ def refuse(experiment: Experiment, place: int) -> None:
         missing.append(f"a command, got a target for a controller ({experiment.command})")
     if len(leaks) > 1:
         missing.append(f"at most one leak, got {len(leaks)}")
-    if leaks and not isinstance(leaks[0].opening, From | Growing):
+    if leaks and leaks[0].opening.rise is None:
         missing.append(f"a leak that opens abruptly or evenly, got {leaks[0].opening}")
     if rig.motor.integrator == "euler":
         missing.append("motor.integrator = state, got euler")
@@ -103,9 +93,7 @@ def refuse(experiment: Experiment, place: int) -> None:
     if leaks and experiment.thins:
         missing.append("no leak while the oil's temperature changes")
     absent = ["daq.jitter"]
-    absent += [
-        f"sensors.{name}.{own}" for name in CHAMBERS for own in ("stuck_rate", "drop_rate", "lag", "hum_harmonics")
-    ]
+    absent += [f"sensors.{name}.{own}" for name in CHAMBERS for own in _ABSENT]
     missing += [f"{name} = 0, got {rig[name]}" for name in absent if rig[name] != 0]
     if missing:
         raise InputError(f"a run of a batch must have {missing[0]} (run {place}); simulate it by itself")
@@ -175,11 +163,8 @@ def leak_rows(members: Sequence[Member], sizes: Array, measured: Array) -> Array
     for member, size, accounted in zip(members, sizes, measured, strict=True):
         leak = member.leak
         laminar = leak.law == "laminar"
-        opening = leak.opening
-        if isinstance(opening, Growing):
-            when = (opening.start, 1.0 / (opening.stop - opening.start))
-        else:
-            when = (opening.onset(), ABRUPT)
+        start, stop = leak.opening.rise or (0.0, 0.0)
+        when = start, (1.0 / (stop - start) if stop > start else ABRUPT)
         laws = (size, 0.0, accounted, 0.0) if laminar else (0.0, size, 0.0, accounted)
         rows.append([laws[0], laws[1], *when, laws[2], laws[3]])
     return np.array(rows)
@@ -206,26 +191,14 @@ class Cells:
 
 
 def cells_of(members: Sequence[Member], n_out: int, rate: float) -> Cells:
-    """Cells for a set at `rate` [Hz] of outputs.
-
-    0.5 s long, or so short (down to 0.05 s) that no effect moves by more than its resolution; a jump begins a cell.
-    While a valve moves, a cell is as short as an output.
-    """
+    """Cells for a set at `rate` [Hz] of outputs: the blocks of all effects of its members (`changes.blocks_of`)."""
     from sealscope.physics.rig import NUMBERS
 
     numbers = {id(member.numbers): member.numbers for member in members}
     rows = {key: [float(getattr(own, name)) for name in NUMBERS] for key, own in numbers.items()}
     base = np.array([rows[id(member.numbers)] for member in members])
     effects = [effect for member in members for effect in member.effects]
-    if not effects:
-        return Cells(np.array([0, n_out]), base, (), np.empty((len(members), 0, 1)))
-    coarse = np.arange(0, n_out + 1, max(1, round(LONGEST_BLOCK * rate)))
-    slow = [effect for effect in effects if effect.shortest >= SHORTEST_BLOCK]
-    parts = max((float(moved_per_block(effect, coarse, rate).max(initial=1.0)) for effect in slow), default=1.0)
-    length = max(LONGEST_BLOCK / parts, SHORTEST_BLOCK)
-    grid = np.arange(0, n_out, max(1, round(length * rate)))
-    bounds = np.unique(np.r_[grid, n_out, jumps_of(effects, n_out, rate)])
-    bounds = refined(bounds, [effect for effect in effects if effect.shortest < SHORTEST_BLOCK], rate)
+    bounds = blocks_of(effects, n_out, rate)
     middles = 0.5 * (bounds[:-1] + bounds[1:]) / rate
     fields = tuple(sorted({NUMBERS.index(effect.field) for effect in effects}))
     values = np.repeat(base[:, list(fields), None], middles.size, axis=2)

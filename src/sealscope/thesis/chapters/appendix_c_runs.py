@@ -21,7 +21,7 @@ from sealscope.signals.filters import reach
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.instruments import record
 from sealscope.simulation.integrate import Trajectory, oversampling, sized_leaks, trajectory
-from sealscope.simulation.leaks import From
+from sealscope.simulation.leaks import from_time
 from sealscope.simulation.simulate import prove, simulate_with_truth
 from sealscope.thesis.engine.context import Context, first_table
 from sealscope.thesis.engine.items import Item
@@ -135,7 +135,7 @@ def with_leak(half: float, quick: bool) -> Iterator[Simulated]:
     for condition in APPENDIX_C:
         leak = f"{condition.mean_leak_lpm:g} L/min from {SETTLING:g} s"
         sized = sized_leaks(_experiment(condition, SETTLING + _SIZING, leak))
-        leaks = tuple(replace(leak, opening=From(half)) for leak in sized)
+        leaks = tuple(replace(leak, opening=from_time(half)) for leak in sized)
         experiment = replace(_experiment(condition, 2 * half, seed=condition.number), leaks=leaks)
         simulated = simulate_with_truth(experiment)
         resolved = None
