@@ -23,6 +23,8 @@ from numpy.typing import ArrayLike
 from sealscope.errors import InputError
 from sealscope.signals.filters import Array, IntArray, checked_levels, discrete_wavelet, finite_array, reach
 
+#: What is measured of a chamber's pressure: its details to level 4, and the sample product of the third and the fourth.
+QUANTITIES = ("d1", "d2", "d3", "d4", "d3d4")
 Transform = Literal["stationary", "decimated", "reconstructed"]
 Edge = Literal["symmetric", "periodic", "reflect", "constant", "zero", "smooth", "antisymmetric", "antireflect"]
 
@@ -65,6 +67,10 @@ class Details:
     def product(self, first: int = 3, second: int = 4) -> Array:
         """Return the sample product d_first * d_second, (n,) [unit^2], edges included; the thesis's d3d4 by default."""
         return self[first] * self[second]
+
+    def quantities(self) -> Array:
+        """Return d1..d4 [unit] and d3d4 [unit^2] of details to level 4, (5, n), edges included (`QUANTITIES`)."""
+        return np.vstack([self.values, self.product()])
 
     def inside(self, *levels: int) -> slice:
         """Return the samples at which none of the named levels (default: all of them) touches the padding."""
@@ -129,6 +135,19 @@ def details(
     compute = {"stationary": _stationary, "decimated": _decimated, "reconstructed": _reconstructed}[transform]
     values, approximation = compute(x, discrete_wavelet(wavelet), levels, edge)
     return Details(values, approximation, edge_samples(wavelet, levels, transform), wavelet, transform, edge)
+
+
+def mean_squares(transformed: Details, bounds: ArrayLike) -> Array:
+    """Return the mean squares of the `QUANTITIES` between consecutive samples `bounds`, (len(bounds) - 1, 5)."""
+    return segment_means(np.square(transformed.quantities()), bounds).T
+
+
+def segment_means(values: Array, bounds: ArrayLike) -> Array:
+    """Return the means of rows (r, n) between consecutive samples `bounds`, (r, len(bounds) - 1)."""
+    at = np.asarray(bounds)
+    sums = np.add.reduceat(values, at[:-1], axis=1)
+    sums[:, -1] = values[:, at[-2] : at[-1]].sum(axis=1)
+    return np.asarray(sums / np.diff(at))
 
 
 def _one_of(value: object, choices: Any, name: str) -> None:

@@ -11,15 +11,22 @@ from numpy.typing import NDArray
 
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
+from sealscope.signals.details import QUANTITIES
 from sealscope.signals.filters import reach
 from sealscope.signals.windows import WINDOW_SIZE, rms, windowed_rms
 from sealscope.simulation.experiment import Experiment
-from sealscope.thesis.chapters.appendix_c_runs import SETTLING, detail_rms, detail_series, pressure_range
+from sealscope.thesis.chapters.appendix_c_runs import (
+    SETTLING,
+    detail_rms,
+    detail_series,
+    leak_test,
+    pressure_range,
+)
 from sealscope.thesis.engine.context import Context, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Figure, FigureCurve, Number, Panel, Role
 from sealscope.thesis.engine.texts import note, texts_of
-from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, QUANTITIES, UNITS, Condition, experiment_values
+from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, UNITS, Condition
 from sealscope.units import LITRE_PER_MINUTE
 
 Mask = NDArray[np.bool_]
@@ -77,15 +84,7 @@ TESTS: dict[str, ShownTest] = {row[0]: ShownTest(*row) for row in texts_of("case
 
 def spec_of(test: ShownTest) -> Experiment:
     """Return the run of a test: its command and throttles on the identified rig, its mean leak from half time."""
-    condition = test.condition
-    return Experiment.of(
-        command=condition.command,
-        duration=2 * test.half,
-        leak=f"{condition.mean_leak_lpm:g} L/min from {test.half:g} s",
-        rig=BENCH_RIG,
-        set=experiment_values(condition),
-        seed=condition.number,
-    )
+    return leak_test(test.condition, test.half)
 
 
 @dataclass(frozen=True, eq=False)
