@@ -19,7 +19,6 @@ from sealscope.thesis.chapters.chapter5 import (
     ShownTest,
     best_step,
     figure,
-    mean_slope,
     measure_test,
     spec_of,
     windowed,
@@ -226,12 +225,6 @@ def test_a_part_sees_nothing_outside_of_itself() -> None:
     assert {c: {q: pytest.approx(rms) for q, rms in of.items()} for c, of in quiet.items()} == beside
     wider = detail_rms(noise(loud), ((9.6, 30.0),))
     assert wider["p_A"]["d1"][0] > 2 * beside["p_A"]["d1"][0]
-
-
-def test_the_mean_slope_is_that_beside_the_sine() -> None:
-    t = np.arange(0, 33.3, 0.01)
-    y = 0.7 + 0.02 * t + 3.0 * np.sin(2 * t + 0.4)
-    assert mean_slope(t, y, 2.0) == pytest.approx(0.02, abs=1e-10)
 
 
 @pytest.mark.parametrize(("command", "omega"), [("3 sin(4t)", 4.0), ("8 sin(t)", 1.0)])

@@ -12,11 +12,13 @@ import numpy as np
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.errors import InputError
 from sealscope.recordings.recording import COUNTS, Array, Recording
-from sealscope.reporting.features import NAMES, PRODUCT, ChamberDetails
+from sealscope.reporting.features import ChamberDetails
 from sealscope.reporting.picture import Scale
 from sealscope.reporting.series import DrawnTimes, coded, coded_times, ordered_time, time_base
+from sealscope.signals.details import QUANTITIES
 from sealscope.units import to_si
 
+PRODUCT = QUANTITIES[-1]
 SAMPLES = "samples"
 #: points of a series drawn by the script, and in the still picture
 POINTS, STILL_POINTS = 16_000, 800
@@ -141,7 +143,10 @@ _CHANNELS = (
 def rms_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
     """Return the charts of the windowed RMS: d1..d4 of each chamber, then d3d4 of each."""
     charts = []
-    for names, of, key, height in ((NAMES[:-1], "the details", "", 230), ((PRODUCT,), label_of(PRODUCT), "-d3d4", 150)):
+    for names, of, key, height in (
+        (QUANTITIES[:-1], "the details", "", 230),
+        ((PRODUCT,), label_of(PRODUCT), "-d3d4", 150),
+    ):
         for chamber in chambers:
             if not chamber.window_t.size:
                 continue
@@ -193,7 +198,7 @@ def _limits(values: Array, low: Array, high: Array) -> tuple[float, float]:
 def detail_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
     """Return the charts of the details themselves, one each, the chambers side by side."""
     charts = []
-    for d in NAMES:
+    for d in QUANTITIES:
         for chamber in chambers:
             unit, size = detail_unit(chamber.unit, d, pressure_unit)
             style = "b" if chamber.channel == "p_B" else "a"

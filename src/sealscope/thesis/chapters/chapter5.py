@@ -27,6 +27,7 @@ from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Figure, FigureCurve, Number, Panel, Role
 from sealscope.thesis.engine.texts import note, texts_of
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, UNITS, Condition
+from sealscope.thesis.sines import sine_fit
 from sealscope.units import LITRE_PER_MINUTE
 
 Mask = NDArray[np.bool_]
@@ -89,11 +90,12 @@ def spec_of(test: ShownTest) -> Experiment:
 
 @dataclass(frozen=True, eq=False)
 class FigureView:
-    """The panels and numbers of one view of a test, from its run over a stretch of time [s]."""
+    """The panels and numbers of a test over a stretch of time [s], those of details of one chamber."""
 
     run: SimulatedRun
     test: ShownTest
     span: tuple[float, float]
+    chamber: str
 
     @property
     def recording(self) -> Recording:
@@ -128,7 +130,7 @@ class FigureView:
         t, half = self.recording.t, self.test.half
         return ((t >= SETTLING) & (t < half), _WHEN[0]), (t >= half, _WHEN[1])
 
-    def inputs(self, chamber: str) -> Drawn:
+    def inputs(self) -> Drawn:
         """Draw command, motor speed and displacement."""
         recording = self.recording
         rpm, x = recording["omega"] / _RPM, recording["x"] * 1e3
@@ -140,11 +142,11 @@ class FigureView:
         numbers = []
         for part, when in self._halves():
             speed = float(np.sqrt(np.mean(rpm[part] ** 2)))
-            drift = mean_slope(recording.t[part], x[part], self.test.omega)
+            drift = sine_fit(recording.t[part], x[part], self.test.omega).slope
             numbers += [Number(f"RMS of speed {when}", speed, "rpm"), Number(f"drift of x {when}", drift, "mm/s")]
         return panels, numbers
 
-    def leak(self, chamber: str) -> Drawn:
+    def leak(self) -> Drawn:
         """Draw leak flow and chamber pressures."""
         recording = self.recording
         flow = self._curve(recording["q_leak"] / LITRE_PER_MINUTE, "flow meter, A to B positive", "leak")
@@ -161,25 +163,25 @@ class FigureView:
                 numbers.append(Number(f"5 to 95 % range of {c} {when}", float(high - low), "MPa"))
         return panels, numbers
 
-    def details(self, chamber: str) -> Drawn:
-        """Draw d1 to d4 and d3d4 of a chamber's pressure."""
-        series = detail_series(self.recording, chamber)
+    def details(self) -> Drawn:
+        """Draw d1 to d4 and d3d4 of the chamber's pressure."""
+        series = detail_series(self.recording, self.chamber)
         panels = [self._panel(f"{name} [{UNITS[name]}]", *self._split(values)) for name, values in series.items()]
-        return panels, self._changes(chamber, QUANTITIES)
+        return panels, self._changes(QUANTITIES)
 
-    def windowed_rms(self, chamber: str) -> Drawn:
+    def windowed_rms(self) -> Drawn:
         """Draw the windowed RMS of d3, d4 and d3d4 of a chamber's pressure, and the RMS of each part."""
-        t, curves = windowed(self.recording, chamber)
-        rms = detail_rms(self.recording, self.test.parts)[chamber]
+        t, curves = windowed(self.recording, self.chamber)
+        rms = detail_rms(self.recording, self.test.parts)[self.chamber]
         panels = []
         for name, values in curves.items():
             levels = FigureCurve(np.ravel(self.test.parts), np.repeat(rms[name], 2), "RMS of each part", "reference")
             panels.append(self._panel(f"RMS of {name} [{UNITS[name]}]", *self._split(values, t), levels))
-        return panels, self._changes(chamber, _WINDOWED)
+        return panels, self._changes(_WINDOWED)
 
-    def _changes(self, chamber: str, names: tuple[str, ...]) -> list[Number]:
+    def _changes(self, names: tuple[str, ...]) -> list[Number]:
         numbers = []
-        for name, (before, after) in detail_rms(self.recording, self.test.parts)[chamber].items():
+        for name, (before, after) in detail_rms(self.recording, self.test.parts)[self.chamber].items():
             if name in names:
                 rms = zip(_WHEN, (before, after), strict=True)
                 numbers += [Number(f"RMS of {name} {when}", value, UNITS[name]) for when, value in rms]
@@ -188,7 +190,7 @@ class FigureView:
 
 
 #: View -> what it shows, and what draws it.
-_VIEWS: dict[str, tuple[str, Callable[[FigureView, str], Drawn]]] = {
+_VIEWS: dict[str, tuple[str, Callable[[FigureView], Drawn]]] = {
     "input": ("command, motor speed and piston displacement", FigureView.inputs),
     "leak": ("leak flow and chamber pressures", FigureView.leak),
     "details": ("wavelet details d1 to d4 and d3d4", FigureView.details),
@@ -213,17 +215,10 @@ def views() -> Iterator[tuple[str, str, dict[str, object]]]:
 
 def figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw one of Figs. 5.1 to 5.89, by the item's test, view, chamber and stretch of time."""
-    test = TESTS[item.inputs["test"]]
-    view = FigureView(context.run(spec_of(test)), test, (item.inputs["from_s"], item.inputs["to_s"]))
-    panels, numbers = _VIEWS[item.inputs["view"]][1](view, item.inputs["chamber"])
+    test, span = TESTS[item.inputs["test"]], (item.inputs["from_s"], item.inputs["to_s"])
+    view = FigureView(context.run(spec_of(test)), test, span, item.inputs["chamber"])
+    panels, numbers = _VIEWS[item.inputs["view"]][1](view)
     return (item.figure(panels, numbers, view.run.resolved, view.notes()),)
-
-
-def mean_slope(t: Array, y: Array, omega: float) -> float:
-    """Return the slope of `y` over `t` beside a sine of `omega` [rad/s], by least squares on 1, t, sin and cos."""
-    t_0 = t - t.mean()
-    basis = np.column_stack([np.ones_like(t), t_0, np.sin(omega * t), np.cos(omega * t)])
-    return float(np.linalg.lstsq(basis, y, rcond=None)[0][1])
 
 
 def windowed(recording: Recording, chamber: str) -> tuple[Array, dict[str, Array]]:
@@ -286,7 +281,7 @@ def measure_test(context: Context, test: ShownTest, leak: bool = True) -> ShownM
         centres, curves = windowed(recording, chamber)
         settled = centres >= SETTLING
         steps[chamber] = best_step(centres[settled], curves["d3"][settled])
-    before, after = (mean_slope(t[part], run.outputs["x"][part], test.omega) * 1e3 for part in parts)
+    before, after = (sine_fit(t[part], run.outputs["x"][part], test.omega).slope * 1e3 for part in parts)
     return ShownMeasures(
         test=test,
         rms=detail_rms(recording, test.parts),
