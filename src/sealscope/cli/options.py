@@ -15,12 +15,12 @@ from functools import partial, wraps
 from inspect import Parameter
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from textwrap import fill
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from typer import Argument, Context, Option, echo
 
 from sealscope.errors import InputError, SealscopeError, UnreadableFile
+from sealscope.paragraphs import paragraph, printable
 from sealscope.simulation.arguments import Arguments
 
 if TYPE_CHECKING:
@@ -333,11 +333,6 @@ def verbose(context: Context) -> bool:
     return bool(context.find_root().params.get("verbose"))
 
 
-def printable(text: str, kept: str = "") -> str:
-    """Return a text without what a terminal would obey, whatever a file's name or header brought; `kept` stays."""
-    return "".join(c if c.isprintable() or c in kept else "\N{REPLACEMENT CHARACTER}" for c in text)
-
-
 def say(text: str) -> None:
     """Print lines on standard output."""
     echo(printable(text, "\n"))
@@ -345,8 +340,7 @@ def say(text: str) -> None:
 
 def say_wrapped(text: str, head: str = "") -> None:
     """Print a paragraph on standard output, beside `head`; its lines are as wide as words allow, 80 columns."""
-    indent = " " * (len(head) or 2)
-    say(fill(text, 80, initial_indent=head, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False))
+    say(paragraph(text, head, len(head) or 2))
 
 
 def complain(message: object) -> None:

@@ -21,7 +21,7 @@ SYMBOLS = {
 _LEAST = 2.0
 
 
-class Shape(NamedTuple):
+class SvgPath(NamedTuple):
     """A part of a picture: its style's name in the style sheet, its path, and what it says where it is pointed at."""
 
     style: str
@@ -29,7 +29,7 @@ class Shape(NamedTuple):
     title: str = ""
 
 
-class Label(NamedTuple):
+class SvgText(NamedTuple):
     """A text at a place of the picture; `turned`: it reads upwards."""
 
     x: float
@@ -53,8 +53,8 @@ class Picture:
     y_ends: tuple[float, float]
     log: bool = False
     margins: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    shapes: list[Shape] = field(default_factory=list)
-    labels: list[Label] = field(default_factory=list)
+    shapes: list[SvgPath] = field(default_factory=list)
+    labels: list[SvgText] = field(default_factory=list)
 
     @property
     def view_box(self) -> str:
@@ -80,7 +80,7 @@ class Picture:
 
     def draw(self, style: str, path: str, title: str = "") -> None:
         """Draw a path in units of the picture."""
-        self.shapes.append(Shape(style, path, title))
+        self.shapes.append(SvgPath(style, path, title))
 
     def frame(self) -> None:
         """Draw the frame."""
@@ -131,11 +131,11 @@ class Picture:
         """Draw and label about so many lines over the whole width."""
         for value in ticks(*self.y_ends, about):
             self.level("grid", value)
-            self.labels.append(Label(-6.0, float(self.y(value)) + 4.0, f"{value:g}", "end"))
+            self.labels.append(SvgText(-6.0, float(self.y(value)) + 4.0, f"{value:g}", "end"))
 
     def x_label(self, x: float, text: str, anchor: str = "middle") -> None:
         """Write a text under the frame."""
-        self.labels.append(Label(float(self.x(x)), self.height + 16.0, text, anchor))
+        self.labels.append(SvgText(float(self.x(x)), self.height + 16.0, text, anchor))
 
 
 def ticks(low: float, high: float, about: int) -> list[float]:

@@ -18,11 +18,12 @@ from sealscope.campaigns.plans.model import HeldOutPlan, RecordedPlan, Simulated
 from sealscope.campaigns.results import CampaignResult
 from sealscope.diagnosis.registry import detectors
 from sealscope.evaluation.roc import Area
+from sealscope.paragraphs import paragraph
 from sealscope.recordings.channels import Array
 from sealscope.reporting import template
 from sealscope.reporting.campaign.tables import cause_tables, page_tables, percent
 from sealscope.reporting.messages import say
-from sealscope.reporting.picture import Label, Picture, log_ticks, ticks
+from sealscope.reporting.picture import Picture, SvgText, log_ticks, ticks
 
 PAGE = "report.html"
 #: More sizes than this are shown together: a column for each could not be read.
@@ -116,7 +117,7 @@ def campaign_text(result: CampaignResult) -> str:
     for first, *others in (heads, *rows):
         right = (text.rjust(width) for text, width in zip(others, widths[1:], strict=True))
         lines.append("  ".join([first.ljust(widths[0]), *right]).rstrip())
-    return "\n".join([result.plan.title, *lines, *_notes(result)])
+    return "\n".join([result.plan.title, *lines, *(paragraph(note) for note in _notes(result))])
 
 
 def _notes(result: CampaignResult) -> list[str]:
@@ -302,7 +303,7 @@ def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:
         picture.point("point", at.size, own.value, (own.high, own.low))
     for k, (size, label) in enumerate(marks, 1):
         picture.mark("mark", size)
-        picture.labels.append(Label(float(picture.x(size)) - 4.0, 14.0 * k, label, "end"))
+        picture.labels.append(SvgText(float(picture.x(size)) - 4.0, 14.0 * k, label, "end"))
     return {"title": f"Detection over leak size, {pod.detector}", "picture": picture}
 
 
@@ -337,5 +338,5 @@ def _draw_curves(
     picture.frame()
     for k, (label, x, y) in enumerate(thinned):
         picture.line(f"path s{k % 6}", x, y, label, digits=2)
-    picture.labels.append(Label(WIDTH / 2, HEIGHT + 32.0, x_label))
-    picture.labels.append(Label(-34.0, HEIGHT / 2, "detected", turned=True))
+    picture.labels.append(SvgText(WIDTH / 2, HEIGHT + 32.0, x_label))
+    picture.labels.append(SvgText(-34.0, HEIGHT / 2, "detected", turned=True))
