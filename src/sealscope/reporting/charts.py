@@ -305,10 +305,9 @@ def still_chart(
     lines = [np.clip(line, low, high) for line in lines]
     ends = (span[0], span[1] if span[1] > span[0] else span[0] + 1)
     picture = Picture(860.0, float(chart.height), ends, (low, high), margins=(0.0, 0.0, 0.0, 20.0))
-    picture.y_grid(4)
+    picture.frame(4)
     for value in ticks(*ends, 8):
-        picture.x_label(value, f"{value:g} s")
-    picture.frame()
+        picture.below(value, f"{value:g} s")
     for style, begin, end in moments:
         if end is None:
             picture.mark(style, begin)

@@ -82,10 +82,6 @@ class Picture:
         """Draw a path in units of the picture."""
         self.shapes.append(SvgPath(style, path, title))
 
-    def frame(self) -> None:
-        """Draw the frame."""
-        self.draw("frame", f"M0 0H{self.width:g}V{self.height:g}H0z")
-
     def line(self, style: str, x: Array, y: Array, title: str = "", digits: int = 1) -> None:
         """Draw the line through points (n,), broken where y is missing; places with so many decimals."""
         self.draw(style, self._path(x, y, digits), title)
@@ -127,13 +123,14 @@ class Picture:
         self.draw("whisker", f"M{self.x(x):.1f} {self.y(ends[0]):.1f}V{self.y(ends[1]):.1f}")
         self.symbol(style, x, float(self.y(y)), title)
 
-    def y_grid(self, about: int) -> None:
-        """Draw and label about so many lines over the whole width."""
+    def frame(self, about: int) -> None:
+        """Draw the frame, and about so many levels with their values."""
         for value in ticks(*self.y_ends, about):
             self.level("grid", value)
             self.labels.append(SvgText(-6.0, float(self.y(value)) + 4.0, f"{value:g}", "end"))
+        self.draw("frame", f"M0 0H{self.width:g}V{self.height:g}H0z")
 
-    def x_label(self, x: float, text: str, anchor: str = "middle") -> None:
+    def below(self, x: float, text: str, anchor: str = "middle") -> None:
         """Write a text under the frame."""
         self.labels.append(SvgText(float(self.x(x)), self.height + 16.0, text, anchor))
 

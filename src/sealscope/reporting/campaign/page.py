@@ -331,11 +331,10 @@ def _draw_curves(
         thinned.append((label, x[kept], y[kept]))
         if ends is not None:
             picture.area("band", x[kept], ends[0][kept], ends[1][kept])
-    picture.y_grid(5)
     for value in log_ticks(*picture.x_ends) if picture.log else ticks(*picture.x_ends, 5):
         picture.mark("grid", value)
-        picture.x_label(value, f"{value:g}")
-    picture.frame()
+        picture.below(value, f"{value:g}")
+    picture.frame(5)
     for k, (label, x, y) in enumerate(thinned):
         picture.line(f"path s{k % 6}", x, y, label, digits=2)
     picture.labels.append(SvgText(WIDTH / 2, HEIGHT + 32.0, x_label))

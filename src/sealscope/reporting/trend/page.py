@@ -61,10 +61,9 @@ def level_pictures(
     for size, (width, height) in SIZES.items():
         picture = Picture(width - left - right, height - top - bottom, (first, last), levels, margins=_MARGINS)
         step = next((step for step in _STEPS if (last - first) / step <= width / 110.0), _STEPS[-1])
-        picture.y_grid(4)
+        picture.frame(4)
         for day in np.arange(days[0], last, step).tolist():
-            picture.x_label(day, moment(day), "middle" if picture.x(day) + 22.0 <= picture.width else "end")
-        picture.frame()
+            picture.below(day, moment(day), "middle" if picture.x(day) + 22.0 <= picture.width else "end")
         if limit is not None and limit <= levels[1]:
             picture.level("limit", limit)
         draw(picture)
