@@ -63,6 +63,15 @@ def test_each_step_has_its_cause_and_its_time(kind: str) -> None:
     assert step is None or abs(step.onset - 60.0) < 6.0
 
 
+def test_missing_positions_hide_nothing() -> None:
+    changed, cause = STEPS["friction"]
+    whole = machine(**changed)
+    x = whole["x"].copy()
+    x[1000], x[9000:9100] = np.nan, np.nan
+    step = other_step(replace(whole, channels={**whole.channels, "x": x}), CHANCE)
+    assert step is not None and step.cause == cause
+
+
 def test_units_and_sides_do_not_matter() -> None:
     recording = machine(p_A=5e3 * WAY * LATE, p_B=-5e3 * WAY * LATE)
     scores = [test.score for test in level_tests(recording)]

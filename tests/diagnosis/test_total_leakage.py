@@ -7,6 +7,7 @@ import pytest
 
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.inference.detector import VolumeBalance
+from sealscope.diagnosis.verdict.machine import unstated
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording
 from sealscope.reporting.messages import diagnosis_text, total_leakage
@@ -122,3 +123,14 @@ def test_a_single_rod_s_total_is_stated_from_the_first_sample(command: str, load
     assert low <= true <= high
     worn = true / LPM / float(np.abs(difference).mean()) > own.pump.G_healthy
     assert diagnosis.verdict == ("leak" if worn else "no leak")
+
+
+@pytest.mark.parametrize(
+    "stated", [{"pump.q_b": "4.9[cm^3/rev]"}, {"cylinder.A_A": "633 mm^2", "cylinder.A_B": "633 mm^2"}]
+)
+def test_a_size_alone_says_nothing_of_what_a_healthy_pump_leaks(stated: dict[str, str]) -> None:
+    """The pump of another rig is none of this machine's: with a size alone a worn or a large pump was a leak."""
+    pump_leaks = machine(1, G=20 * PUMP)
+    result = diagnose(pump_leaks, rig=unstated().with_overrides(stated))
+    assert result.verdict == "no leak" and result.total_leakage.healthy_lpm is None
+    assert diagnose(pump_leaks, rig="thesis").verdict == "leak"

@@ -43,7 +43,6 @@ class RingingEnergy:
     """Change of the energy of the pressures' ringing, in either direction."""
 
     name = "ringing energy"  # that of the entry point
-    reads = CHAMBERS  # optional: where only other channels differ, it need not be run again
 
     def __init__(self, rig: Rig) -> None:
         """`rig` is what a detector may assume of the machine; this one assumes nothing."""

@@ -22,9 +22,7 @@ class Detector(Protocol):
     """A detector: states evidence at a false-alarm probability, and says `cannot tell` rather than guess.
 
     The recordings it is given are uniformly sampled, and their chamber pressures and command have no missing sample
-    (what was missing is bridged, and marked in `Recording.bridged`); any other channel may be absent or hold NaN. A
-    class attribute `reads` may name the channels that it looks at where no baseline is given: then a campaign that
-    shows a record through several sets of channels runs it once for all that agree in these.
+    (what was missing is bridged, and marked in `Recording.bridged`); any other channel may be absent or hold NaN.
 
     A method `learn(recording)` may return what a healthy recording teaches, as plain values, or None; a detector that
     has one is also given what was written down of recordings (`learnt.Learnt`), and reads both by `learnt.lessons_of`.

@@ -14,7 +14,7 @@ from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.detector import Detector, checked, failure, unusable
 from sealscope.diagnosis.inference.other_steps.step import other_step
 from sealscope.diagnosis.inspection import comparable, inspected
-from sealscope.diagnosis.judgement import ORDER, judged, judging, rank
+from sealscope.diagnosis.judgement import ORDER, combined, deciding, rank
 from sealscope.diagnosis.learnt import Healthy, Learnt
 from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
@@ -59,7 +59,7 @@ class Examination:
     _evidence: dict[tuple[str, frozenset[str]], Evidence] = field(default_factory=dict)
 
     def through(self, channels: Iterable[str]) -> Examination:
-        """Return the same recording with these channels alone; a detector that reads no other is not run again."""
+        """Return the same recording with these channels alone."""
         wanted = set(channels)
         recording, *baseline = (
             own.only(name for name in own.channels if name in wanted)
@@ -80,9 +80,7 @@ class Examination:
             if name not in self._detectors:
                 self._detectors[name] = factory(load_rig(self.rig))
             detector = self._detectors[name]
-            # a detector may state the channels that it `reads` where there is no baseline
-            reads = visible if self.baseline else frozenset(getattr(detector, "reads", visible))
-            key = (name, visible & reads)
+            key = (name, visible)
             if key not in self._evidence:
                 # small matrices: threads would cost more than they give, and how they share the work may not repeat to
                 # the bit
@@ -113,10 +111,10 @@ class Examination:
         """Return one verdict from all registered detectors but those that only stand in for one which judges."""
         evidences: list[Evidence] = []
         for name in sorted(detectors(), key=rank):
-            if name not in ORDER or judging(evidences) is None:
+            if name not in ORDER or deciding(evidences) is None:
                 evidences.append(self.evidence(name))
         other = None if self.distrust else other_step(self.recording, RAREST)
-        return judged(evidences, other, self.refusal)
+        return combined(evidences, other, self.refusal)
 
 
 def _unusable(detector: Detector, healthy: Healthy) -> str | None:

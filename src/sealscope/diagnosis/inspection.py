@@ -17,7 +17,7 @@ import numpy as np
 from sealscope.diagnosis.learnt import Healthy, Learnt
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.formats.columns import counted
-from sealscope.recordings.gaps import MOST_BRIDGED, bridge
+from sealscope.recordings.gaps import MOST_BRIDGED, bridge, filled
 from sealscope.recordings.hydraulics import lack_of_chambers, no_readings
 from sealscope.recordings.motion import runs_of
 from sealscope.recordings.quality import SHORTEST, Finding, Severity, inspect, uniform_segments
@@ -77,7 +77,7 @@ def _inspection(recording: Recording, names: Sequence[str]) -> Inspection:
     if "u" in part and not np.any(np.isfinite(part["u"])):  # `inspect` reports it; the pressures can do without
         part = part.only(name for name in part.channels if name != "u")
     needed = (*chambers, "u") if "u" in part else chambers
-    part = bridge(part, needed)
+    part = filled(bridge(part, needed), needed)
     if part.bridged is not None:
         rows = np.flatnonzero(part.bridged)
         text = (

@@ -24,21 +24,21 @@ def rank(detector: str) -> int:
     return ORDER.index(detector) if detector in ORDER else len(ORDER)
 
 
-def judging(evidences: Sequence[Evidence]) -> Evidence | None:
+def deciding(evidences: Sequence[Evidence]) -> Evidence | None:
     """Return the evidence that judges, of those asked so far; None where another detector is to be asked."""
     usable = [own for own in sorted(evidences, key=lambda own: rank(own.detector)) if own.usable]
     able = [own for own in usable if own.detector != LEAST_SPECIFIC]
     return next((own for own in able or usable if not own.abstains), None)
 
 
-def judged(evidences: Sequence[Evidence], other: OtherStep | None = None, refusal: str | None = None) -> Evidence:
+def combined(evidences: Sequence[Evidence], other: OtherStep | None = None, refusal: str | None = None) -> Evidence:
     """Return the verdict on a recording, from the evidence of every detector that was asked.
 
     `other`: what else than a leak stepped, by what a leak does not move; `refusal`: why the recording cannot be
     compared with the baseline that was given: then only a leak is stated.
     """
     ranked = sorted(evidences, key=lambda own: rank(own.detector))
-    judge = judging(ranked)
+    judge = deciding(ranked)
     if judge is None:
         return replace(_nobody(ranked), detector="", parts=tuple(ranked), usable=True)
     verdict, cause, reasons = judge.verdict, judge.cause, [judge.reason]

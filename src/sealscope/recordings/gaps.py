@@ -24,6 +24,8 @@ from sealscope.recordings.quality import even_steps, uniform_segments
 from sealscope.recordings.recording import Recording
 
 Flags = NDArray[np.bool_]
+#: Longest gap of a motion that is filled by a line [s]: a mass moves on meanwhile.
+MOTION_SECONDS = 0.05
 
 #: Longest gaps that are bridged: by a spline [samples], by a line [s], by other cycles (share of the recording); and
 #: largest share of a recording that all gaps together may be.
@@ -78,6 +80,26 @@ def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
     return replace(whole, channels=channels, bridged=bridged, history=(*whole.history, note))
 
 
+def filled(recording: Recording, needed: Sequence[str]) -> Recording:
+    """Return the recording with short gaps filled by a line where a channel is none of the `needed`.
+
+    Those of positions, angles, speeds and flows up to `MOTION_SECONDS`, as a slower sensor leaves between its samples;
+    those of pressures up to `SPLINE` samples.
+    """
+    channels = dict(recording.channels)
+    for name, values in recording.channels.items():
+        missing = ~np.isfinite(values)
+        if name in needed or not missing.any() or missing.all():
+            continue
+        most = SPLINE if name.startswith("p_") else MOTION_SECONDS * recording.rate
+        short = np.zeros(len(values), dtype=bool)
+        for first, length in runs_of(missing).tolist():
+            short[first : first + length] = first > 0 and first + length < len(values) and length <= most
+        channels[name] = values.copy()
+        channels[name][short] = np.interp(np.flatnonzero(short), np.flatnonzero(~missing), values[~missing])
+    return replace(recording, channels=channels)
+
+
 def touched(recording: Recording, bounds: Array | NDArray[np.integer]) -> Flags:
     """Return which blocks between sample `bounds` (n + 1,) hold more bridged samples than `MOST_BRIDGED`, (n,)."""
     bounds = np.asarray(bounds)
@@ -85,6 +107,15 @@ def touched(recording: Recording, bounds: Array | NDArray[np.integer]) -> Flags:
         return np.zeros(max(bounds.size - 1, 0), dtype=bool)
     counts = np.diff(np.concatenate([[0], np.cumsum(recording.bridged)])[bounds])
     return np.asarray(counts > MOST_BRIDGED * np.diff(bounds))
+
+
+def long_gaps(recording: Recording) -> Flags:
+    """Return which rows (n,) lie in bridged gaps of more than `SPLINE` samples; a spline errs by no more than noise."""
+    flags = np.zeros(len(recording), dtype=bool)
+    if recording.bridged is not None:
+        for first, length in runs_of(recording.bridged).tolist():
+            flags[first : first + length] = length > SPLINE
+    return flags
 
 
 def _with_lost_rows(recording: Recording) -> Recording:

@@ -133,7 +133,9 @@ def rests_on(diagnosis: Diagnosis) -> str | None:
 
 def machine_text(machine: AssumedMachine) -> str:
     """Return area and displacement that a flow rests on, and who stated them."""
-    if machine.stated_by == "recording":
+    if machine.flow_meter:
+        key = "meter"
+    elif machine.stated_by == "recording":
         key = "recording"
     elif machine.stated:
         key = "call" if machine.stated_by == "call" else "stated"

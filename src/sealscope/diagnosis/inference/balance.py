@@ -24,6 +24,7 @@ from sealscope.diagnosis.inference.terms import (
 )
 from sealscope.diagnosis.inference.weak_form import SPAN, STRIDE, rows, stride_samples
 from sealscope.diagnosis.inference.zero import about_zero
+from sealscope.recordings.gaps import long_gaps
 from sealscope.recordings.quality import clipped
 from sealscope.recordings.recording import Array, Recording
 from sealscope.storage.plain_state import array_of, part_of, plain_array
@@ -237,12 +238,12 @@ def _gauge_to_absolute(pressure: Array) -> float:
 
 
 def whole_samples(recording: Recording, names: Collection[str]) -> dict[str, Array]:
-    """Return the samples of channels, NaN where bridged or where a pressure is cut off at an end of its range."""
-    samples = {}
+    """Return the samples of channels, NaN in `long_gaps` and where a pressure is cut off at an end of its range."""
+    samples, gaps = {}, long_gaps(recording)
     for name in recording.channels:
         if name not in names:
             continue
-        values = recording[name] if recording.bridged is None else np.where(recording.bridged, np.nan, recording[name])
+        values = np.where(gaps, np.nan, recording[name]) if gaps.any() else recording[name]
         rails = [rail.value for rail in clipped(values[np.isfinite(values)])] if name.startswith("p_") else []
         samples[name] = np.where(np.isin(values, rails), np.nan, values) if rails else values
     return samples

@@ -131,9 +131,7 @@ class Columns:
         levels = beliefs("inference")["level"]
         self.levels = np.array([levels.get(term.drift, np.inf) for term in equation.terms])
         self.motion = tuple(k for k in self.nuisance if equation.terms[k].drift in ("motion", "edge"))
-        self.support = tuple(
-            k for k in self.nuisance if equation.terms[k].drift not in ("leak", "pump", "bias", "outside")
-        )
+        self.support = tuple(k for k in self.nuisance if equation.terms[k].drift not in UNSTEADY)
         self.fast = tuple(k for k in self.nuisance if k not in self.support)
         self.bias = self.names.index(BIAS) if BIAS in self.names else None
         self.driven = tuple(term.driven for term in equation.terms)

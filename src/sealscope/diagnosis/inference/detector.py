@@ -13,7 +13,8 @@ from sealscope.diagnosis.inference.balance import blocks_of, shortest
 from sealscope.diagnosis.inference.blocks import Columns
 from sealscope.diagnosis.inference.circuit.store import lost_beside
 from sealscope.diagnosis.inference.circuit.without_position import circulations
-from sealscope.diagnosis.inference.decision import RecordedBalance, bound_of, judge
+from sealscope.diagnosis.inference.decision.judge import bound_of, judge
+from sealscope.diagnosis.inference.decision.recorded import RecordedBalance
 from sealscope.diagnosis.inference.scatter import RecordingSums, Rise, motion_change, rise
 from sealscope.diagnosis.inference.terms import CYLINDER, LOCKED, circulation, equations, locked
 from sealscope.diagnosis.inference.weak_form import STRIDE, stride_samples
@@ -39,7 +40,11 @@ RESOLVED = 2
 def made_good(balance: RecordedBalance) -> bool:
     """Whether the pump surely delivers what any pump loses: a loop brings the piston back, or holds it."""
     least: float = beliefs("inference")["held"]["share"]
-    return balance.level.low * balance.mean(0) > least * balance.mean(2)
+    return balance.level.low * balance.mean_pressure() > least * balance.mean_flow
+
+
+#: Channels that balances read.
+_READ = ("u", "theta", "omega", "q_pump", "x", "p_1", "p_2", *CHAMBERS)
 
 
 class VolumeBalance:
@@ -51,7 +56,6 @@ class VolumeBalance:
     """
 
     name = "volume balance"
-    reads = ("u", "theta", "omega", "q_pump", "x", "p_1", "p_2", *CHAMBERS)
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
@@ -83,18 +87,18 @@ class VolumeBalance:
         """
         balances = equations(self.rig, frozenset(recording.channels))
         if not balances:
-            made = remembered(recording, (self.name, self.rig), lambda own: circulations(own, self.rig), self.reads)
+            made = remembered(recording, (self.name, self.rig), lambda own: circulations(own, self.rig), _READ)
             recorded = [
                 RecordedBalance(own.blocks, (own.equation,), (own.columns,), self.rig, recording, own.lost)
                 for own in made
             ]
             answering = [own for own in recorded if own.equations[0].name == LOCKED or made_good(own)]
             return min(answering, key=lambda own: bound_of(own, None), default=None)
-        blocks = remembered(recording, (self.name, self.rig), lambda own: blocks_of(own, self.rig), self.reads)
+        blocks = remembered(recording, (self.name, self.rig), lambda own: blocks_of(own, self.rig), _READ)
         if blocks is None:
             return None
         zero = float(blocks[0].zero[0])
-        lost = remembered(recording, ("lost oil", self.rig), lambda own: lost_beside(own, self.rig, zero), self.reads)
+        lost = remembered(recording, ("lost oil", self.rig), lambda own: lost_beside(own, self.rig, zero), _READ)
         return RecordedBalance(blocks[0], balances, blocks[2], self.rig, recording, lost, blocks[1])
 
     def learn(self, recording: Recording) -> Lesson | None:

@@ -24,7 +24,8 @@ class AssumedMachine:
 
     `rig`: its name; `stated_by` the call (`--rig` or a Rig), the provenance of a recording of our own, or nobody;
     `area` of the piston, the mean of both sides [m^2], and `displacement` of the pump [m^3/rev]; `area_stated`,
-    `displacement_stated`: whether they are stated, by the rig or on their own.
+    `displacement_stated`: whether they are stated, by the rig or on their own; `flow_meter`: whether flows are a
+    meter's, `q_pump`, and rest on neither.
     """
 
     rig: str
@@ -33,6 +34,7 @@ class AssumedMachine:
     displacement: float
     area_stated: bool
     displacement_stated: bool
+    flow_meter: bool = False
 
     @property
     def stated(self) -> bool:
@@ -48,6 +50,7 @@ class AssumedMachine:
             "area_stated": self.area_stated,
             "displacement_m3_per_rev": self.displacement,
             "displacement_stated": self.displacement_stated,
+            "flow_meter": self.flow_meter,
         }
 
 
@@ -71,7 +74,23 @@ def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) 
         displacement=known.pump.q_b,
         area_stated=known.states("cylinder.A_A", "cylinder.A_B"),
         displacement_stated=known.states("pump.q_b"),
+        flow_meter=measures_flow(recording.units),
     )
+
+
+def measures_flow(units: Mapping[str, str]) -> bool:
+    """Whether the flow to the cylinder is read by a meter in its unit, and neither angle nor speed of a pump is."""
+    return units.get("q_pump") == "m^3/s" and not {"theta", "omega"} & units.keys()
+
+
+def healthy_leakage(rig: Rig) -> float:
+    """Return the most that a healthy pump leaks, `pump.G_healthy` [m^3/(s Pa)]; 0 where it is not that of this pump.
+
+    What a file assumes of its own pump counts; not what is left of another rig's where only the displacement is stated.
+    """
+    healthy, pump = rig.entry("pump.G_healthy"), rig.entry("pump.q_b")
+    own = rig.states("pump.G_healthy") or (rig.states("pump.q_b") and healthy.place == pump.place)
+    return rig.pump.G_healthy if own else 0.0
 
 
 def unstated() -> Rig:

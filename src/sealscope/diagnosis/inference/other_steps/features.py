@@ -19,7 +19,7 @@ from sealscope.recordings.recording import Array, Recording
 _BELIEVED = beliefs("inference.other_steps")["features"]
 BLOCKS, ORDER = _BELIEVED["blocks"], _BELIEVED["order"]
 #: What commands the motion, and what moves, in the order of preference.
-COMMANDS, MOTIONS = ("x_d", "u", "omega", "theta"), ("x", "theta", "omega", "u")
+COMMANDS, MOTIONS = ("u", "omega", "theta"), ("x", "theta", "omega", "u")
 #: Bins of a spectrum beyond the main lobe of a line, by a Hann window.
 _BESIDE: list[float] = _BELIEVED["beside"]
 

@@ -67,7 +67,7 @@ class Level(NamedTuple):
 def _motion(recording: Recording) -> Array | None:
     """Return speed, acceleration and, of a recorded position, position (n, 2 or 3); None where no channel shows them.
 
-    Each in a unit of its own size.
+    Each in a unit of its own size, NaN where samples are missing.
     """
     name = next((name for name in ("x", "theta", "omega", "u") if name in recording), None)
     if name is None:
@@ -76,8 +76,8 @@ def _motion(recording: Recording) -> Array | None:
     speed = _slope(recording[name], half) if name in ("x", "theta") else recording[name]
     motion = [speed, _slope(speed, half)]
     if name == "x":
-        motion.append(recording[name] - recording[name].mean())
-    return np.column_stack([own / max(float(np.percentile(np.abs(own), 99.0)), _TINY) for own in motion])
+        motion.append(recording[name] - np.nanmean(recording[name]))
+    return np.column_stack([own / max(float(np.nanpercentile(np.abs(own), 99.0)), _TINY) for own in motion])
 
 
 def _slope(values: Array, half: int) -> Array:
@@ -100,7 +100,9 @@ def levels(recording: Recording) -> tuple[Array, Array] | None:
         motion, moving = np.zeros((len(recording), 0)), np.ones(len(recording))
         columns = np.column_stack([moving, pressures - means])
     else:
-        moving = (np.abs(motion[:, 0]) > believed["slowest"]).astype(float)
+        whole = np.asarray(np.isfinite(motion).all(axis=1))
+        motion = np.where(whole[:, None], motion, 0.0)
+        moving = (whole & (np.abs(motion[:, 0]) > believed["slowest"])).astype(float)
         columns = np.column_stack([np.ones(len(recording)), np.sign(motion[:, 0]), motion, pressures - means])
     own, size = min(2, columns.shape[1] - 2), columns.shape[1]
     lengths, cycle = [len(recording) // count for count in believed["blocks"]], find_cycle(recording)

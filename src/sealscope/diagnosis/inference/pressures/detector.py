@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sealscope.diagnosis.beliefs import beliefs
-from sealscope.diagnosis.inference.decision import WITHIN, Question, asked, is_leak, may_be_leak, questions
+from sealscope.diagnosis.inference.decision.questions import WITHIN, Question, answer, asked, bound_text, questions
 from sealscope.diagnosis.inference.onset import WITHIN_95, StepTest, course, two_sided
 from sealscope.diagnosis.inference.other_steps.causes import StepHypothesis, probabilities
 from sealscope.diagnosis.inference.other_steps.causes import stepped as stepped_cause
@@ -43,7 +42,6 @@ class PressureResponse:
     """Leakage from both chamber pressures and the command, by how p_A - p_B responds to the command."""
 
     name = "pressure response"
-    reads = ("u", "p_A", "p_B")
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
@@ -94,21 +92,17 @@ def judge(
     if test is None and against is None:
         return Evidence("cannot tell", "too little moves: no leak would show")
     possible, tested = questions(test, against, probability), hypotheses(own)
-    answered = next((each for each in possible if each.chance < each.probability), None)
-    causes = probabilities(tested, beside) if answered is not None and answered.name == WITHIN else {}
-    if causes and not is_leak(causes):
-        answered = None
     bound = against.bound() if against is not None else (test.bound() if test is not None else 0.0)
-    if answered is None:
-        enough = bound * float(own.pressure.mean()) <= beliefs("inference")["worth"]["share"] * own.pump
-        enough = enough and not may_be_leak(causes)
+    flow = bound * float(own.pressure.mean())
+    verdict, judging, _ = answer(possible, lambda: probabilities(tested, beside), flow, own.pump)
+    if verdict != "leak":
         cause = stepped_cause(tested, RAREST)
-        evidence = Evidence("no leak" if enough else "cannot tell", "", cause=None if cause in LEAKS else cause)
-    elif answered.name == WITHIN and test is not None:
+        evidence = Evidence(verdict, "", cause=None if cause in LEAKS else cause)
+    elif judging.name == WITHIN and test is not None:
         evidence = _begun(own, test)
     else:
         evidence = Evidence("leak", "", cause="piston leak")  # levels of g lean on the friction: they state no L/min
-    return _with_figures(own, evidence, possible, answered or possible[0], bound)
+    return _with_figures(own, evidence, possible, judging, bound)
 
 
 def _rise(own: PressureEvidence, levels: Sequence[float]) -> Rise:
@@ -143,11 +137,11 @@ def _with_figures(
     limit = f"{lpm:.2g} L/min" if own.stated else f"{100.0 * flow / own.pump:.2g} % of the pump's flow"
     begins = "steps up within the recording, beyond the drift of this machine"
     above = "is above that of the healthy recordings by more than they scatter"
-    reason = {
-        "leak": f"the conductance past piston or pump {begins if judging.name == WITHIN else above}",
-        "no leak": f"no leak above {limit} (95 %)",
-        "cannot tell": f"a leak of up to {limit} would not show (95 %); with the piston's position it does",
-    }[evidence.verdict]
+    reason = bound_text(evidence.verdict, limit)
+    if evidence.verdict == "leak":
+        reason = f"the conductance past piston or pump {begins if judging.name == WITHIN else above}"
+    elif evidence.verdict == "cannot tell":
+        reason += "; with the piston's position it does"
     if "leak_lpm" in evidence.refuses:
         reason += f"; {NO_RIG}"
     evidence = replace(asked(evidence, possible, judging, "conductance"), reason=reason)

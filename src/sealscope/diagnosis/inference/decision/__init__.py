@@ -1,0 +1,1 @@
+"""What a balance says, the questions asked of it, and the verdict."""

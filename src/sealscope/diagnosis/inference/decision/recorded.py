@@ -1,0 +1,215 @@
+"""A recording's balance with all that is asked of it, and what sizes its flows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from sealscope.diagnosis.beliefs import beliefs
+from sealscope.diagnosis.inference.blocks import Blocks, Columns, information, mean_of, zero_of
+from sealscope.diagnosis.inference.onset import WITHIN_95, Course, Information, Interval, StepTest, course, step_test
+from sealscope.diagnosis.inference.other_steps.causes import StepHypothesis, hypotheses
+from sealscope.diagnosis.inference.scatter import RecordingSums
+from sealscope.diagnosis.inference.terms import LAG, ORIFICE, PUMP, Equation
+from sealscope.diagnosis.verdict.evidence import RAREST
+from sealscope.diagnosis.verdict.machine import measures_flow
+from sealscope.recordings.joining import start_seconds
+from sealscope.recordings.oil import oil_temperature
+from sealscope.recordings.recording import Array, Recording
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+
+
+class Size(NamedTuple):
+    """What turns a flow by the assumed displacement into that of the machine.
+
+    `scale`, its relative `deviation`; `stated`: whether L/min can be stated at all; `ratio`: displacement over area as
+    measured, over the assumed one, with its interval, None where the position has no unit; `area` of the piston by the
+    assumed displacement [m^2].
+    """
+
+    scale: float
+    deviation: float
+    stated: bool
+    ratio: Interval | None
+    area: float | None
+    disagrees: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedBalance:
+    """A recording's blocks with all that is asked of them.
+
+    `lost`: tests of a step of what leaves the circuit by the accumulator's own balance, by the term's name; `plain`:
+    the blocks with the zero of p_A - p_B as recorded, where they are others.
+    """
+
+    blocks: Blocks
+    equations: tuple[Equation, ...]
+    columns: tuple[Columns, ...]
+    rig: Rig
+    recording: Recording
+    lost: Mapping[str, StepTest] = field(default_factory=dict)
+    plain: Blocks | None = None
+
+    @property
+    def units(self) -> frozenset[tuple[str, str]]:
+        """Channels with their units."""
+        return frozenset(self.recording.units.items())
+
+    @cached_property
+    def leak(self) -> Information:
+        """What the blocks say of the leak's coefficient."""
+        return information(self.blocks, self.columns, self.columns[0].leak)
+
+    @cached_property
+    def test(self) -> StepTest | None:
+        """Test of a step of the leak's coefficient."""
+        return step_test(self.leak)
+
+    @cached_property
+    def through_orifice(self) -> StepTest | None:
+        """Test of a step of the flow through an orifice."""
+        column = self.columns[0]
+        return step_test(information(self.blocks, self.columns, column.names.index(ORIFICE), column.leak))
+
+    @cached_property
+    def hypotheses(self) -> tuple[StepHypothesis, ...]:
+        """Tests of all terms' coefficients, the most likely first."""
+        return hypotheses(self.blocks, self.plain or self.blocks, self.equations, self.columns, self.lost)
+
+    @cached_property
+    def recording_sums(self) -> RecordingSums:
+        """What the recording says of a healthy machine."""
+        dated, oil = start_seconds(self.recording), oil_temperature(self.recording)
+        return RecordingSums.of(self.blocks, self.columns, dated, oil)
+
+    @cached_property
+    def zero(self) -> float:
+        """Zero of p_A - p_B [Pa], as a change of the leak shows it."""
+        return zero_of(self.blocks, self.columns)
+
+    @cached_property
+    def root_zero(self) -> float:
+        """Zero of the root of p_A - p_B [Pa^0.5], as a change of a leak through an orifice shows it."""
+        return zero_of(self.blocks, self.columns, self.columns[0].names.index(ORIFICE))
+
+    @cached_property
+    def delay(self) -> tuple[float, float] | None:
+        """How much later x is recorded than the flow [s], by the share of its lag in the motion, with its deviation."""
+        column = self.columns[0]
+        motion = [k for k in column.motion if column.names[k].startswith("motion")]
+        if LAG not in column.names or not motion:
+            return None
+        area = _area(self, motion).measured
+        value, deviation = mean_of(self.blocks, column, {column.names.index(LAG): 1.0})
+        return (value / area, deviation / area) if area > 0.0 else None
+
+    def mean_pressure(self, since: float = -np.inf) -> float:
+        """Return the mean size of p_A - p_B about its zero [Pa], over the blocks whose middle is `since` or later."""
+        return self._mean(self.blocks.driving(self.zero), since)
+
+    def mean_root(self, since: float = -np.inf) -> float:
+        """Return the mean root of the size of p_A - p_B [Pa^0.5], likewise."""
+        return self._mean(self.blocks.driving(self.root_zero, root=True), since)
+
+    @cached_property
+    def mean_flow(self) -> float:
+        """Mean size of the pump's flow [m^3/s]."""
+        return self._mean(self.blocks.flow)
+
+    def _mean(self, values: Array, since: float = -np.inf) -> float:
+        chosen = self.blocks.time >= since
+        if not chosen.any():
+            chosen[-1] = True
+        return float(np.average(values[chosen], weights=np.maximum(self.blocks.rows[chosen], 1e-9)))
+
+    @cached_property
+    def moving(self) -> float:
+        """Mean flow while it flows [m^3/s]: the mean weighted by itself, so that standstills do not count."""
+        flow = self.blocks.flow
+        return float(flow @ flow / max(float(flow.sum()), np.finfo(float).tiny))
+
+    @cached_property
+    def size(self) -> Size:
+        """What turns a flow by the assumed displacement into that of the machine."""
+        return _size(self)
+
+    @cached_property
+    def level(self) -> Interval:
+        """What passes pump and piston in all over the recording, as a conductance with its interval.
+
+        The pressures at the pump's ports hardly differ from those of the chambers: the sum is known, its parts are not.
+        """
+        weights = np.maximum(self.blocks.rows, 0.0)
+        return self.whole.over(weights / weights.sum())
+
+    @cached_property
+    def whole(self) -> Course:
+        """What passes pump and piston in all over the blocks, as a conductance."""
+        column = self.columns[0]
+        apart = column.names.index(PUMP) if PUMP in column.names else None
+        both = information(self.blocks, self.columns, column.leak, apart)
+        test = step_test(both)
+        return course(both, test, step=test is not None and test.chance < RAREST)
+
+    def course(self, step: bool) -> Course:
+        """Return the leak's coefficient over the blocks."""
+        return course(self.leak, self.test, step)
+
+
+def _size(balance: RecordedBalance) -> Size:
+    """Weigh what is stated of displacement and area against each other.
+
+    A flow meter sizes flows by itself. Else the balance measures their ratio: a stated displacement sizes every flow
+    directly, a stated area by that ratio; where both are stated and disagree the flow lies between what either says.
+    """
+    column, rig, meter = balance.columns[0], balance.rig, measures_flow(balance.recording.units)
+    believed = beliefs("inference")["size"]
+    with_unit = not {("theta", "count"), ("omega", "count"), ("u", "count")} & balance.units
+    pressures = not {("p_A", "count"), ("p_B", "count")} & balance.units
+    states_displacement = rig.states("pump.q_b") and with_unit
+    if len(balance.columns) > 1:  # behind a valve the area sizes the flow
+        return Size(1.0, believed["area"], rig.states("cylinder.A_A", "cylinder.A_B") and pressures, None, None)
+    motion = [k for k in column.motion if column.names[k].startswith("motion")]
+    area = _area(balance, motion) if motion and ("x", "m") in balance.units else None
+    if area is None or not area.measured > 0.0 or not with_unit:
+        known = believed["meter" if meter else "displacement"]
+        return Size(1.0, known, (meter or states_displacement) and pressures, None, None)
+    if meter:
+        return Size(1.0, believed["meter"], pressures, None, area.measured)
+    ratio = Interval(*(area.assumed / end for end in (area.measured, area.high, max(area.low, 1e-12))))
+    apart = abs(1.0 / ratio.value - 1.0)
+    known = float(np.hypot(believed["displacement"], believed["area"]))
+    if states_displacement:
+        disagrees = rig.states("cylinder.A_A", "cylinder.A_B") and apart > WITHIN_95 * known
+        deviation = apart if disagrees else believed["displacement"]
+        return Size(1.0, deviation, pressures, ratio, area.measured, disagrees)
+    if rig.states("cylinder.A_A", "cylinder.A_B"):
+        return Size(ratio.value, believed["area"], pressures, ratio, area.measured)
+    return Size(1.0, known, False, ratio, area.measured)
+
+
+class _Area(NamedTuple):
+    """The area of the side that carries [m^2]: `measured` by the assumed displacement, with its interval; `assumed`."""
+
+    measured: float
+    low: float
+    high: float
+    assumed: float
+
+
+def _area(balance: RecordedBalance, motion: list[int]) -> _Area:
+    """Return the area of the side that carries, the mean of both ways and sides in the proportion that they occur."""
+    column, cylinder = balance.columns[0], balance.rig.cylinder
+    energy = np.einsum("kii->i", balance.blocks.gram[:, 0])[motion]
+    shares = energy / max(float(energy.sum()), np.finfo(float).tiny)
+    value, deviation = mean_of(balance.blocks, column, dict(zip(motion, shares, strict=True)))
+    value, half = abs(value), WITHIN_95 * deviation
+    stated = [cylinder.A_A if column.names[k].endswith("A carries") else cylinder.A_B for k in motion]
+    return _Area(value, value - half, value + half, float(shares @ stated))
