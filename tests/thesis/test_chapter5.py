@@ -170,7 +170,7 @@ def test_windows_are_a_thousand_samples_five_hundred_apart(context: Direct) -> N
     centres, curves = windowed(recording, "p_A")
     np.testing.assert_allclose(np.diff(centres), 500 / recording.rate)
     assert centres[0] == pytest.approx((105 + 500) / recording.rate)
-    assert set(curves) == {"d3", "d4", "d3d4"}
+    assert set(curves) == {"d1", "d2", "d3", "d4", "d3d4"}
     levels = [c for c in drawn(context, 7).panels[0].curves if c.role == "reference"]
     settled = curves["d3"][(centres > 7) & (centres < 58)]
     assert levels[0].y[0] == pytest.approx(float(np.sqrt(np.mean(settled**2))), rel=0.01)

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
-from sealscope.signals.details import QUANTITIES
-from sealscope.signals.filters import reach
+from sealscope.signals.details import QUANTITIES, details
 from sealscope.signals.windows import WINDOW_SIZE, rms, windowed_rms
 from sealscope.simulation.experiment import Experiment
 from sealscope.thesis.chapters.appendix_c_runs import (
@@ -28,7 +27,7 @@ from sealscope.thesis.engine.products import Figure, FigureCurve, Number, Panel,
 from sealscope.thesis.engine.texts import note, texts_of
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, UNITS, Condition
 from sealscope.thesis.sines import sine_fit
-from sealscope.units import LITRE_PER_MINUTE
+from sealscope.units import LITRE_PER_MINUTE, PSI
 
 Mask = NDArray[np.bool_]
 Drawn = tuple[list[Panel], list[Number]]
@@ -174,9 +173,9 @@ class FigureView:
         t, curves = windowed(self.recording, self.chamber)
         rms = detail_rms(self.recording, self.test.parts)[self.chamber]
         panels = []
-        for name, values in curves.items():
+        for name in _WINDOWED:
             levels = FigureCurve(np.ravel(self.test.parts), np.repeat(rms[name], 2), "RMS of each part", "reference")
-            panels.append(self._panel(f"RMS of {name} [{UNITS[name]}]", *self._split(values, t), levels))
+            panels.append(self._panel(f"RMS of {name} [{UNITS[name]}]", *self._split(curves[name], t), levels))
         return panels, self._changes(_WINDOWED)
 
     def _changes(self, names: tuple[str, ...]) -> list[Number]:
@@ -222,13 +221,12 @@ def figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def windowed(recording: Recording, chamber: str) -> tuple[Array, dict[str, Array]]:
-    """Return the centres [s] of the windows of 1000 samples, 500 apart, and the RMS of d3, d4, d3d4 in each."""
-    before, after = (int(samples) for samples in reach("db8", 4)[-1])
-    series = detail_series(recording, chamber)
-    inside = slice(before, len(recording) - after)
-    windows_of = {name: windowed_rms(series[name][inside], first=before) for name in _WINDOWED}
-    centres = (windows_of["d3"].ends - WINDOW_SIZE / 2) / recording.rate
-    return np.asarray(centres, dtype=np.float64), {name: windows.rms for name, windows in windows_of.items()}
+    """Return the centres [s] of the windows of 1000 samples, 500 apart, and the RMS of d1..d4, d3d4 in each."""
+    transformed = details(recording[chamber] / PSI)
+    inside = transformed.inside()
+    ends, rows = windowed_rms(transformed.quantities()[:, inside], first=inside.start)
+    centres = np.asarray((ends - WINDOW_SIZE / 2) / recording.rate, dtype=np.float64)
+    return centres, dict(zip(QUANTITIES, rows, strict=True))
 
 
 @dataclass(frozen=True)
