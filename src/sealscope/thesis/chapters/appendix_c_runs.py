@@ -49,12 +49,7 @@ def drawn_drifts(number: int, half: float, draw: int = 0) -> tuple[ParameterDrif
 
 
 def leak_test(
-    condition: Condition,
-    half: float,
-    *,
-    leak: bool = True,
-    drifts: tuple[ParameterDrift, ...] = (),
-    seed: int | None = None,
+    condition: Condition, half: float, seed: int, leak: bool = True, drifts: tuple[ParameterDrift, ...] = ()
 ) -> Experiment:
     """Return the run of a test: its command and throttles on the identified rig, its mean leak from half time on."""
     return Experiment.of(
@@ -64,7 +59,7 @@ def leak_test(
         duration=2 * half,
         leak=f"{condition.mean_leak_lpm:g} L/min from {half:g} s" if leak else None,
         drifts=drifts,
-        seed=condition.number if seed is None else seed,
+        seed=seed,
     )
 
 
@@ -74,7 +69,7 @@ def experiments(kind: Runs, half: float, quick: bool) -> list[tuple[Condition, E
     for draw, condition in product(range(2 if kind == "drift" and not quick else 1), APPENDIX_C):
         drifts = drawn_drifts(condition.number, half, draw) if kind == "drift" else ()
         seed = _SEEDS[kind] + 100 * draw + condition.number
-        runs.append((condition, leak_test(condition, half, leak=kind == "leak", drifts=drifts, seed=seed)))
+        runs.append((condition, leak_test(condition, half, seed, kind == "leak", drifts)))
     return runs
 
 
@@ -85,11 +80,6 @@ def _at_half_time(experiment: Experiment) -> str:
     end = np.array(experiment.duration)
     factors = [f"{drift.parameter} x {1.0 + float(drift.shape.at(end)):.3f}" for drift in experiment.drifts]
     return ", ".join(factors) or "nothing"
-
-
-def detail_series(recording: Recording, chamber: str) -> dict[str, Array]:
-    """Return d1..d4 [psi] and d3d4 [psi^2] of a chamber's pressure."""
-    return dict(zip(QUANTITIES, details(recording[chamber] / PSI).quantities(), strict=True))
 
 
 def detail_rms(recording: Recording, parts: Sequence[tuple[float, float]]) -> dict[str, dict[str, tuple[float, ...]]]:

@@ -17,7 +17,6 @@ from sealscope.simulation.experiment import Experiment
 from sealscope.thesis.chapters.appendix_c_runs import (
     SETTLING,
     detail_rms,
-    detail_series,
     leak_test,
     pressure_range,
 )
@@ -84,7 +83,7 @@ TESTS: dict[str, ShownTest] = {row[0]: ShownTest(*row) for row in texts_of("case
 
 def spec_of(test: ShownTest) -> Experiment:
     """Return the run of a test: its command and throttles on the identified rig, its mean leak from half time."""
-    return leak_test(test.condition, test.half)
+    return leak_test(test.condition, test.half, test.condition.number)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,8 +163,8 @@ class FigureView:
 
     def details(self) -> Drawn:
         """Draw d1 to d4 and d3d4 of the chamber's pressure."""
-        series = detail_series(self.recording, self.chamber)
-        panels = [self._panel(f"{name} [{UNITS[name]}]", *self._split(values)) for name, values in series.items()]
+        series = zip(QUANTITIES, details(self.recording[self.chamber] / PSI).quantities(), strict=True)
+        panels = [self._panel(f"{name} [{UNITS[name]}]", *self._split(values)) for name, values in series]
         return panels, self._changes(QUANTITIES)
 
     def windowed_rms(self) -> Drawn:
