@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sealscope import datasets as datasets
-    from sealscope.diagnosis.commissioned.estimator import LeakDetector as LeakDetector
     from sealscope.diagnosis.commissioned.machine import CommissionedMachine as CommissionedMachine
     from sealscope.diagnosis.commissioned.machine import commission as commission
     from sealscope.diagnosis.commissioned.machine_file import load_machine as load_machine
     from sealscope.diagnosis.commissioned.machine_file import write_machine as write_machine
+    from sealscope.diagnosis.commissioned.scikit_learn import LeakDetector as LeakDetector
     from sealscope.diagnosis.diagnose import diagnose as diagnose
     from sealscope.diagnosis.live.watch import Watch as Watch
     from sealscope.diagnosis.live.watch import watch as watch
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 #: Module -> names that it is the home of.
 _NAMES = {
-    "diagnosis.commissioned.estimator": "LeakDetector",
+    "diagnosis.commissioned.scikit_learn": "LeakDetector",
     "diagnosis.commissioned.machine": "CommissionedMachine commission",
     "diagnosis.commissioned.machine_file": "load_machine write_machine",
     "diagnosis.diagnose": "diagnose",

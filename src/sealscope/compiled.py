@@ -29,6 +29,7 @@ from threading import Lock
 from typing import Any, TypeVar
 
 import numba
+import numpy as np
 from llvmlite import ir as llvm
 from numba import types
 from numba.core import config, ir
@@ -388,18 +389,18 @@ def address_of(context: Any, pointer: Any) -> Any:
     return numba.int64(pointer), generate
 
 
-@intrinsic  # type: ignore[misc]
-def pointer_at(context: Any, pointer: Any, offset: Any) -> Any:
-    """Return the pointer to the double `offset` places behind that of `pointer`, in code for `plain_code`.
+def layout_of(*numbers: str, **parts: Any) -> np.dtype[Any]:
+    """Return the type of a record of numbers by name, and of parts: arrays of a shape, or records of a type."""
+    shaped = [(name, part) if isinstance(part, np.dtype) else (name, "f8", part) for name, part in parts.items()]
+    return np.dtype([*((name, "f8") for name in numbers), *shaped])
 
-    With `numba.carray` it makes arrays of parts of a block of numbers without counting of references.
-    """
 
-    def generate(target: Any, builder: Any, signature: Any, values: Any) -> Any:
-        double = target.get_value_type(numba.float64)
-        return builder.gep(values[0], [values[1]], source_etype=double)
-
-    return pointer(pointer, numba.int64), generate
+def record_of(layout: np.dtype[Any], source: object = None, **values: Any) -> np.recarray[Any, Any]:
+    """Return an array (1,) of a record: its parts are `values` or else attributes of `source` by name, or zeros."""
+    record = np.zeros(1, layout).view(np.recarray)
+    for name in layout.fields or ():
+        record[name] = values.get(name, getattr(source, name, 0.0))
+    return record
 
 
 def record_at(layout: Any) -> Callable[[Any], Any]:

@@ -1,4 +1,4 @@
-"""The errors a caller can act on.
+"""The errors a caller can act on, and texts fit to print.
 
 Each message is one line that names the rule, the value and the place, for example
 ``charge_pressure must be > 0 Pa, got -3.0 (rigs/lab.toml)``.
@@ -8,6 +8,11 @@ from __future__ import annotations
 
 #: Most characters of a message at its beginning, where the rule stands, and at its end, where the place does.
 _BEGINNING, _END = 1500, 2500
+
+
+def printable(text: str, kept: str = "", instead: str = "\N{REPLACEMENT CHARACTER}") -> str:
+    """Return a text without what a terminal would obey, whatever a file's name or header brought; `kept` stays."""
+    return "".join(sign if sign.isprintable() or sign in kept else instead for sign in text)
 
 
 class SealscopeError(Exception):

@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from textwrap import fill
 
+from sealscope.errors import printable
+
 #: Width of a line in columns.
 WIDTH = 80
-
-
-def printable(text: str, kept: str = "") -> str:
-    """Return a text without what a terminal would obey, whatever a file's name or header brought; `kept` stays."""
-    return "".join(c if c.isprintable() or c in kept else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 
 def paragraph(text: str, head: str = "", indent: int | None = None, width: int = WIDTH) -> str:

@@ -79,6 +79,8 @@ _ATOMS = {
     for name, row in _TABLES["prefixed"].items()
     for prefix, power in _TABLES["prefixes"].items()
 } | {name: _unit(row) for name, row in _TABLES["plain"].items()}
+#: Standard atmosphere [Pa], by which a gauge pressure is less than the absolute one.
+P_ATM = float(_TABLES["absolute"]["atmosphere"])
 _ATOMS |= {name: _absolute(_ATOMS[of]) for name, of in _TABLES["absolute"].items() if name != "atmosphere"}
 _SPELLINGS = {own: name for name, spellings in _TABLES["spellings"].items() for own in spellings.split()} | {"": "1"}
 _SIGNS, _KINDS = str.maketrans(_TABLES["signs"]), _TABLES["kinds"]

@@ -30,6 +30,31 @@ def test_what_a_task_raises_is_raised():
         list(carried_out(math.sqrt, [4.0, -1.0], 2))
 
 
+@pytest.fixture
+def cluster(request):
+    """Two workers of Dask, in threads or in processes of their own, of which the death of one counts at once."""
+    distributed, dask = pytest.importorskip("distributed"), pytest.importorskip("dask")
+    alike = {"dashboard_address": None, "silence_logs": 50, "processes": request.param}
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, **alike) as opened,
+    ):
+        yield opened.scheduler_address
+
+
+@pytest.mark.parametrize("cluster", [False], indirect=True, ids=["threads"])
+def test_what_a_task_raises_on_a_cluster_is_raised(cluster):
+    with pytest.raises(ValueError, match="math domain error"):
+        list(carried_out(math.sqrt, [4.0, -1.0], 1, cluster))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cluster", [True], indirect=True, ids=["processes"])
+def test_a_worker_that_dies_loses_its_own_item_alone(die_on, cluster):
+    results = dict(carried_out(partial(die_on, 3), range(8), 1, cluster))
+    assert results == {item: None if item == 3 else item for item in range(8)}
+
+
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="looks at processes in /proc")
 def test_closing_ends_processes_at_work():
     def alive():

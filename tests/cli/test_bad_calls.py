@@ -107,6 +107,7 @@ def test_an_unresolved_run_comes_through_only_when_asked_for_and_is_marked(call,
         (("convert", "log.csv", "log.xls"), "a recording's file must end in .nc"),
         (("convert", "log.csv", "nowhere/log.nc"), "the folder of a file to write must exist, got nowhere"),
         (("fmu", "-o", "leak.fmu", "--sensor", "volume", "--step", "1 ms"), "--step is of a rig's solver, got it with"),
+        (("fmu", "-o", "leak.fmu", "--sensor", "volume", "--error", "1[Pa]"), "--error is of a rig's solver, got it"),
         (("fmu", "-o", "eha.fmu", "--rate", "100 Hz"), "--rate is of a soft sensor, got it without --sensor"),
         (
             ("fmu", "-o", "leak.fmu", "--sensor", "volume", "--rate", "10 Hz"),

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 import sealscope as ss
-from sealscope.control import CONTROLLERS, Drive, FaultTolerant, Flatness, LeakObserver, PositionPI, controller_named
+from sealscope.control import CONTROLLERS, Drive, FaultTolerant, Flatness, PositionPI, controller_named
+from sealscope.control.leak_observer import conductance as estimate_of
+from sealscope.control.leak_observer import observed, observer_of
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.simulation.experiment import Experiment
@@ -58,7 +60,7 @@ def test_the_inverse_of_a_drive_gives_the_flow_against_the_pressure():
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_the_observer_returns_the_conductance_of_a_balance_that_holds(sign):
     balance = FaultTolerant.of(RIG).balance
-    observer, rate, G = LeakObserver(balance, 500.0), 500.0, 3e-13
+    (observer,), rate, G = observer_of(balance, 500.0), 500.0, 3e-13
     t = np.arange(10_000) / rate
     x, p = 0.05 * np.sin(1.5 * t), 1e6 + sign * 0.3e6 * np.sin(0.7 * t)
     high, low = np.maximum(2.5e6 + 0.0 * p, p), p
@@ -66,7 +68,8 @@ def test_the_observer_returns_the_conductance_of_a_balance_that_holds(sign):
     area = balance.area_A if sign > 0 else balance.area_B
     theta = (area * x + G * np.cumsum(p_A - p_B) / rate) / balance.D
     for sample in zip(theta, x, p_A, p_B, strict=True):
-        estimate, sd, blocks = observer.update(*sample)
+        observed(observer, *sample)
+    estimate, sd, blocks = estimate_of(observer)
     # left out above: oil is drawn at the low side's pressure, a share of dp/K of what the pump turns
     assert abs(estimate - G) < max(4.0 * sd, 0.02 * G)
     assert blocks > 30
@@ -74,13 +77,16 @@ def test_the_observer_returns_the_conductance_of_a_balance_that_holds(sign):
 
 def test_a_leak_that_opens_at_once_is_followed_within_three_blocks_and_an_outlier_is_not():
     balance = FaultTolerant.of(RIG).balance
-    observer, rate = LeakObserver(balance, 500.0), 500.0
+    (observer,), rate = observer_of(balance, 500.0), 500.0
     G = np.repeat([0.0, 2.6e-12], 5000)
     theta = np.cumsum(G * 3e6) / rate / balance.D
     theta[2500:2600] += 1.0  # a slip of the encoder across the end of a block
-    observed = [observer.update(angle, 0.0, 4e6, 1e6)[0] for angle in theta]
-    assert np.abs(observed[:5000]).max() < 1e-14
-    assert observed[5000 + 3 * 250] == pytest.approx(2.6e-12, rel=0.1)
+    estimates = []
+    for angle in theta:
+        observed(observer, angle, 0.0, 4e6, 1e6)
+        estimates.append(estimate_of(observer)[0])
+    assert np.abs(estimates[:5000]).max() < 1e-14
+    assert estimates[5000 + 3 * 250] == pytest.approx(2.6e-12, rel=0.1)
 
 
 @dataclass(frozen=True)

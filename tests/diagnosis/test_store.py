@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.inference.circuit.store import lost_oil
-from sealscope.diagnosis.inference.terms import ATMOSPHERE, Signals
+from sealscope.diagnosis.inference.terms import Signals
 from sealscope.parameters import Rig, load_rig
+from sealscope.units import P_ATM
 
 RATE, SECONDS, CYCLE = 100.0, 120.0, 3.0
 
@@ -24,8 +25,8 @@ def signals(rig: Rig, lost: float) -> Signals:
     x = 0.05 * np.sin(2.0 * np.pi * t / CYCLE)
     makeup, cylinder = rig.makeup, rig.cylinder
     given = (cylinder.A_A - cylinder.A_B) * x + lost * np.maximum(t - 60.0, 0.0)
-    charge = rig.fluid.p_charge + ATMOSPHERE
-    p_B = charge * (1.0 + given / makeup.V_gas) ** -makeup.n_gas - ATMOSPHERE
+    charge = rig.fluid.p_charge + P_ATM
+    p_B = charge * (1.0 + given / makeup.V_gas) ** -makeup.n_gas - P_ATM
     p_A = np.full_like(t, 2e6)
     own = {"x": x, "p_A": p_A + noise.normal(0.0, 1e3, t.size), "p_B": p_B + noise.normal(0.0, 1e3, t.size)}
     return Signals(own, RATE, {})

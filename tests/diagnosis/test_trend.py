@@ -299,6 +299,17 @@ def test_numbers_out_of_range_are_refused(wrong: dict[str, float]) -> None:
         trend_of(life(3), **wrong)  # type: ignore[arg-type]
 
 
+def test_the_first_recordings_are_healthy_whether_they_are_compared_or_not() -> None:
+    """A leak from day 5 on, five healthy days: it is found as well where one of these is defective, or comes twice."""
+    days = [reading(day, HEALTHY * (1.0 + 0.02 * (-1) ** day) * (1.0 if day < 5 else 4.0)) for day in range(10)]
+    defective = replace(days[0], basis=None, problem="p_A is constant", level=math.nan, error=math.nan)
+    copy = replace(days[1], file="day_1_copy.csv")
+    assert trend_of(days, healthy=5).verdict == "leak"
+    trend = trend_of([defective, *days[1:]], healthy=5)
+    assert (trend.verdict, trend.alarm and trend.alarm.day) == ("leak", 6.0)
+    assert trend_of([*days, copy], healthy=5).verdict == "leak"
+
+
 def test_many_recordings_are_merged(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Levels, "merged", partialmethod(Levels.merged, 60))
     trend = trend_of(life(150, wears=0.004, since=100.0, scatter=0.05), healthy=20)

@@ -48,6 +48,8 @@ int sealscope_report(int64_t *code, void **u, double *v, double *in, double *y, 
     out[1] = y[4] / 1e5;
     out[2] = y[2] * 1e3;
     out[3] = y[1] * 180.0 / 3.14159265358979323846;
+    out[4] = 40.0;
+    out[5] = 1.2e-6 * y[0] * 6e4;
     *code = 0;
     return 0;
 }
@@ -73,7 +75,7 @@ CONFIG = """
 #define N_STATES 6
 #define N_VALUES 1
 #define N_INPUTS 2
-#define N_RESULTS 4
+#define N_RESULTS 6
 #define INPUT_BASE 1
 #define VALUE_BASE 1000
 #define RESULT_BASE 2000
@@ -92,6 +94,8 @@ VARIABLES = {
     "rod.pressure": (2001, "output", "bar"),
     "piston.travel": (2002, "output", "mm"),
     "motor.angle": (2003, "output", "deg"),
+    "oil.temperature": (2004, "output", "degC"),
+    "pump.flow": (2005, "output", "L/min"),
 }
 MAP = {
     "u": "drive.voltage", "G": "seal.conductance", "p_A": "cap.pressure", "p_B": "rod.pressure", "x": "piston.travel",
@@ -124,7 +128,7 @@ def plant(tmp_path_factory):
         for name, (reference, causality, unit) in VARIABLES.items()
     )
     outputs = "".join(f'<Unknown index="{k}"/>' for k, v in enumerate(VARIABLES.values(), 1) if v[1] == "output")
-    units = "".join(f'<Unit name="{unit}"/>' for unit in ("mV", "bar", "mm", "deg"))
+    units = "".join(f'<Unit name="{unit}"/>' for unit in ("mV", "bar", "mm", "deg", "degC", "L/min"))
     path = place / "plant.fmu"
     with zipfile.ZipFile(path, "w") as archive:
         archive.write(library, "binaries/linux64/plant.so")
@@ -157,6 +161,15 @@ def test_a_foreign_unit_is_recorded_and_diagnosed(plant, tmp_path):
     assert healthy.verdict == "no leak"
     assert leaking.verdict == "leak"
     assert leaking.onset_s == pytest.approx(60.0, abs=2.0)
+
+
+def test_what_no_instrument_reads_is_recorded_as_the_unit_gives_it(plant):
+    experiment = ss.Experiment.of(command="2 sin(3t)", duration=2.0)
+    recording = ss.record_fmu(plant, experiment, map=MAP | {"T_oil": "oil.temperature", "q_pump": "pump.flow"})
+    np.testing.assert_allclose(recording["T_oil"], 313.15, rtol=1e-12)
+    assert (recording.units["T_oil"], recording.units["q_pump"]) == ("K", "m^3/s")
+    turned = 1.2e-6 * np.gradient(recording["theta"]) * recording.rate  # of whole counts
+    np.testing.assert_allclose(np.cumsum(recording["q_pump"] - turned) / recording.rate, 0.0, atol=1e-8)
 
 
 def test_a_unit_of_our_own_is_recorded_as_simulate_records(tmp_path):

@@ -28,13 +28,15 @@ LEAK = WatchedLeak(
 )
 
 
-def through(judge: AlarmJudge, flows: list[float | None], leak: WatchedLeak | None = LEAK) -> list[str]:
+def through(
+    judge: AlarmJudge, flows: list[float | None], leak: WatchedLeak | None = LEAK, settings: WatchSettings = SETTINGS
+) -> list[str]:
     """What happens as blocks of these flows follow each other."""
     happened = []
     for number, lpm in enumerate(flows):
         interval = None if lpm is None else (lpm, lpm)
         change = judge.take(
-            BlockEstimate(number, 3.0 * number, "alarm", lpm, interval, lpm, interval), leak, 1, SETTINGS
+            BlockEstimate(number, 3.0 * number, "alarm", lpm, interval, lpm, interval), leak, 1, settings
         )
         if change is not None and change[1]:
             happened.append(change[1])
@@ -76,6 +78,25 @@ def test_it_returns_well_below_its_threshold():
     assert judge.alarm is None
 
 
+def test_what_rises_again_before_anybody_saw_it_is_the_same_alarm():
+    judge = AlarmJudge("a")
+    through(judge, [0.003] * 2)
+    judge.marked("shelved", 3.0, until=1e4)
+    assert through(judge, [0.0] * 2 + [0.003] * 2) == ["returned", "raised"]
+    assert judge.alarm is not None
+    assert (judge.alarm.id, judge.alarm.active, judge.alarm.shelved, judge.raised) == ("a-1", True, True, 1)
+
+
+def test_a_clock_that_is_set_back_shelves_no_longer():
+    judge = AlarmJudge("a")
+    block = BlockEstimate(1, 1e6, "alarm", 0.003, None, 0.003, None)
+    for _ in range(2):
+        judge.take(block, LEAK, 1, SETTINGS)
+    judge.marked("shelved", 1e6, until=1e6 + 3600.0)
+    shelved = [judge.take(replace(block, t=t), LEAK, 1, SETTINGS)[0].shelved for t in (100.0, 3600.0, 3800.0)]
+    assert shelved == [True, True, False]
+
+
 def test_an_error_must_be_seen_again_and_becomes_a_warning_below():
     judge = AlarmJudge("a")
     through(judge, [0.003] * 2)
@@ -85,8 +106,17 @@ def test_an_error_must_be_seen_again_and_becomes_a_warning_below():
     assert (judge.alarm.state, judge.alarm.status_word) == ("new", 6)
     assert through(judge, [0.004] * 2) == ["warning"]
     judge.marked("acknowledged", 50.0)
-    assert through(judge, [0.0] * 2, None) == ["returned"]
+    assert through(judge, [0.0] * 2) == ["returned"]
     assert judge.alarm is None
+
+
+def test_an_error_returns_without_a_limit_for_errors_as_well():
+    """Settings of a restart may have none: the alarm then is a warning, or over where the leak is below that."""
+    for lpm, happens in ((0.005, ["returned"]), (0.03, ["warning"])):
+        judge = AlarmJudge("a")
+        through(judge, [0.02] * 2)
+        assert judge.alarm is not None and judge.alarm.level == "error"
+        assert through(judge, [lpm] * 6, settings=WatchSettings(warning_lpm=0.01)) == happens
 
 
 def test_without_litres_a_leak_is_a_warning():
@@ -108,7 +138,8 @@ def test_a_valid_alarm_stays_so_until_its_cause_is_over_or_repaired():
     assert judge.over_s == 20.0
     through(judge, [0.003] * 2)
     judge.marked("valid", 30.0)
-    assert through(judge, [0.0] * 2, None) == ["returned"]
+    assert through(judge, [0.0] * 20, None) == []  # the detector began anew, and says nothing of the leak
+    assert through(judge, [0.0] * 2) == ["returned"]
     assert (judge.alarm, judge.raised) == (None, 2)
 
 

@@ -115,7 +115,7 @@ def test_while_the_database_is_away_the_connection_stays_and_the_broker_keeps_th
     undisturbed, broker: Broker, settings: MonitorSettings, monkeypatch
 ):
     """A locked database stops the storing for longer than the broker would wait for a client that is silent."""
-    monkeypatch.setattr("sealscope.monitor.sources.broker.KEEP_ALIVE_S", 2)
+    monkeypatch.setattr("sealscope.monitor.mqtt_client.KEEP_ALIVE_S", 2)
     monkeypatch.setattr("sealscope.monitor.service._WAITING", 8)
     lines = LINES.splitlines()
     kept(broker)

@@ -104,6 +104,23 @@ def test_nothing_is_taught_from_the_onset_of_a_valid_alarm_on_until_the_repair(t
         again.with_healthy(healthy(alarm.onset_s + 3600.0, 21))
 
 
+def test_the_last_word_on_an_alarm_counts(tmp_path, commissioned):
+    """An alarm that was valid and is invalid holds no teaching up: not of its samples, nor of later recordings."""
+    service = alarmed(tmp_path, commissioned[3.0e-13])
+    service.actuators.mark(NAME, "valid")
+    service.actuators.mark(NAME, "invalid", text="another valve")
+    assert said_by(service.actuators) == "press.toml: taught as healthy"
+    known = ss.load_machine(tmp_path / "press.toml")
+    assert [own.mark for own in known.alarms] == ["valid", "invalid"]
+    later = known.alarms[1].date_s + 120.0
+    made = {"start": datetime.fromtimestamp(later, UTC).replace(tzinfo=None).isoformat()}
+    late = replace(machine(20, G=3.0e-13, duration=30.0, rate=50.0), provenance=made)
+    assert len(known.with_healthy(late).healthy) == 6
+    again = known.alarms[0]._replace(onset_s=later - 60.0, date_s=later)
+    with pytest.raises(InputError, match="without a leak"):  # another alarm, of a database that counts from 1 again
+        replace(known, alarms=(*known.alarms, again)).with_healthy(late)
+
+
 def test_without_samples_or_a_file_it_says_so(tmp_path, commissioned):
     service = alarmed(tmp_path, commissioned[0.0])
     service.actuators.mark(NAME, "comment", text="its checkpoint takes the place of the samples")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import io
 import math
+import pickle
 import threading
 from collections import Counter
 from collections.abc import Iterator
@@ -53,6 +54,16 @@ def test_values_that_change_are_gathered_and_others_stay():
     assert gatherer.take("x", math.inf, [1.0]) == []
     gatherer.interrupted()
     assert gatherer.take("x", 1e9 + 9.0, [2.0]) == []
+
+
+def test_a_channel_that_never_came_fills_no_memory_and_may_come_late():
+    gatherer, sizes = ValueGatherer(("x", "theta"), 50.0, 1.0, lambda reason: None), []
+    for second in range(200):
+        assert gatherer.take("x", float(second), [float(second)] * 50) == []
+        sizes.append(len(pickle.dumps(vars(gatherer)["_channels"])))
+    assert max(sizes[100:]) < 1.1 * sizes[70]
+    (block,) = gatherer.take("theta", 199.0, [1.0] * 50)
+    assert (block.t[0], block["x"][0]) == (199.0, 199.0)
 
 
 def test_values_in_portions_make_the_same_blocks():

@@ -20,15 +20,18 @@ from sqlalchemy import create_engine, inspect, text
 from sqlalchemy.exc import OperationalError
 from starlette.testclient import TestClient
 
+from sealscope.diagnosis.live.estimates import BlockEstimate
 from sealscope.errors import InputError
-from sealscope.monitor.database.store import MonitorStore, away
+from sealscope.monitor.alarms import AlarmJudge
+from sealscope.monitor.database.store import MonitorStore, StoredRows, away
 from sealscope.monitor.database.tables import metadata
 from sealscope.monitor.page.site import site
 from sealscope.monitor.service import Service
-from sealscope.monitor.settings import PageSettings
+from sealscope.monitor.settings import PageSettings, WatchSettings
 
 from .plant import HEALTHY, LINES, WORN, kill_often, lines_of, rows_of, served, settings_in, until
 from .servers import NO_POSTGRESQL, PostgreSQL
+from .test_alarms import LEAK
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(NO_POSTGRESQL is not None, reason=NO_POSTGRESQL or "")]
 
@@ -137,6 +140,36 @@ def test_three_monitors_share_the_actuators_and_take_over_those_of_a_killed_one(
     events = sorted({json.loads(line)["number"] for line in said})
     assert len(events) == len(theirs["events"])  # none is left out; the last before the kill may come twice
     engine.dispose()
+
+
+def test_an_event_that_is_stored_late_goes_out(url: str):
+    """Of two transactions at once the one that began first may end last: its events must not be passed over."""
+    stores = [MonitorStore(url) for _ in range(2)]
+    passed = []
+
+    def keep(store: MonitorStore, name: str, *, wait: bool) -> None:
+        rows, judge = StoredRows(), AlarmJudge(name)
+        block = BlockEstimate(1, 3.0, "alarm", 0.003, None, 0.003, None)
+        rows.add_alarm(judge.take(block, LEAK, 1, WatchSettings(debounce_blocks=1))[0], "raised", 3.0)
+        with store.writing() as connection:
+            store.keep_rows(connection, rows)
+            if wait:
+                begun.set()
+                time.sleep(1.0)
+
+    def pass_on() -> None:
+        stores[0].pass_on("lines", lambda event: passed.append(event["alarm"]["actuator"]) or True)
+
+    stores[0].keep_position("lines", max([number for number, _ in stores[0].events_since(0)], default=0))
+    begun = threading.Event()
+    late = threading.Thread(target=keep, args=(stores[0], "late"), kwargs={"wait": True})
+    late.start()
+    begun.wait()
+    keep(stores[1], "early", wait=False)
+    pass_on()
+    late.join()
+    pass_on()
+    assert passed == ["late", "early"]
 
 
 def test_while_postgresql_is_away_the_page_says_so_and_nothing_is_lost(undisturbed, server: PostgreSQL, tmp_path: Path):

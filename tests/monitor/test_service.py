@@ -8,22 +8,26 @@ import os
 import sqlite3
 import threading
 import time
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import pytest
 from sqlalchemy.exc import DataError, OperationalError
 
+from sealscope.diagnosis.live.estimates import BlockEstimate, WatchedLeak
 from sealscope.diagnosis.live.watch import STATE_VERSION
 from sealscope.errors import InputError
+from sealscope.monitor.alarms import AlarmJudge
 from sealscope.monitor.database.store import MonitorStore, StoredRows
 from sealscope.monitor.outputs.prometheus import metrics_text
 from sealscope.monitor.service import Service
-from sealscope.monitor.settings import read_settings, template
+from sealscope.monitor.settings import WatchSettings, read_settings, template
 from sealscope.monitor.sources.source_block import digest_of
 from sealscope.simulation.simulate import simulate
 
-from .plant import LINES, WORN, kill_often, lines_of, rows_of, served, settings_in, until, write_files
+from ..diagnosis.balance_machine import machine
+from .plant import LINES, WORN, kill_often, lines_of, moved, rows_of, served, settings_in, until, write_files
 
 
 def test_a_leak_becomes_one_alarm_with_litres_per_minute(undisturbed_run):
@@ -223,6 +227,70 @@ def test_other_settings_begin_a_new_baseline(tmp_path):
     service, _ = served(read_settings(file))
     _, state, _ = service.store.checkpoint("press 1")
     assert (state["watch"]["baseline_version"], state["watch"]["blocks"]) == (2, 44)
+
+
+def test_another_rig_under_the_same_name_begins_a_new_baseline(tmp_path, caplog):
+    """What counts is what the file states, not its name: the same values elsewhere are the same machine."""
+    settings = settings_in(tmp_path)
+    press, moved_to = tmp_path / "press.toml", tmp_path / "settings" / "renamed.toml"
+    moved_to.parent.mkdir()
+
+    def watched(rig: Path, lines: bytes = b"") -> dict[str, Any]:
+        own = [actuator.model_copy(update={"rig": str(rig)}) for actuator in settings.actuator]
+        service, _ = served(settings.model_copy(update={"actuator": own}), lines)
+        return service.store.checkpoint("press 2")[1]["watch"]
+
+    text = (files("sealscope.parameters") / "rigs" / "thesis.toml").read_text()
+    for place in (press, moved_to):
+        place.write_text(text)
+    assert watched(press, LINES)["baseline"] is not None
+    assert (watched(moved_to)["baseline_version"], caplog.text) == (1, "")
+    assert "q_b = { value = 4.9e-6" in text
+    moved_to.write_text(text.replace("q_b = { value = 4.9e-6", "q_b = { value = 9.8e-6"))
+    again = watched(moved_to)
+    assert (again["baseline_version"], again["baseline"]) == (2, None)
+    assert "press 2: its rig or learn_hours are others than it learned with" in caplog.text
+
+
+def test_a_leak_is_not_over_because_the_detector_begins_anew(tmp_path):
+    settings = settings_in(tmp_path)
+    served(settings, LINES)
+    own = [actuator.model_copy(update={"learn_hours": 0.01}) for actuator in settings.actuator]
+    later = moved(machine(3, G=3.0e-13, duration=60.0, rate=50.0), 130.0)
+    service, _ = served(settings.model_copy(update={"actuator": own}), lines_of({"press 1": later}, 150))
+    assert service.actuators.plain()["press 1"]["baseline"]["version"] == 2
+    assert [event["event"] for _, event in service.store.events_since(0)] == ["raised"]
+    assert service.actuators.plain()["press 1"]["state"]["name"] == "maintenance required"
+
+
+def test_a_clock_that_is_set_back_hides_nothing_that_is_new(tmp_path):
+    store = MonitorStore(str(tmp_path / "monitor.db"))
+    rows, judge = StoredRows(), AlarmJudge("a")
+    for number, t in enumerate([9e5, 9e5 + 3.0, 0.0, 3.0], 1):
+        rows.add_estimates("a", [BlockEstimate(number, t, "alarm", 0.003, None, 0.003, None)], None)
+    leak = WatchedLeak(10.0, 9.0, (8.0, 10.0), 0.003, (0.002, 0.004), 1e-13, 1e-15, "step", "leak", "", 50.0, 28.0)
+    for t in (9e5, 3.0):
+        block = BlockEstimate(1, t, "alarm", 0.003, None, 0.003, None)
+        alarm, _ = judge.take(block, leak, 1, WatchSettings(debounce_blocks=1))
+        rows.add_alarm(alarm, "raised", t)
+        rows.add_alarm(judge.marked("repaired", t), "repaired", t)
+    store.keep(rows)
+    assert [row["t"] for row in store.course("a", seconds=60.0)] == [0.0, 3.0]
+    assert [alarm["id"] for alarm in store.alarms()] == ["a-2", "a-1"]
+
+
+def test_a_restart_with_other_thresholds_changes_nothing_that_was_said(tmp_path):
+    """A leak below the threshold is announced when the threshold is lowered: by the next block, and as raised."""
+    settings = settings_in(tmp_path)
+    lines = LINES.splitlines(keepends=True)
+    strict = [own.model_copy(update={"warning_lpm": 10.0, "error_lpm": 20.0}) for own in settings.actuator]
+    served(settings.model_copy(update={"actuator": strict}), b"".join(lines[:-10]))
+    service, _ = served(settings)
+    assert service.actuators.plain()["press 1"]["alarm"] is None
+    assert service.store.alarms() == []
+    service, _ = served(settings, b"".join(lines))
+    assert service.actuators.plain()["press 1"]["alarm"] == service.store.alarms()[0]["id"]
+    assert [event["event"] for _, event in service.store.events_since(0)] == ["raised"]
 
 
 def test_a_fleet_shares_its_budget_and_keeps_its_baselines(tmp_path):

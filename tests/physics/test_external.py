@@ -10,7 +10,8 @@ from scipy.integrate import quad, simpson
 
 from sealscope.errors import SimulationFailed
 from sealscope.physics.external import accumulator_pressure, check_valve_flow, external_leakage
-from sealscope.physics.fluid import P_ATM, effective_bulk_modulus
+from sealscope.physics.fluid import effective_bulk_modulus
+from sealscope.units import P_ATM
 
 MADE_UP = {"check_valves": "present"}
 

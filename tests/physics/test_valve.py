@@ -13,10 +13,10 @@ from scipy.integrate import simpson
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.physics.external import accumulator_compliance, gas_volume, polytropic_pressure
-from sealscope.physics.fluid import P_ATM
 from sealscope.physics.standstill import initial_state
 from sealscope.physics.valve import edge_flow
 from sealscope.simulation.experiment import Experiment
+from sealscope.units import P_ATM
 
 EDGES = ("o_PA", "o_AT", "o_PB", "o_BT")
 

@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sealscope.parameters import load_rig
-from sealscope.physics.fluid import P_ATM, mixture_density_ratio
+from sealscope.physics.fluid import mixture_density_ratio
 from sealscope.simulation.faults import parse_fault
+from sealscope.units import P_ATM
 
 P_VAP = 2e3
 LEAST = P_VAP - P_ATM

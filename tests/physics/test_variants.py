@@ -15,7 +15,7 @@ from scipy.integrate import cumulative_simpson, simpson
 from scipy.interpolate import CubicSpline
 
 from sealscope.parameters import load_rig
-from sealscope.physics.fluid import P_ATM
+from sealscope.units import P_ATM
 
 STEP, DURATION = 1e-5, 0.6
 

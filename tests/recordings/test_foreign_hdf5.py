@@ -1,12 +1,14 @@
 """NetCDF and HDF5 files of others, and Parquet tables of others."""
 
+import json
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
-from sealscope.recordings import COUNTS, read
+from sealscope.recordings import COUNTS, Recording, read
+from sealscope.recordings.oil import oil_temperature
 
 T = np.arange(200) / 500
 P = 2.5 + np.sin(4 * T)
@@ -26,6 +28,31 @@ def test_plain_hdf5_in_groups(tmp_path: Path) -> None:
     assert recording.units["p_A"] == COUNTS
     assert recording["p_B"] == pytest.approx(P * 1e5, rel=1e-15)
     assert read(path, map={"p_A": "rig/daq/PG_1[bar]"}).units["p_A"] == "Pa"
+
+
+def test_what_files_say_beside_the_samples_is_the_same_in_every_format(tmp_path: Path) -> None:
+    pd, pa = pytest.importorskip("pandas"), pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    said = {"Oil temperature": "45 degC", "Operator": "N. N.", "serial": 7}
+    columns = {"t [s]": T.tolist(), "p_A [bar]": P.tolist()}
+    (tmp_path / "log.json").write_text(json.dumps(said | columns))
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        file.attrs.update(said | {"tool": np.bytes_("DAQ"), "axes": [1, 2], "_hidden": "x"})
+        file["t"], file["p_A"] = T, P
+        file["t"].attrs["units"], file["p_A"].attrs["units"] = "s", "bar"
+    frame = pd.DataFrame(columns)
+    frame.attrs.update(said)
+    table = pa.table(columns).replace_schema_metadata({name: str(value) for name, value in said.items()})
+    parquet.write_table(table, tmp_path / "log.parquet")
+    recordings = [
+        *(read(tmp_path / f"log.{suffix}") for suffix in ("json", "h5", "parquet")),
+        Recording.from_pandas(frame),
+    ]
+    for recording in recordings:
+        about = dict(recording.provenance["about"])
+        assert about.pop("tool", "DAQ") == "DAQ"
+        assert about == {name: str(value) for name, value in said.items()}
+        assert oil_temperature(recording) == 45.0
 
 
 def test_without_time_a_rate_is_needed(tmp_path: Path) -> None:

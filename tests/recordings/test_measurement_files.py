@@ -186,3 +186,14 @@ def test_what_a_file_says_of_its_recording(tmp_path: Path) -> None:
     assert read(tmp_path / "log.tdms").provenance["about"]["Oil temperature"] == "41.5"
     assert read(lvm(tmp_path)).provenance["about"] == {"operator": "N. N."}
     assert read(xlsx(tmp_path)).provenance.get("about") is None
+
+
+def test_packets_of_several_days_have_one_order_of_day_and_month(tmp_path: Path) -> None:
+    path = lvm(tmp_path, packets=2)
+    first, second = (f"Date{3 * f'{chr(9)}{day}/06/2024'}" for day in (12, 13))
+    packets = path.read_text().replace(f"Date{3 * f'{chr(9)}2024/05/31'}", first)
+    at = packets.rindex(first)
+    path.write_text(packets[:at] + second + packets[at + len(first) :])
+    recording = read(path)
+    assert recording.provenance["start"].startswith("2024-06-12T12:00:00.25")
+    assert recording.t[[0, -1]] == pytest.approx([0.0, 86400 + T[-1]])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 
 import sealscope as ss
 from sealscope.errors import InputError, UnreadableFile
+from sealscope.recordings import join
 from sealscope.recordings.formats import text
 
 RATE = 500.0
@@ -50,6 +52,41 @@ def test_parts_are_the_whole(every: float, stamps: bool, chunk: int, tmp_path: P
     else:
         begins = [np.datetime64(part.provenance["start"]) - np.datetime64(whole.provenance["start"]) for part in parts]
         assert [begin / np.timedelta64(1, "ms") for begin in begins] == [2.0 * size * k for k in range(len(parts))]
+
+
+def moments(count: int) -> np.ndarray:
+    return np.datetime64("2024-06-12T23:59:57", "ms") + (10 * np.arange(count)).astype("m8[ms]")
+
+
+#: Times of samples at 100 Hz, as files hold them.
+TIMES: dict[str, Callable[[int], list[str]]] = {
+    "seconds": lambda count: [f"{k / 100}" for k in range(count)],
+    "coarse": lambda count: [f"{k // 10 / 10}" for k in range(count)],
+    "epoch": lambda count: [f"{1717151400000 + 10 * k}" for k in range(count)],
+    "share of the day": lambda count: [repr(0.3 + k / 8_640_000) for k in range(count)],
+    "days": lambda count: [repr(45_000 + k / 8_640_000) for k in range(count)],
+    "date": lambda count: [time.item().strftime("%d/%m/%Y %H:%M:%S.%f") for time in moments(count)],
+    "time of the day": lambda count: [str(time)[11:] for time in moments(count)],
+    "minutes": lambda count: [str(time)[14:] for time in moments(count)],
+    "last sample first": lambda count: [f"{k / 100}" for k in range(count)][::-1],
+}
+
+
+@pytest.mark.parametrize("form", TIMES)
+@pytest.mark.parametrize("every", [0.3, 2.5, 5.0])
+def test_what_is_decided_of_the_time_holds_for_all_parts(form: str, every: float, tmp_path: Path) -> None:
+    """The last part has one sample; a word stands in a part of 30 samples, 1 % of the log at most."""
+    path = tmp_path / "log.csv"
+    path.write_text(
+        "Time;p_A [bar]\n"
+        + "".join(f"{time};{'OVERLOAD' if k == 40 else k % 7}\n" for k, time in enumerate(TIMES[form](1001)))
+    )
+    whole, parts = ss.read(path), list(ss.read_parts(path, every))
+    assert len(parts) == (1 if form == "last sample first" else 1 + 1000 // round(100 * every))
+    joined = join(parts) if len(parts) > 1 else parts[0]
+    assert joined.rate == whole.rate
+    assert joined.t == pytest.approx(whole.t, abs=1e-5)
+    assert np.array_equal(joined["p_A"], whole["p_A"], equal_nan=True)
 
 
 @pytest.mark.parametrize("suffix", [".nc", ".parquet", ".csv.gz"])

@@ -1,6 +1,9 @@
 """What is written reads back as the same recording, to the bit, in every format; nothing half-written stays."""
 
+import copy
 import os
+import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +14,7 @@ from hypothesis.extra import numpy as hnp
 
 from sealscope.errors import InputError
 from sealscope.recordings import CHANNEL_UNITS, COUNTS, Recording, read, write
+from sealscope.recordings.cycle import find_cycle
 
 FORMATS = ["nc", "csv", "tsv", "parquet"]
 json_values = st.recursive(
@@ -73,6 +77,16 @@ def plain(count: int = 600) -> Recording:
     t = np.arange(count) / 500
     p = 3e5 + 1e4 * np.sin(4 * t)
     return Recording(t, {"p_A": p, "x": 0.01 * np.cos(4 * t)}, CHANNEL_UNITS, 500.0, {"by": "test"}, ("made",))
+
+
+def test_a_recording_is_pickled_and_copied_whole() -> None:
+    made = replace(plain(), bridged=np.arange(600) < 3)
+    find_cycle(made)  # what is known of it by then is not part of it
+    for other in (pickle.loads(pickle.dumps(made)), copy.deepcopy(made)):
+        assert_same(other, made)
+        assert np.array_equal(other.bridged, made.bridged)
+        assert not any(values.flags.writeable for values in (other.t, other.bridged, *other.channels.values()))
+        assert find_cycle(other) == find_cycle(made)
 
 
 @pytest.mark.parametrize("suffix", ["nc4", "h5", "hdf5", "txt", "pq"])

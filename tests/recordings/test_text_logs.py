@@ -1,5 +1,6 @@
 """Logs of other people's loggers: delimiters, decimals, headers, units, encodings, time columns, maps."""
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -185,15 +186,31 @@ def test_split_map_option() -> None:
     [
         (("5/31/2024 11:59:59.999 PM", "6/1/2024 12:00:00.001 AM"), "2024-05-31T23:59:59.999"),
         (("5/31/2024 12:00:00.000 pm", "5/31/2024 12:00:00.002 pm"), "2024-05-31T12:00:00.000"),
+        (("5/31/2024 1:30:00.000 p.m.", "5/31/2024 1:30:00.002 p.m."), "2024-05-31T13:30:00.000"),
+        (("5/31/2024 12:30:00.000 A.M.", "5/31/2024 12:30:00.002 A.M."), "2024-05-31T00:30:00.000"),
+        (("05-12-2024 23:59:59.999", "05-13-2024 00:00:00.001"), "2024-05-12T23:59:59.999"),
+        (("12-05-2024 23:59:59.999", "13-05-2024 00:00:00.001"), "2024-05-12T23:59:59.999"),
+        (("05-12-2024 08:00:00.000", "05-12-2024 08:00:00.002"), "2024-12-05T08:00:00.000"),
+        (("05/12/2024 08:00:00.000", "05/12/2024 08:00:00.002"), "2024-05-12T08:00:00.000"),
         (("31/05/2024 08:00:00.000", "31/05/2024 08:00:00.002"), "2024-05-31T08:00:00.000"),
         (("2024/05/31 08:00:00.000", "2024/05/31 08:00:00.002"), "2024-05-31T08:00:00.000"),
     ],
 )
-def test_dates_with_strokes(tmp_path: Path, stamps: tuple[str, str], start: str) -> None:
+def test_dates_of_either_order(tmp_path: Path, stamps: tuple[str, str], start: str) -> None:
     text = "timestamp,p_A [bar]\n" + "".join(f"{stamp},{3 + i}\n" for i, stamp in enumerate(stamps))
     recording = read(saved(tmp_path, text))
     assert recording.t == pytest.approx([0, 0.002], abs=1e-12)
     assert recording.provenance["start"].startswith(start)
+    told = any("none has a number over 12" in line for line in recording.history)
+    assert told == (start in ("2024-12-05T08:00:00.000", "2024-05-12T08:00:00.000"))
+
+
+@pytest.mark.parametrize(("form", "step"), [("%M:%S.0", 1), ("%H:%M:%S", 30)])
+def test_a_clock_without_a_date_goes_on_however_often_it_begins_again(form: str, step: int, tmp_path: Path) -> None:
+    seconds = 3000 + step * np.arange(3 * 3600 if step == 1 else 9000)
+    rows = "".join(f"{time.strftime(form, time.gmtime(second))};1\n" for second in seconds.tolist())
+    recording = read(saved(tmp_path, "Time;p_A [bar]\n" + rows))
+    assert np.array_equal(recording.t, seconds - 3000.0)
 
 
 @pytest.mark.parametrize(("rate", "step"), [(500.0, 1.0), (333.25, 1.0), (100.0, 0.05)])

@@ -204,6 +204,8 @@ def test_the_drawing_is_the_machines_own(recording):
     assert "single-rod cylinder" in read.text and "The rod leaves chamber B." in read.text
     assert "accumulator" in read.text and "needle valve" in read.text  # the flow meter was recorded
     assert circuit(recording, **{"cylinder.A_A": 316.5e-6})[0].rods == "A"
+    piloted, read = circuit(recording, **{"makeup.check_valves": "pilot-operated"})
+    assert piloted.make_up and "accumulator" in read.text
     assert "one-way throttle A" in circuit(recording, **{"line.orifices": "present"})[1].text
     unknown = circuit_of(None, recording)
     assert (unknown.cylinder, unknown.throttles) == ("cylinder", False)
@@ -285,7 +287,7 @@ def test_a_page_is_written_whole_or_not_at_all(tmp_path, recording, make_diagnos
 
 
 def test_a_folder_that_is_not_there_is_one_clear_line(tmp_path, recording, make_diagnosis):
-    with pytest.raises(InputError, match=r"^cannot write .*absent.*No such file or directory"):
+    with pytest.raises(InputError, match=r"^the folder of a file to write must exist, got .*absent"):
         write_page(tmp_path / "absent" / "page.html", recording, make_diagnosis())
 
 

@@ -15,6 +15,7 @@ from sealscope.errors import InputError
 from sealscope.reporting.trend.page import render_trend_page, trend_pictures, write_trend_page
 from sealscope.reporting.trend.text import trend_text
 
+from ..diagnosis.test_trend import life
 from .pages import Reader, places
 
 
@@ -37,6 +38,17 @@ def test_the_page_is_whole_and_shows_what_happened(trend: Trend) -> None:
     wide = page[page.index('class="trend wide"') : page.index('class="trend narrow"')]
     assert wide.count('class="point other"') == 3 and wide.count('class="absent"') == 1
     assert wide.count('class="point') == 39 and wide.count('class="course"') == len(trend.episodes) == 2
+
+
+def test_the_oil_is_taken_out_where_every_recording_states_it() -> None:
+    for temperatures, words in (
+        ([40.0] * 3, "taken out"),
+        ([40.0, None, 40.0], "not taken out"),
+        ([None] * 3, "not known"),
+    ):
+        days = [replace(own, temperature=known) for own, known in zip(life(3), temperatures, strict=True)]
+        text = " ".join(trend_text(trend_of(days), whole=True).split())
+        assert f"The oil's temperature is {words}." in text
 
 
 def test_the_chart_stands_within_its_frame(trend: Trend) -> None:

@@ -165,7 +165,7 @@ def test_faults_and_leaks_meet_a_closed_loop():
 
 
 def test_a_recorded_force_is_taken_as_it_was(tmp_path):
-    path = tmp_path / "force.csv"
+    path = tmp_path / "force  of a press.csv"
     path.write_text("t [min],F [kN],note\n1,0.5,a\n1.01,1.5,b\n1.03,-0.5,c\n")
     force = Experiment.of(load=f"file {path}", duration=1.0).load
     np.testing.assert_allclose(force.at(np.array([0.0, 0.3, 0.6, 1.2, 9.0])), [500.0, 1000.0, 1500.0, 500.0, -500.0])
@@ -197,9 +197,11 @@ def test_words_of_targets_and_loads():
 
 def test_a_recorded_position_is_a_target(tmp_path):
     t = np.arange(200) / 50.0
-    path = tmp_path / "moved.csv"
+    path = tmp_path / "moved  twice.csv"
     np.savetxt(path, np.c_[t, 10.0 * np.sin(t)], delimiter=",", header="t [s],x [mm]", comments="")
-    np.testing.assert_allclose(parse_position(f"position file {path}").at(t), 0.01 * np.sin(t), atol=1e-9)
+    target = parse_position(f"position  file {path}")
+    np.testing.assert_allclose(target.at(t), 0.01 * np.sin(t), atol=1e-9)
+    assert str(target) == f"position file {path}"
     path.write_text("t [s],p_A [Pa]\n0,1\n0.1,2\n0.2,3\n")
     with pytest.raises(InputError, match="a recorded position must have the channel x"):
         parse_position(f"position file {path}")

@@ -55,6 +55,16 @@ def test_faults_are_read_from_words_and_their_own_words_read_back(text, fault):
     assert Experiment.of(set=LEAKING_PUMP, duration=1.0, fault=result).faults[0].kind == fault.kind
 
 
+def test_capitals_do_not_matter():
+    for text, plain in (
+        ("Friction X1.2 From 9 S", "friction x1.2 from 9 s"),
+        ("SENSOR p_A STUCK from 9 s", "sensor p_A stuck from 9 s"),
+        ("Rod Seal a g = 2e-13", "rod seal A G = 2e-13 from 0 s"),
+        ("Shut-off b To 0 % Within 0.5 s", "shut-off B to 0 % from 0 s within 0.5 s"),
+    ):
+        assert str(parse_fault(text)) == str(parse_fault(plain))
+
+
 def test_no_fault_is_none():
     assert parse_fault("none") is None
     assert Experiment.of(fault=["none", "friction x2"], duration=1.0).faults == (Fault("friction", 2.0),)

@@ -14,7 +14,7 @@ _PLATFORM = (
     "System it shall run on: linux, windows, macos; FMI 3 also macos-arm, linux-arm; repeat. By default this one; "
     "others need the extra `fmu`."
 )
-_ERROR = "Error that a pressure may have, by which the solver's step is chosen."
+_ERROR = "Error that a pressure may have, by which the solver's step is chosen (1 Pa)."
 _SENSOR = (
     "Write a soft sensor of leakage instead: volume, which reads the chamber pressures, the pump's angle and the "
     "piston's position."
@@ -27,7 +27,7 @@ def fmu(
     overrides: SetOption = None,
     version: Annotated[int, Option("--fmi", help="Version of the interface, 2 or 3.")] = 2,
     platforms: Annotated[list[str] | None, Option("--platform", help=_PLATFORM)] = None,
-    error: Annotated[str, Option(help=_ERROR)] = "1[Pa]",
+    error: Annotated[str | None, Option(help=_ERROR)] = None,
     step: Annotated[str | None, declared("step")] = None,
     sensor: Annotated[str | None, Option(help=_SENSOR)] = None,
     rate: Annotated[str | None, Option(help="Sampling rate of the soft sensor (500 Hz).")] = None,
@@ -37,7 +37,7 @@ def fmu(
     The rig has the inputs command, leak and load, and every parameter can be tuned. The soft sensor takes readings and
     gives the leakage in m^3/s with its 95 % interval.
     """
-    from sealscope.fmu.build import write_fmu, write_sensor_fmu
+    from sealscope.fmu.build import ERROR, write_fmu, write_sensor_fmu
     from sealscope.units import parse_quantity
 
     check_folder(output)
@@ -46,11 +46,13 @@ def fmu(
         if rate is not None:
             raise InputError("--rate is of a soft sensor, got it without --sensor")
         longest = None if step is None else parse_quantity(step, "s", name="step")
-        variables = write_fmu(output, **common, error=parse_quantity(error, "Pa", name="error"), step=longest)
+        allowed = ERROR if error is None else parse_quantity(error, "Pa", name="error")
+        variables = write_fmu(output, **common, error=allowed, step=longest)
         takes = f"steps of at most {next(v.start for v in variables if v.name == 'step'):.3g} s"
     else:
-        if step is not None:
-            raise InputError("--step is of a rig's solver, got it with --sensor")
+        for name, value in (("--step", step), ("--error", error)):
+            if value is not None:
+                raise InputError(f"{name} is of a rig's solver, got it with --sensor")
         hertz = 500.0 if rate is None else parse_quantity(rate, "Hz", name="rate")
         variables = write_sensor_fmu(output, **common, sensor=sensor, rate=hertz)  # type: ignore[arg-type]
         takes = f"samples at {hertz:g} Hz"

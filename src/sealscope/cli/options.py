@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from typer import Argument, Context, Option, echo
 
-from sealscope.errors import InputError, SealscopeError, UnreadableFile
-from sealscope.paragraphs import paragraph, printable
+from sealscope.errors import InputError, SealscopeError, UnreadableFile, printable
+from sealscope.paragraphs import paragraph
 from sealscope.simulation.arguments import Arguments
 
 if TYPE_CHECKING:
@@ -364,11 +364,10 @@ def attempt(file: Path, work: Callable[[], T]) -> T | None:
 
 def check_folder(file: Path) -> None:
     """Refuse a file whose folder is not there before the long work, not after it; remove what a killed call left."""
-    if not file.parent.is_dir():
-        raise InputError(f"the folder of a file to write must exist, got {file.parent} ({file})")
-    from sealscope.storage.atomic import remove_temporaries
+    from sealscope.storage import atomic
 
-    remove_temporaries(file.parent, file.name)
+    atomic.check_folder(file)
+    atomic.remove_temporaries(file.parent, file.name)
 
 
 def write_text(file: Path, text: str) -> None:

@@ -10,7 +10,6 @@ from sealscope.control.drive import drive_of as drive_of
 from sealscope.control.fault_tolerant import FaultTolerant as FaultTolerant
 from sealscope.control.flatness import Flatness as Flatness
 from sealscope.control.leak_observer import Balance as Balance
-from sealscope.control.leak_observer import LeakObserver as LeakObserver
 from sealscope.control.margins import Margins as Margins
 from sealscope.control.margins import margins as margins
 from sealscope.control.position import PositionPI as PositionPI

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from sealscope.compiled import layout_of, record_at
 from sealscope.recordings.recording import Array
 
 
@@ -28,8 +29,8 @@ class Measured(NamedTuple):
     theta: float = 0.0
 
 
-#: Places of what is measured, in the order of `Measured`, as a compiled law is given it.
-T, TARGET, TARGET_SPEED, X, P_A, P_B, ANGLE = range(len(Measured._fields))
+#: What is measured, at the pointer by which a compiled law is given it.
+measured_at = record_at(layout_of(*Measured._fields))
 
 
 class CompiledLaw(NamedTuple):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from sealscope.compiled import kernel, law
+from sealscope.compiled import kernel, law, layout_of, record_of
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 
@@ -22,27 +22,28 @@ if TYPE_CHECKING:
 _LEAST_ACROSS = 0.1
 #: How many times its growth a small voltage is moved to where an overlap ends.
 _ACROSS_OVERLAP = 4.0
-#: Numbers of the inverse of a drive: which it is, and what that needs (`Drive.block`, `ValveDrive.block`).
-DRIVE_BLOCK = 8
-_PUMP, _VALVE = 0.0, 1.0
+#: Numbers of the inverse of a drive, and what it remembers: those of `Drive`, or of `ValveDrive`, whose Q_N is > 0.
+DRIVE = layout_of(
+    *("displacement", "omega_per_volt", "shortfall", "fading", "droop", "high_passed", "needed_before"),
+    *("Q_N", "dp_N", "u_N", "p_s", "dead"),
+)
 
 
 @law
 def drive_voltage(m: Any, flow: float, dp: float) -> float:
     """Return the voltage [V] that makes a drive give a flow [m^3/s] against p_A - p_B [Pa], sample by sample.
 
-    `m`: the block of numbers of a `Drive` or of a `ValveDrive`, which say what it is.
+    `m`: a record `DRIVE`.
     """
-    if m[0] == _VALVE:
-        p_s = m[4]
-        across = max(p_s - math.copysign(dp, dp * flow), _LEAST_ACROSS * p_s)
-        u = m[3] * flow / (m[1] * math.sqrt(0.5 * across / m[2]))
-        return u + min(max(_ACROSS_OVERLAP * u, -m[5]), m[5])  # type: ignore[no-any-return]
-    omega = flow / m[1]
-    voltages = omega + m[5] * dp
-    m[6] = m[4] * (m[6] + voltages - m[7])
-    m[7] = voltages
-    return (omega + m[3] * m[6]) / m[2]  # type: ignore[no-any-return]
+    if m.Q_N > 0.0:
+        across = max(m.p_s - math.copysign(dp, dp * flow), _LEAST_ACROSS * m.p_s)
+        u = m.u_N * flow / (m.Q_N * math.sqrt(0.5 * across / m.dp_N))
+        return u + min(max(_ACROSS_OVERLAP * u, -m.dead), m.dead)  # type: ignore[no-any-return]
+    omega = flow / m.displacement
+    needed = omega + m.droop * dp
+    m.high_passed = m.fading * (m.high_passed + needed - m.needed_before)
+    m.needed_before = needed
+    return (omega + m.shortfall * m.high_passed) / m.omega_per_volt  # type: ignore[no-any-return]
 
 
 @kernel
@@ -53,27 +54,25 @@ def lagged(values: np.ndarray, fading: float, first: float, out: np.ndarray) -> 
         first = values[sample] + fading * (first - values[sample])
 
 
-def check_numbers(what: str, positive: dict[str, float], not_negative: dict[str, float]) -> None:
-    """Raise InputError for a number that is not finite, not > 0, or not >= 0; `what` has it."""
-    for name, value in positive.items():
-        if not (math.isfinite(value) and value > 0):
-            raise InputError(f"{name} of {what} must be > 0, got {value}")
-    for name, value in not_negative.items():
-        if not (math.isfinite(value) and value >= 0):
-            raise InputError(f"{name} of {what} must be >= 0, got {value}")
+def check_numbers(what: str, source: object, positive: Sequence[str], not_negative: Sequence[str] = ()) -> None:
+    """Raise InputError for a number of `source` that is not finite, not > 0, or not >= 0; `what` has it."""
+    for name in (*positive, *not_negative):
+        value = getattr(source, name)
+        if not (math.isfinite(value) and (value > 0 or (value == 0 and name in not_negative))):
+            raise InputError(f"{name} of {what} must be {'>' if name in positive else '>='} 0, got {value}")
 
 
 class _Invertible(ABC):
-    """What turns a flow into a voltage by its block of numbers."""
+    """What turns a flow into a voltage by its numbers."""
 
     @abstractmethod
-    def block(self, rate: float, dead: float = 0.0) -> Array:
-        """Return the numbers of the inverse, called at `rate` [Hz], as `drive_voltage` takes them."""
+    def numbers(self, rate: float, dead: float = 0.0) -> Any:
+        """Return the numbers (1,) of the inverse, called at `rate` [Hz], as `drive_voltage` takes them."""
 
     def inverse(self, rate: float) -> Callable[[float, float], float]:
         """Return the voltage [V] as a function of its flow [m^3/s] and p_A - p_B [Pa], called at `rate` [Hz]."""
-        block = self.block(rate)
-        return lambda flow, dp: float(drive_voltage(block, flow, dp))
+        (numbers,) = self.numbers(rate)
+        return lambda flow, dp: float(drive_voltage(numbers, flow, dp))
 
 
 @dataclass(frozen=True)
@@ -93,9 +92,7 @@ class Drive(_Invertible):
     droop: float
 
     def __post_init__(self) -> None:
-        positive = {"displacement": self.displacement, "omega_per_volt": self.omega_per_volt}
-        rest = {"shortfall": self.shortfall, "corner": self.corner, "droop": self.droop}
-        check_numbers("the drive", positive, rest)
+        check_numbers("the drive", self, ("displacement", "omega_per_volt"), ("shortfall", "corner", "droop"))
 
     @classmethod
     def of(cls, rig: Rig) -> Self:
@@ -131,11 +128,9 @@ class Drive(_Invertible):
         lagged(wanted, math.exp(decay), first, late)
         return np.asarray(self.displacement * (commanded + self.shortfall * (late - lift)) / (1.0 + self.shortfall))
 
-    def block(self, rate: float, dead: float = 0.0) -> Array:
-        """Return the numbers of the inverse, called at `rate` [Hz], as `drive_voltage` takes them; no `dead` [V]."""
-        fading = math.exp(-self.corner / rate)
-        numbers = (self.displacement, self.omega_per_volt, self.shortfall, fading, self.droop)
-        return np.array([_PUMP, *numbers, 0.0, 0.0])
+    def numbers(self, rate: float, dead: float = 0.0) -> Any:
+        """Return the numbers (1,) of the inverse, called at `rate` [Hz]; `dead` is of valves alone."""
+        return record_of(DRIVE, self, fading=math.exp(-self.corner / rate))
 
     def steady(self, flow: float) -> float:
         """Return the voltage [V] of a flow [m^3/s] that lasts, of a drive that reaches its commanded speed."""
@@ -161,8 +156,7 @@ class ValveDrive(_Invertible):
     p_s: float
 
     def __post_init__(self) -> None:
-        positive = {"Q_N": self.Q_N, "dp_N": self.dp_N, "u_N": self.u_N, "p_s": self.p_s}
-        check_numbers("the valve", positive, {})
+        check_numbers("the valve", self, ("Q_N", "dp_N", "u_N", "p_s"))
 
     @classmethod
     def of(cls, rig: Rig) -> Self:
@@ -173,12 +167,12 @@ class ValveDrive(_Invertible):
         pumped = rig.pump.q_b / (2.0 * math.pi) * supply.omega_P
         return cls(valve.Q_N, valve.dp_N, valve.u_N, supply.p_set + pumped / supply.G_set)
 
-    def block(self, rate: float, dead: float = 0.0) -> Array:
-        """Return the numbers of the inverse as `drive_voltage` takes them.
+    def numbers(self, rate: float, dead: float = 0.0) -> Any:
+        """Return the numbers (1,) of the inverse as `drive_voltage` takes them.
 
         Within `dead` [V], the overlap of the edges, nothing flows: a small voltage is moved beyond it.
         """
-        return np.array([_VALVE, self.Q_N, self.dp_N, self.u_N, self.p_s, dead, 0.0, 0.0])
+        return record_of(DRIVE, self, dead=dead)
 
     def steady(self, flow: float) -> float:
         """Return the voltage [V] of a flow [m^3/s] without a load."""

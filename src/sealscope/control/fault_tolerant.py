@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from sealscope.compiled import address_of, call_at, entry, pointer_at
-from sealscope.control.controller import ANGLE, P_A, P_B, CompiledLaw, Controller, Measured, Started, X, law_of
-from sealscope.control.drive import DRIVE_BLOCK, Drive, check_numbers, drive_voltage
-from sealscope.control.leak_observer import SHUT, Balance, conductance, observed, observer_block
+from sealscope.compiled import address_of, call_at, entry, layout_of, record_at, record_of
+from sealscope.control.controller import CompiledLaw, Controller, Measured, Started, law_of, measured_at
+from sealscope.control.drive import DRIVE, Drive, check_numbers, drive_voltage
+from sealscope.control.leak_observer import OBSERVER, SHUT, Balance, conductance, observed, observer_of
 from sealscope.control.position import PositionPI
 from sealscope.errors import InputError
 
@@ -29,50 +29,54 @@ _SIGNIFICANT = 4.0
 _COUNTS = 0.5
 #: Blocks that the observer must have used.
 _FEWEST = 4
-#: Places of the law's numbers in its block: law and memory of the inner one, as addresses; the last are those of the
-#: drive's inverse and of the observer.
-_COMPENSATED, _INNER, _ITS_MEMORY, _U_MAX, _ASSUMED, _KNOWN, _AVERAGED, _BLENDED = range(8)
-_MEAN_A, _MEAN_B, _G, _STANDS_OUT, _X_STEP, _AREA, _DRIVE = range(8, 15)
-_OBSERVER = _DRIVE + DRIVE_BLOCK
+#: What the law remembers, and its numbers; law and memory of the inner one as addresses.
+_MEMORY = layout_of(
+    *("compensated", "inner", "its_memory", "u_max", "G_assumed", "known", "averaged", "blended"),
+    *("mean_A", "mean_B", "G", "stands_out"),
+    drive=DRIVE,
+    observer=OBSERVER,
+)
+_memory_at = record_at(_MEMORY)
 
 
 @entry
-def _tolerant_law(m: Any, measured: Any) -> Any:
-    u = call_at(int(m[_INNER]), int(m[_ITS_MEMORY]), address_of(measured))
-    if math.isnan(m[_MEAN_A]):
-        m[_MEAN_A], m[_MEAN_B] = measured[P_A], measured[P_B]
-    m[_MEAN_A] += m[_AVERAGED] * (measured[P_A] - m[_MEAN_A])
-    m[_MEAN_B] += m[_AVERAGED] * (measured[P_B] - m[_MEAN_B])
-    over = m[_MEAN_A] - m[_MEAN_B]
-    if m[_KNOWN] == 0.0:
-        observer = pointer_at(m, _OBSERVER)
-        observed(observer, measured[ANGLE], measured[X], measured[P_A], measured[P_B])
-        G, sd, blocks = conductance(observer)
-        above = G - m[_ASSUMED]
+def _tolerant_law(memory: Any, given: Any) -> Any:
+    m, measured = _memory_at(memory), measured_at(given)
+    u = call_at(int(m.inner), int(m.its_memory), address_of(given))
+    if math.isnan(m.mean_A):
+        m.mean_A, m.mean_B = measured.p_A, measured.p_B
+    m.mean_A += m.averaged * (measured.p_A - m.mean_A)
+    m.mean_B += m.averaged * (measured.p_B - m.mean_B)
+    over = m.mean_A - m.mean_B
+    if m.known == 0.0:
+        o = m.observer
+        observed(o, measured.theta, measured.x, measured.p_A, measured.p_B)
+        G, sd, blocks = conductance(o)
+        above = G - m.G_assumed
         wanted = 0.0
         if blocks >= _FEWEST:
-            unseen = _COUNTS * m[_X_STEP] * m[_AREA] / max(abs(over), 1.0)
-            needed = (0.5 if m[_STANDS_OUT] > 0.0 else 1.0) * max(_SIGNIFICANT * sd, unseen)
-            m[_STANDS_OUT] = 1.0 if above > needed else 0.0
+            unseen = _COUNTS * o.x_step * min(o.area_A, o.area_B) / max(abs(over), 1.0)
+            needed = (0.5 if m.stands_out > 0.0 else 1.0) * max(_SIGNIFICANT * sd, unseen)
+            m.stands_out = 1.0 if above > needed else 0.0
             wanted = above if above > needed else 0.0
-        m[_G] += m[_BLENDED] * (wanted - m[_G])
-        if m[_STANDS_OUT] == 0.0 and m[_G] < 1e-18:
-            m[_G] = 0.0
-    if m[_G] == 0.0:
-        m[_COMPENSATED] = 0.0
+        m.G += m.blended * (wanted - m.G)
+        if m.stands_out == 0.0 and m.G < 1e-18:
+            m.G = 0.0
+    if m.G == 0.0:
+        m.compensated = 0.0
         return u
-    m[_COMPENSATED] = m[_G] * over
-    return min(max(u + drive_voltage(pointer_at(m, _DRIVE), m[_COMPENSATED], 0.0), -m[_U_MAX]), m[_U_MAX])
+    m.compensated = m.G * over
+    return min(max(u + drive_voltage(m.drive, m.compensated, 0.0), -m.u_max), m.u_max)
 
 
 @dataclass(frozen=True)
 class FaultTolerant:
     """A controller beside which the leakage across the piston is made good: u = u_inner + inverse of (G dp).
 
-    `inner` is any controller; G [m^3/(s Pa)] comes from a `LeakObserver` on the controller's own signals, less the
-    pump's `G_assumed`, and is 0 until it stands out of its own deviation and of a count of the encoder: without a leak
-    the voltages are those of `inner`, to the last bit. `known` [m^3/(s Pa)], not negative, is taken instead (the ideal
-    that knows the leak). The flow that is made good is reported as `compensated` [m^3/s].
+    `inner` is any controller; G [m^3/(s Pa)] comes from a Kalman filter (`observed`) on the controller's own signals,
+    less the pump's `G_assumed`, and is 0 until it stands out of its own deviation and of a count of the encoder:
+    without a leak the voltages are those of `inner`, to the last bit. `known` [m^3/(s Pa)], not negative, is taken
+    instead (the ideal that knows the leak). The flow that is made good is reported as `compensated` [m^3/s].
     """
 
     inner: Controller
@@ -83,11 +87,14 @@ class FaultTolerant:
     known: float | None = None
 
     def __post_init__(self) -> None:
-        check_numbers("the controller", {"u_max": self.u_max}, {"G_assumed": self.G_assumed, "known": self.known or 0})
+        given = ("G_assumed",) if self.known is None else ("G_assumed", "known")
+        check_numbers("the controller", self, ("u_max",), given)
 
     @classmethod
     def of(cls, rig: Rig, inner: Controller | None = None, *, known: float | None = None) -> Self:
         """Return the controller for what a rig is said to be, around `inner`, by default `PositionPI`."""
+        from sealscope.physics.cylinder import volumes_at_middle
+
         c, sensors, makeup = rig.cylinder, rig.sensors, rig.makeup
         if rig.valve.spool == "present":
             raise InputError(
@@ -99,8 +106,7 @@ class FaultTolerant:
             rig.pump.q_b / (2.0 * math.pi),
             c.A_A,
             c.A_B,
-            c.V + c.V_hose_A,
-            c.V - c.V_rod + c.V_hose_B,
+            *volumes_at_middle(c),
             rig.fluid.K_oil,
             sensors.x.resolution,
             math.hypot(max(sensors.p_A.noise, sensors.p_B.noise), sensors.common_noise),
@@ -124,12 +130,18 @@ class FaultTolerant:
 
     def compiled(self) -> CompiledLaw:
         """Return the law in machine code, for one run from its beginning; it calls the inner one."""
-        inner, balance, rate = law_of(self.inner), self.balance, self.rate
-        m = np.zeros(_OBSERVER)
-        m[_INNER], m[_ITS_MEMORY] = inner.address, inner.memory.ctypes.data  # below 2^53: exact as doubles
-        m[_U_MAX], m[_ASSUMED], m[_KNOWN] = self.u_max, self.G_assumed, self.known is not None
-        m[_AVERAGED], m[_BLENDED] = (1.0 - math.exp(-1.0 / (rate * lag)) for lag in (_PRESSURE_LAG, _BLEND))
-        m[_MEAN_A] = m[_MEAN_B] = math.nan
-        m[_G], m[_X_STEP], m[_AREA] = self.known or 0.0, balance.x_step, min(balance.area_A, balance.area_B)
-        m[_DRIVE:_OBSERVER] = self.drive.block(rate)
-        return CompiledLaw(_tolerant_law.address, np.r_[m, observer_block(balance, rate)], inner)
+        inner, rate = law_of(self.inner), self.rate
+        memory = record_of(
+            _MEMORY,
+            self,
+            inner=inner.address,  # below 2^53: exact as a double
+            its_memory=inner.memory.ctypes.data,
+            known=self.known is not None,
+            averaged=1.0 - math.exp(-1.0 / (rate * _PRESSURE_LAG)),
+            blended=1.0 - math.exp(-1.0 / (rate * _BLEND)),
+            mean_A=math.nan,
+            G=self.known or 0.0,
+            drive=self.drive.numbers(rate),
+            observer=observer_of(self.balance, rate),
+        )
+        return CompiledLaw(_tolerant_law.address, memory.view(np.float64), inner)

@@ -9,38 +9,42 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from sealscope.compiled import entry, pointer_at
-from sealscope.control.controller import P_A, P_B, TARGET_SPEED, CompiledLaw, Measured, Started
-from sealscope.control.drive import DRIVE_BLOCK, Drive, ValveDrive, check_numbers, drive_of, drive_voltage
-from sealscope.control.position import PositionPI, followed
+from sealscope.compiled import entry, layout_of, record_at, record_of
+from sealscope.control.controller import CompiledLaw, Measured, Started, measured_at
+from sealscope.control.drive import DRIVE, Drive, ValveDrive, check_numbers, drive_of, drive_voltage
+from sealscope.control.position import FOLLOWING, PositionPI, followed
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 #: Time [s] over which the load that the pressures carry is averaged.
 _LOAD_LAG = 0.1
-#: Places of the law's numbers in its block; the last are those of the drive's inverse and of the feedback.
-_V_MAX, _MASS, _F_C, _V_TH, _F_V, _G, _C, _T, _AVERAGED, _FIRST, _V, _DP, _LOAD, _AREA_A, _AREA_B, _U_MAX = range(1, 17)
-_DRIVE = 17
-_FEEDBACK = _DRIVE + DRIVE_BLOCK
+#: What the law remembers, and its numbers.
+_MEMORY = layout_of(
+    *("compensated", "v_max", "M", "F_C", "v_th", "F_v", "G", "C", "T", "averaged", "first", "v", "dp", "load"),
+    drive=DRIVE,
+    feedback=FOLLOWING,
+)
+_memory_at = record_at(_MEMORY)
 
 
 @entry
-def _flatness_law(m: Any, measured: Any) -> Any:
-    T, v_max, first = m[_T], m[_V_MAX], m[_FIRST] > 0.0
-    v = measured[TARGET_SPEED] if abs(measured[TARGET_SPEED]) <= v_max else 0.0
-    a = 0.0 if first else (v - m[_V]) / T
-    a = a if abs(a) * T < 0.1 * v_max else 0.0
-    force = m[_MASS] * a + m[_F_C] * math.tanh(v / m[_V_TH]) + m[_F_V] * v
-    pushed = m[_AREA_A] * measured[P_A] - m[_AREA_B] * measured[P_B]
-    m[_LOAD] += (1.0 if first else m[_AVERAGED]) * (pushed - force - m[_LOAD])
-    area = m[_AREA_A] if m[_LOAD] >= 0.0 else m[_AREA_B]
-    dp = (force + m[_LOAD]) / area
-    rate = 0.0 if first else (dp - m[_DP]) / T
-    flow = m[_G] * dp + m[_C] * rate
-    m[_V], m[_DP], m[_FIRST] = v, dp, 0.0
-    u = followed(pointer_at(m, _FEEDBACK), measured) + drive_voltage(pointer_at(m, _DRIVE), flow, dp)
-    return min(max(u, -m[_U_MAX]), m[_U_MAX])
+def _flatness_law(memory: Any, given: Any) -> Any:
+    m, measured = _memory_at(memory), measured_at(given)
+    f, first = m.feedback, m.first > 0.0
+    v = measured.target_speed if abs(measured.target_speed) <= m.v_max else 0.0
+    a = 0.0 if first else (v - m.v) / m.T
+    a = a if abs(a) * m.T < 0.1 * m.v_max else 0.0
+    force = m.M * a + m.F_C * math.tanh(v / m.v_th) + m.F_v * v
+    pushed = f.area_A * measured.p_A - f.area_B * measured.p_B
+    m.load += (1.0 if first else m.averaged) * (pushed - force - m.load)
+    area = f.area_A if m.load >= 0.0 else f.area_B
+    dp = (force + m.load) / area
+    rate = 0.0 if first else (dp - m.dp) / m.T
+    flow = m.G * dp + m.C * rate
+    m.v, m.dp, m.first = v, dp, 0.0
+    u = followed(f, measured) + drive_voltage(m.drive, flow, dp)
+    return min(max(u, -f.u_max), f.u_max)
 
 
 @dataclass(frozen=True)
@@ -70,8 +74,7 @@ class Flatness:
     v_max: float
 
     def __post_init__(self) -> None:
-        rest = {"M": self.M, "F_C": self.F_C, "F_v": self.F_v, "G": self.G, "C": self.C}
-        check_numbers("the controller", {"v_th": self.v_th, "v_max": self.v_max}, rest)
+        check_numbers("the controller", self, ("v_th", "v_max"), ("M", "F_C", "F_v", "G", "C"))
 
     @classmethod
     def of(cls, rig: Rig) -> Self:
@@ -108,8 +111,15 @@ class Flatness:
 
     def compiled(self) -> CompiledLaw:
         """Return the law in machine code, for one run from its beginning."""
-        T, f = 1.0 / self.rate, self.feedback
-        own = (self.v_max, self.M, self.F_C, self.v_th, self.F_v, self.G, self.C, T, 1.0 - math.exp(-T / _LOAD_LAG))
-        states, outer = (1.0, 0.0, 0.0, 0.0), (f.area_A, f.area_B, f.u_max)
-        memory = np.array([math.nan, *own, *states, *outer, *self.drive.block(self.rate), *f.block()])
-        return CompiledLaw(_flatness_law.address, memory)
+        T = 1.0 / self.rate
+        memory = record_of(
+            _MEMORY,
+            self,
+            compensated=math.nan,
+            T=T,
+            averaged=1.0 - math.exp(-T / _LOAD_LAG),
+            first=1.0,
+            drive=self.drive.numbers(self.rate),
+            feedback=self.feedback.memory(),
+        )
+        return CompiledLaw(_flatness_law.address, memory.view(np.float64))

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.compiled import law
-from sealscope.recordings.recording import Array
+from sealscope.compiled import law, layout_of, record_of
 
 #: Length of a block [s] over which volumes are balanced.
 BLOCK = 0.5
@@ -25,91 +24,103 @@ _WALK, _WALK_SHARE = 1e-15, 0.03
 _SURPRISE = 4.0
 #: Time [s] over which all four signals are averaged alike.
 _LAG = 0.01
-#: Places in the observer's block: what it assumes, then what it remembers. From _BEGIN and _AVERAGED on stand angle,
-#: position and both pressures; from _G on the three states, from _P on the rows of their covariance.
-_D, _AREA_A, _AREA_B, _V_A, _V_B, _K, _X_STEP, _NOISE, _SHUT, _RATE, _LENGTH, _SHARE = range(12)
-_COUNT, _SUM_DP, _LOW, _HIGH, _FORWARD, _BACK, _SURPRISED, _USED, _BEGIN, _AVERAGED = *range(12, 21), 24
-_G, _P = 28, 31
-OBSERVER_BLOCK = _P + 9
+#: What the observer assumes (`Balance`) and remembers. `begin`, `averaged`: angle, position and both pressures;
+#: `state`: conductance, errors of 1/K and of the area, with their covariance `P`.
+OBSERVER = layout_of(
+    *("D", "area_A", "area_B", "V_A", "V_B", "K", "x_step", "noise", "shut", "rate", "length", "share"),
+    *("count", "sum_dp", "low", "high", "forward", "back", "surprised", "used"),
+    begin=(4,),
+    averaged=(4,),
+    state=(3,),
+    P=(3, 3),
+)
 
 
 @law
 def observed(m: Any, theta: float, x: float, p_A: float, p_B: float) -> None:
-    """Take a sample into the observer's block `m`: angle [rad], position [m], pressures [Pa]."""
-    now = (theta, x, p_A, p_B)
-    if m[_COUNT] == 0.0:
+    """Take a sample into the observer `m` (`OBSERVER`): angle [rad], position [m], pressures [Pa].
+
+    A Kalman filter of the conductance between the chambers, a block of `BLOCK` seconds at a time. Over a block, on the
+    side with the higher pressure (the other may be fed by its check valve):
+    D dtheta - A dx - (V(x)/K) dp_side - (|p_A - p_B|/K) D dtheta_in = G integral of (p_A - p_B) dt, with signs turned
+    for side B; dtheta_in is what the pump turned towards that side, whose oil it draws at the other pressure. Beside G
+    the filter holds the errors of 1/K and of the area, as shares. Friction and load do not enter.
+    """
+    now, mean = (theta, x, p_A, p_B), m.averaged
+    if m.count == 0.0:
         for k in range(4):
-            m[_AVERAGED + k] = m[_BEGIN + k] = now[k]
-    before = m[_AVERAGED]
+            mean[k] = m.begin[k] = now[k]
+    before = mean[0]
     for k in range(4):
-        m[_AVERAGED + k] = m[_AVERAGED + k] + m[_SHARE] * (now[k] - m[_AVERAGED + k])
-    dp, turned = m[_AVERAGED + 2] - m[_AVERAGED + 3], m[_AVERAGED] - before
-    m[_LOW], m[_HIGH] = min(m[_LOW], dp), max(m[_HIGH], dp)
-    m[_SUM_DP] += dp
-    m[_FORWARD] += max(turned, 0.0)
-    m[_BACK] += max(-turned, 0.0)
-    m[_COUNT] += 1.0
-    if m[_COUNT] > m[_LENGTH]:
-        _close(m, m[_SUM_DP] - 0.5 * dp)
-        m[_COUNT], m[_SUM_DP], m[_LOW], m[_HIGH], m[_FORWARD], m[_BACK] = 1.0, 0.5 * dp, dp, dp, 0.0, 0.0
+        mean[k] = mean[k] + m.share * (now[k] - mean[k])
+    dp, turned = mean[2] - mean[3], mean[0] - before
+    m.low, m.high = min(m.low, dp), max(m.high, dp)
+    m.sum_dp += dp
+    m.forward += max(turned, 0.0)
+    m.back += max(-turned, 0.0)
+    m.count += 1.0
+    if m.count > m.length:
+        _close(m, m.sum_dp - 0.5 * dp)
+        m.count, m.sum_dp, m.low, m.high, m.forward, m.back = 1.0, 0.5 * dp, dp, dp, 0.0, 0.0
         for k in range(4):
-            m[_BEGIN + k] = m[_AVERAGED + k]
+            m.begin[k] = mean[k]
 
 
 @law
 def _close(m: Any, total: float) -> None:
     """Take a block into the filter; `total`: sum of p_A - p_B [Pa] over its samples."""
-    integral = total / m[_RATE]
-    if abs(integral) < LEAST_DP * m[_LENGTH] / m[_RATE] or m[_LOW] * m[_HIGH] <= 0.0:
+    integral = total / m.rate
+    if abs(integral) < LEAST_DP * m.length / m.rate or m.low * m.high <= 0.0:
         return
-    if min(abs(m[_LOW]), abs(m[_HIGH])) < m[_SHUT]:
+    if min(abs(m.low), abs(m.high)) < m.shut:
         return
-    turned, moved = m[_D] * (m[_AVERAGED] - m[_BEGIN]), m[_AVERAGED + 1] - m[_BEGIN + 1]
-    middle = 0.5 * (m[_AVERAGED + 1] + m[_BEGIN + 1])
+    begin, end, state, P = m.begin, m.averaged, m.state, m.P
+    turned, moved = m.D * (end[0] - begin[0]), end[1] - begin[1]
+    middle = 0.5 * (end[1] + begin[1])
     if integral > 0.0:
-        area_of, drawn = m[_AREA_A], m[_FORWARD]
-        V, change = m[_V_A] + area_of * middle, m[_AVERAGED + 2] - m[_BEGIN + 2]
+        area_of, drawn = m.area_A, m.forward
+        V, change = m.V_A + area_of * middle, end[2] - begin[2]
     else:
-        area_of, drawn = m[_AREA_B], m[_BACK]
-        V, change = m[_V_B] - area_of * middle, m[_BEGIN + 3] - m[_AVERAGED + 3]
+        area_of, drawn = m.area_B, m.back
+        V, change = m.V_B - area_of * middle, begin[3] - end[3]
     area = area_of * moved
-    pressed = (V * change + m[_D] * drawn * integral * m[_RATE] / m[_LENGTH]) / m[_K]
+    pressed = (V * change + m.D * drawn * integral * m.rate / m.length) / m.K
     measured = turned - area - pressed
     # a count of the encoder at both ends, the pressures' noise over the average, and what the laws leave out
-    noise = (area_of * m[_X_STEP]) ** 2 / 6.0 + 0.1 * (V / m[_K] * m[_NOISE]) ** 2
+    noise = (area_of * m.x_step) ** 2 / 6.0 + 0.1 * (V / m.K * m.noise) ** 2
     variance = noise + (0.02 * pressed) ** 2 + (2e-4 * area) ** 2
     row = (integral, pressed, area)
-    innovation = measured - (row[0] * m[_G] + row[1] * m[_G + 1] + row[2] * m[_G + 2])
-    walk = (_WALK + _WALK_SHARE * abs(m[_G])) ** 2
+    innovation = measured - (row[0] * state[0] + row[1] * state[1] + row[2] * state[2])
+    walk = (_WALK + _WALK_SHARE * abs(state[0])) ** 2
     spread = row[0] * row[0] * walk + variance
     for i in range(3):
         for k in range(3):
-            spread += row[i] * m[_P + 3 * i + k] * row[k]
+            spread += row[i] * P[i, k] * row[k]
     if innovation**2 > _SURPRISE**2 * spread:
-        before = m[_SURPRISED]
-        m[_SURPRISED] = innovation / integral
-        if before * m[_SURPRISED] <= 0.0:
+        before = m.surprised
+        m.surprised = innovation / integral
+        if before * m.surprised <= 0.0:
             return
-        more = m[_SURPRISED] ** 2
+        more = m.surprised**2
         walk, spread = walk + more, spread + row[0] * row[0] * more
     else:
-        m[_SURPRISED] = 0.0
-    m[_P] += walk
-    g_0 = (m[_P] * row[0] + m[_P + 1] * row[1] + m[_P + 2] * row[2]) / spread
-    g_1 = (m[_P + 3] * row[0] + m[_P + 4] * row[1] + m[_P + 5] * row[2]) / spread
-    g_2 = (m[_P + 6] * row[0] + m[_P + 7] * row[1] + m[_P + 8] * row[2]) / spread
+        m.surprised = 0.0
+    P[0, 0] += walk
+    g_0 = (P[0, 0] * row[0] + P[0, 1] * row[1] + P[0, 2] * row[2]) / spread
+    g_1 = (P[1, 0] * row[0] + P[1, 1] * row[1] + P[1, 2] * row[2]) / spread
+    g_2 = (P[2, 0] * row[0] + P[2, 1] * row[1] + P[2, 2] * row[2]) / spread
     gain = (g_0, g_1, g_2)
     for i in range(3):
-        m[_G + i] += gain[i] * innovation
+        state[i] += gain[i] * innovation
         for k in range(3):  # P is symmetric: its product with the row is gain times spread
-            m[_P + 3 * i + k] -= gain[i] * gain[k] * spread
-    m[_USED] += 1.0
+            P[i, k] -= gain[i] * gain[k] * spread
+    m.used += 1.0
 
 
 @law
 def conductance(m: Any) -> tuple[float, float, float]:
     """Return the estimated conductance [m^3/(s Pa)], its deviation, and how many blocks were used."""
-    return m[_G], math.sqrt(m[_P]), m[_USED]
+    return m.state[0], math.sqrt(m.P[0, 0]), m.used
 
 
 @dataclass(frozen=True)
@@ -131,31 +142,15 @@ class Balance:
     shut: float = 0.0
 
 
-class LeakObserver:
-    """A Kalman filter of the conductance between the chambers, a block of `BLOCK` seconds at a time.
-
-    Over a block, on the side with the higher pressure (the other may be fed by its check valve):
-    D dtheta - A dx - (V(x)/K) dp_side - (|p_A - p_B|/K) D dtheta_in = G integral of (p_A - p_B) dt, with signs turned
-    for side B; dtheta_in is what the pump turned towards that side, whose oil it draws at the other pressure. Beside G
-    the filter holds the errors of 1/K and of the area, as shares. Friction and load do not enter.
-
-    The law is `observed`, compiled.
-    """
-
-    def __init__(self, balance: Balance, rate: float) -> None:
-        self._block = observer_block(balance, rate)
-
-    def update(self, theta: float, x: float, p_A: float, p_B: float) -> tuple[float, float, float]:
-        """Take a sample in: angle [rad], position [m], pressures [Pa]; return the estimate (`conductance`)."""
-        observed(self._block, float(theta), float(x), float(p_A), float(p_B))
-        return conductance(self._block)  # type: ignore[no-any-return]
-
-
-def observer_block(balance: Balance, rate: float) -> Array:
-    """Return the numbers of an observer that has seen nothing, as `observed` takes them."""
-    b, m = balance, np.zeros(OBSERVER_BLOCK)
-    m[: _RATE + 1] = b.D, b.area_A, b.area_B, b.V_A, b.V_B, b.K, b.x_step, b.noise, b.shut, rate
-    m[_LENGTH], m[_SHARE] = max(2, round(BLOCK * rate)), 1.0 - math.exp(-1.0 / (rate * _LAG))
-    m[_LOW], m[_HIGH] = math.inf, -math.inf
-    m[_P::4] = np.square([_SD_G, _SD_C, _SD_AREA])
-    return m
+def observer_of(balance: Balance, rate: float) -> Any:
+    """Return the record (1,) of an observer that has seen nothing, as `observed` takes it."""
+    return record_of(
+        OBSERVER,
+        balance,
+        rate=rate,
+        length=max(2, round(BLOCK * rate)),
+        share=1.0 - math.exp(-1.0 / (rate * _LAG)),
+        low=math.inf,
+        high=-math.inf,
+        P=np.diag(np.square([_SD_G, _SD_C, _SD_AREA])),
+    )

@@ -32,8 +32,9 @@ _SIZES = (1e-3, 1e-3, 1e-2, 1e-3, 1e-6, 1e-6, 1e2, 1e2, 1e2, 1e2, 1e-9, 1e-9, 1e
 class Margins:
     """Margins of a loop at one speed of the piston.
 
-    `speed` [m/s]; `gain`: factor by which the loop's gain may grow, inf where none ends it; `phase` [rad]; `crossover`
-    [Hz]: the highest frequency at which the loop's gain is 1; `delay` [s]: what the loop may be later; `peak`: the
+    `speed` [m/s]; `gain`: factor by which the loop's gain may grow, inf where none ends it; `phase` [rad]: the least
+    distance of arg L from -pi where |L| = 1; `crossover` [Hz]: the highest frequency at which the loop's gain is 1;
+    `delay` [s]: what the loop may be later, the least over all frequencies at which its gain is 1; `peak`: the
     largest 1/|1 + L|; `damped`: whether the rig rings down by itself (at slow strokes its friction falls with speed,
     and it may not: then gain and phase margin bound a loop that is not stable to begin with).
     """
@@ -60,12 +61,20 @@ def margins(rig: Rig, controller: Controller, speed: float = 0.0, load: float = 
     >>> import sealscope as ss
     >>> from sealscope.control import PositionPI, margins
     >>> rig = ss.load_rig("thesis-closed-loop")
-    >>> loop = margins(rig, PositionPI.of(rig), speed=0.05)
+    >>> loop = margins(rig, PositionPI.of(rig), speed=0.01)
     >>> loop.gain > 2.0 and loop.phase > 0.7
     True
     """
-    A, B, about = _linearised(rig, controller.rate, speed, load)
     f = np.geomspace(0.05, 0.499 * controller.rate, _FREQUENCIES)
+    L, damped = open_loop(rig, controller, f, speed, load)
+    return margins_of(f, L, speed, damped)
+
+
+def open_loop(
+    rig: Rig, controller: Controller, f: Array, speed: float = 0.0, load: float = 0.0
+) -> tuple[NDArray[np.complex128], bool]:
+    """Return L (n,) at the frequencies `f` (n,) [Hz], and whether the rig rings down by itself: see `margins`."""
+    A, B, about = _linearised(rig, controller.rate, speed, load)
     z = np.exp(2j * math.pi * f / controller.rate)
     values, vectors = np.linalg.eig(A)
     inputs = np.linalg.solve(vectors, B.astype(complex))
@@ -73,8 +82,7 @@ def margins(rig: Rig, controller: Controller, speed: float = 0.0, load: float = 
     for row, answer in _answers(controller, about):
         plant = (vectors[row] * inputs / (z[:, None] - values)).sum(axis=1)
         L -= _of_impulse(answer, z) * plant
-    L *= z**-controller.delay
-    return _margins_of(f, L, speed, bool(np.abs(values).max() < 1.0 + 1e-6))
+    return L * z**-controller.delay, bool(np.abs(values).max() < 1.0 + 1e-6)
 
 
 def _linearised(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array, Array, Array]:
@@ -160,16 +168,20 @@ def _of_impulse(answer: Array, z: NDArray[np.complex128]) -> NDArray[np.complex1
     return np.asarray(total + tail / (1.0 - 1.0 / z))
 
 
-def _margins_of(f: Array, L: NDArray[np.complex128], speed: float, damped: bool) -> Margins:
-    size, angle = np.abs(L), np.unwrap(np.angle(L))
-    angle -= 2.0 * math.pi * round((angle[0] + 0.5 * math.pi) / (2.0 * math.pi))  # an integrator begins at -90 or -180
-    over = np.flatnonzero((size[:-1] >= 1.0) & (size[1:] < 1.0))
-    phases = [(abs(math.remainder(angle[k] + math.pi, 2.0 * math.pi)), k) for k in over]
-    phase = min((value for value, _ in phases), default=math.inf)
-    late = min((((angle[k] + math.pi) % (2.0 * math.pi)) / (2.0 * math.pi * f[k]) for _, k in phases), default=math.inf)
-    turned = np.floor((angle + math.pi) / (2.0 * math.pi))
-    at = np.flatnonzero(np.diff(turned) != 0)
-    gains = [1.0 / size[k] for k in at if size[k] < 1.0]
-    crossover = float(f[over[-1]]) if over.size else 0.0
+def margins_of(f: Array, L: NDArray[np.complex128], speed: float = 0.0, damped: bool = True) -> Margins:
+    """Return the margins of a loop L (n,) over frequencies `f` (n,) [Hz], linear between them: see `Margins`."""
+    places = np.arange(f.size)
+    unit, turned = _crossings(np.abs(L) - 1.0), _crossings(L.imag)
+    crossover, ahead = np.interp(unit, places, f), np.angle(-np.interp(unit, places, L))
+    real = np.interp(turned, places, L.real)
+    gain = float(np.min(-1.0 / real[(real < 0.0) & (real > -1.0)], initial=math.inf))
+    phase = float(np.min(np.abs(ahead), initial=math.inf))
+    delay = float(np.min(np.mod(ahead, 2.0 * math.pi) / (2.0 * math.pi * crossover), initial=math.inf))
     peak = float(np.max(1.0 / np.abs(1.0 + L)))
-    return Margins(speed, float(min(gains, default=math.inf)), phase, crossover, float(late), peak, damped)
+    return Margins(speed, gain, phase, float(np.max(crossover, initial=0.0)), delay, peak, damped)
+
+
+def _crossings(values: Array) -> Array:
+    """Return the places, whole numbers those of the values, at which a line through the values changes its sign."""
+    k = np.flatnonzero(np.diff(values > 0.0))
+    return k + values[k] / (values[k] - values[k + 1])

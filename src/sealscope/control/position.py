@@ -9,36 +9,39 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from sealscope.compiled import entry, law, pointer_at
-from sealscope.control.controller import P_A, P_B, TARGET, TARGET_SPEED, CompiledLaw, Measured, Started, X
-from sealscope.control.drive import Drive, ValveDrive, check_numbers, drive_of, drive_voltage
-from sealscope.recordings.recording import Array
+from sealscope.compiled import entry, law, layout_of, record_at, record_of
+from sealscope.control.controller import CompiledLaw, Measured, Started, measured_at
+from sealscope.control.drive import DRIVE, Drive, ValveDrive, check_numbers, drive_of, drive_voltage
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 #: Time [s] over which the pressures that tell the carrying side are averaged.
 _PRESSURE_LAG = 0.02
-#: Places of the law's numbers in its block; the last are those of the drive's inverse.
-_AREA_A, _AREA_B, _K_V, _K_I_T, _DEAD_BAND, _U_MAX, _AVERAGED, _INTEGRAL, _DP, _DRIVE = range(1, 11)
+#: What the law remembers, and its numbers.
+FOLLOWING = layout_of(
+    *("compensated", "area_A", "area_B", "k_v", "k_i_T", "dead_band", "u_max", "averaged", "integral", "dp"),
+    drive=DRIVE,
+)
+_memory_at = record_at(FOLLOWING)
 
 
 @law
 def followed(m: Any, measured: Any) -> float:
-    """Return the voltage [V] of the PI law over the inverse of a drive, from the law's block and what is measured."""
-    m[_DP] += m[_AVERAGED] * (measured[P_A] - measured[P_B] - m[_DP])
-    error = measured[TARGET] - measured[X]
-    velocity = measured[TARGET_SPEED] + m[_K_V] * error + m[_INTEGRAL]
-    area = m[_AREA_A] if m[_DP] > 0.0 else m[_AREA_B]
-    u = drive_voltage(pointer_at(m, _DRIVE), velocity * area, m[_DP])
-    if abs(error) > m[_DEAD_BAND] and (abs(u) < m[_U_MAX] or u * error < 0.0):
-        m[_INTEGRAL] += m[_K_I_T] * error
-    return min(max(u, -m[_U_MAX]), m[_U_MAX])  # type: ignore[no-any-return]
+    """Return the voltage [V] of the PI law over the inverse of a drive; `m`: a record `FOLLOWING`."""
+    m.dp += m.averaged * (measured.p_A - measured.p_B - m.dp)
+    error = measured.target - measured.x
+    velocity = measured.target_speed + m.k_v * error + m.integral
+    area = m.area_A if m.dp > 0.0 else m.area_B
+    u = drive_voltage(m.drive, velocity * area, m.dp)
+    if abs(error) > m.dead_band and (abs(u) < m.u_max or u * error < 0.0):
+        m.integral += m.k_i_T * error
+    return min(max(u, -m.u_max), m.u_max)  # type: ignore[no-any-return]
 
 
 @entry
 def _position_law(memory: Any, measured: Any) -> Any:
-    return followed(memory, measured)
+    return followed(_memory_at(memory), measured_at(measured))
 
 
 @dataclass(frozen=True)
@@ -71,8 +74,7 @@ class PositionPI:
 
     def __post_init__(self) -> None:
         positive, rest = ("area_A", "area_B", "u_max", "rate"), ("dead_volts", "k_v", "k_i", "dead_band", "delay")
-        groups = ({name: getattr(self, name) for name in names} for names in (positive, rest))
-        check_numbers("the controller", *groups)
+        check_numbers("the controller", self, positive, rest)
 
     @classmethod
     def of(cls, rig: Rig, **gains: float) -> Self:
@@ -92,11 +94,16 @@ class PositionPI:
 
     def compiled(self) -> CompiledLaw:
         """Return the law in machine code, for one run from its beginning."""
-        return CompiledLaw(_position_law.address, self.block())
+        return CompiledLaw(_position_law.address, self.memory().view(np.float64))
 
-    def block(self) -> Array:
-        """Return the numbers of the law as `followed` takes them."""
+    def memory(self) -> Any:
+        """Return the record (1,) of the law as `followed` takes it."""
         T = 1.0 / self.rate
-        averaged = 1.0 - math.exp(-T / _PRESSURE_LAG)
-        numbers = (self.area_A, self.area_B, self.k_v, self.k_i * T, self.dead_band, self.u_max, averaged, 0.0, 0.0)
-        return np.array([math.nan, *numbers, *self.drive.block(self.rate, self.dead_volts)])
+        return record_of(
+            FOLLOWING,
+            self,
+            compensated=math.nan,
+            k_i_T=self.k_i * T,
+            averaged=1.0 - math.exp(-T / _PRESSURE_LAG),
+            drive=self.drive.numbers(self.rate, self.dead_volts),
+        )

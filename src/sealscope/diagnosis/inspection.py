@@ -16,7 +16,7 @@ import numpy as np
 
 from sealscope.diagnosis.learnt import Healthy, Learnt
 from sealscope.recordings.chambers import chambers_of
-from sealscope.recordings.formats.columns import counted
+from sealscope.recordings.formats.columns import counted, listed
 from sealscope.recordings.gaps import MOST_BRIDGED, bridge, filled
 from sealscope.recordings.hydraulics import lack_of_chambers, no_readings
 from sealscope.recordings.motion import runs_of
@@ -145,9 +145,8 @@ def comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baselines:
     findings = []
     for (severity, reason), numbers in left_out.items():
         names = [healthy[k].file or f"number {k + 1}" for k in sorted(numbers)]
-        listed = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
         count = f"{len(names)} of {len(healthy)} baseline recordings {'is' if len(names) == 1 else 'are'}"
-        text = f"{count} left out: {reason} ({listed})"
+        text = f"{count} left out: {reason} ({listed(names, 3)})"
         findings.append(Finding("baseline_left_out", severity, None, len(numbers), None, text))
     refusal = None
     if healthy and not chosen:

@@ -13,7 +13,6 @@ import tomllib
 import zipfile
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
-from operator import attrgetter
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -23,8 +22,9 @@ from sealscope.diagnosis.inference.weak_form import STRIDE
 from sealscope.errors import InputError
 from sealscope.fmu.description import description, templates
 from sealscope.fmu.machine import FAILURES, Choice, code, object_code
-from sealscope.fmu.variables import INPUTS, REFERENCES, RESULTS, SENSOR_RESULTS, VALUES, Variable, variables
+from sealscope.fmu.variables import INPUTS, REFERENCES, RESULTS, SENSOR_RESULTS, Variable, variables
 from sealscope.parameters import Rig, load_rig
+from sealscope.physics.rig import values_of
 from sealscope.physics.state import STATES
 from sealscope.storage.atomic import atomic_write
 from sealscope.storage.plain_values import as_type
@@ -245,7 +245,7 @@ def write_fmu(
         f"{machine.title}; {accuracy}",
         code(Choice.of(machine)),
         tuple(variables(machine, step)),
-        _values(machine),
+        values_of(machine),
         len(INPUTS),
         len(RESULTS),
         len(STATES),
@@ -316,7 +316,7 @@ def write_sensor_fmu(
         f"soft sensor of leakage (volume balance of angle and position at {rate:g} Hz) for {machine.title}",
         own.sensor_code(choice),
         tuple(own.variables(machine)),
-        _values(machine),
+        values_of(machine),
         len(own.INPUTS),
         len(SENSOR_RESULTS),
         own.memory_of(choice).itemsize // 8,
@@ -333,11 +333,6 @@ def _pump_controlled(rig: Rig | str | os.PathLike[str]) -> Rig:
     if machine.valve.spool == "present":
         raise InputError(f"a unit must be of a pump-controlled rig (valve.spool = absent), got {machine.name}")
     return machine
-
-
-def _values(rig: Rig) -> tuple[float, ...]:
-    """Return a rig's parameters in the order of a unit's code."""
-    return tuple(float(attrgetter(name)(rig)) for name in VALUES)
 
 
 def _checked(path: str | os.PathLike[str], fmi: int, platforms: Sequence[str] | None) -> tuple[str, ...]:

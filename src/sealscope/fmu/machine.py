@@ -21,15 +21,14 @@ from sealscope.compiled import law, plain_code
 from sealscope.fmu.variables import INPUTS, RESULTS, VALUES
 from sealscope.parameters import Rig
 from sealscope.physics.cylinder import mechanical_power
-from sealscope.physics.fluid import P_ATM
 from sealscope.physics.motor import electric_power
 from sealscope.physics.pump import hydraulic_power
 from sealscope.physics.rig import (
     CHOICES,
-    DERIVED_FROM,
     NUMBERS,
     PARAMETERS,
     RigNumbers,
+    RigValues,
     derived_numbers,
     observe,
     pressures_of,
@@ -38,39 +37,32 @@ from sealscope.physics.rig import (
 )
 from sealscope.physics.solvers.imex import IMEX_NODES, imex_step
 from sealscope.physics.solvers.rk4 import RK4_NODES, rk4_step
-from sealscope.physics.standstill import (
-    carried_at_standstill,
-    holding_current,
-    holding_integral,
-    pressures_at_standstill,
-)
+from sealscope.physics.standstill import BELOW_VACUUM, NOT_HELD, carried_at_standstill, stand_still
 from sealscope.physics.state import (
     CURRENT,
-    INTEGRAL,
     OUTPUTS,
     P_1,
     P_2,
     P_A,
     P_B,
-    POSITION,
     STATES,
     VELOCITY,
     state_of,
 )
 from sealscope.simulation.experiment import choose_method
+from sealscope.units import P_ATM
 
 #: What a function of a unit returns where it fails.
 FAILURES = MappingProxyType(
     {
         1: "the state is not finite: take a smaller step, or smaller gains",
-        2: "a pressure is below vacuum, where the model does not hold",
-        3: "the drive cannot hold the load at standstill",
+        BELOW_VACUUM: "a pressure is below vacuum, where the model does not hold",
+        NOT_HELD: "the drive cannot hold the load at standstill",
     }
 )
 _SIZES = {"values": len(VALUES), "inputs": len(INPUTS), "y": len(STATES), "results": len(RESULTS)}
 _N_VALUES, _N_INPUTS, _N_STATES, _N_RESULTS = _SIZES.values()
 _N_PARAMETERS, _N_OUTPUTS = len(PARAMETERS), len(OUTPUTS)
-_FROM = tuple(VALUES.index(name) for name in DERIVED_FROM)
 _OUTWARD_A, _OUTWARD_B = VALUES.index("cylinder.G_ext_A"), VALUES.index("cylinder.G_ext_B")
 _U, _G, _C, _F, _MORE_A, _MORE_B = range(len(INPUTS))
 _VOLTAGE, _Q_1 = OUTPUTS.index("V"), OUTPUTS.index("Q_1")
@@ -121,14 +113,7 @@ def numbers_of(choices: tuple[bool | tuple[bool, ...], ...], exponent: float, li
 
     @law
     def numbers(v: Any, outward_A: float, outward_B: float) -> Any:
-        C_d, d_line, closed_A, closed_B = v[_FROM[0]], v[_FROM[1]], v[_FROM[2]], v[_FROM[3]]
-        open_A, open_B, rho = v[_FROM[4]], v[_FROM[5]], v[_FROM[6]]
-        V, V_rod, V_hose_A, V_hose_B = v[_FROM[7]], v[_FROM[8]], v[_FROM[9]], v[_FROM[10]]
-        q_b, C_st, C_h = v[_FROM[11]], v[_FROM[12]], v[_FROM[13]]
-        derived = derived_numbers(
-            C_d, d_line, closed_A, closed_B, open_A, open_B, rho, V, V_rod, V_hose_A, V_hose_B, q_b, C_st, C_h,
-            exponent, literal,
-        )  # fmt: skip
+        derived = derived_numbers(RigValues(*to_fixed_tuple(v, _N_VALUES)), exponent, literal)
         taken = to_fixed_tuple(v, _N_PARAMETERS)
         taken = tuple_setitem(taken, _OUTWARD_A, taken[_OUTWARD_A] + outward_A)
         taken = tuple_setitem(taken, _OUTWARD_B, taken[_OUTWARD_B] + outward_B)
@@ -145,7 +130,7 @@ def functions(choice: Choice) -> dict[str, Callable[..., Any]]:
     ``report(values, inputs, y, results)`` writes the outputs.
     """
     choices, exponent, literal, implicit, euler = choice
-    throttled, made_up = bool(choices[CHOICES.index("throttled")]), bool(choices[CHOICES.index("made_up")])
+    throttled = bool(choices[CHOICES.index("throttled")])
     of_values = numbers_of(choices, exponent, literal)
 
     @law
@@ -155,19 +140,8 @@ def functions(choice: Choice) -> dict[str, Callable[..., Any]]:
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
         v, given, state = carray(values, _N_VALUES), carray(inputs, _N_INPUTS), carray(y, _N_STATES)
         p = numbers(v, given)
-        force = carried_at_standstill(x_0, p.F_l, p.k_load, p.A_opp, p.p_opp, p.L, p.k_stop, p.d_stop) + given[_F]
-        V_A, V_B = (p.V_A + p.V_1, p.V_B + p.V_2) if throttled else (p.V_A, p.V_B)
-        p_A, p_B = pressures_at_standstill(force, p.A_A, p.A_B, V_A, V_B, p.p_charge, made_up)
         state[:] = 0.0
-        state[POSITION] = x_0
-        state[P_A] = state[P_1] = p_A
-        state[P_B] = state[P_2] = p_B
-        state[CURRENT] = holding_current(p_A - p_B, p.q_b, p.C_m)
-        state[INTEGRAL] = holding_integral(state[CURRENT], p.R_c, p.K_i)
-        if not min(p_A, p_B) >= -P_ATM:
-            return 2
-        held = abs(state[CURRENT]) <= p.i_max and p.R_c * abs(state[CURRENT]) <= p.V_max
-        return 0 if held else 3
+        return stand_still(state, x_0, carried_at_standstill(x_0, p) + given[_F], p)  # type: ignore[no-any-return]
 
     def report(values: Any, inputs: Any, y: Any, results: Any) -> int:
         v, given, state = carray(values, _N_VALUES), carray(inputs, _N_INPUTS), carray(y, _N_STATES)
@@ -208,7 +182,7 @@ def functions(choice: Choice) -> dict[str, Callable[..., Any]]:
         if total != 0.0:
             return 1
         p_A, p_B, p_1, p_2 = pressures_of(z, p)
-        return 2 if min(p_A, p_B, p_1, p_2) < -P_ATM else 0
+        return BELOW_VACUUM if min(p_A, p_B, p_1, p_2) < -P_ATM else 0
 
     return {"start": start, "advance": advance, "report": report}
 

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 SPAN = 5e-4
 _DRIVING = ("u", "G", "C", "F")
 _MEASURED = tuple(name for name in CHANNEL_UNITS if name not in ("u", "omega"))  # omega is read off the encoder
+#: Channels that no instrument of a rig reads: they are recorded as the unit gives them.
+_AS_GIVEN = ("q_comp", "q_pump", "T_oil")
 
 
 @checked_call
@@ -43,7 +45,8 @@ def record_fmu(
 ) -> Recording:
     """Run a functional mock-up unit under an experiment's command and record it by the instruments of its rig.
 
-    The unit is a machine of somebody else: of the experiment's rig only the instruments are used. A unit is a program,
+    The unit is a machine of somebody else: of the experiment's rig only the instruments are used; flows and temperature
+    that they do not read (``q_comp``, ``q_pump``, ``T_oil``) are recorded as the unit gives them. A unit is a program,
     and runs with all rights of this one.
 
     Parameters
@@ -103,12 +106,14 @@ def record_fmu(
     everything = {name: outputs.get(name, np.zeros(t.size)) for name in _MEASURED}
     recorded = record(experiment.rig, everything, volts, factor, experiment.seed, experiment.readings())
     kept = {"u", *measured} | ({"omega"} if "theta" in measured else set())
+    channels = {name: values for name, values in recorded.channels.items() if name in kept}
+    channels |= {name: outputs[name][: n * factor : factor] for name in _AS_GIVEN if name in outputs}
     source = {"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "name": description.modelName}
     provenance: dict[str, Any] = {"origin": "fmu", "unit": source, "experiment": experiment.describe()}
     return replace(
         recorded,
-        channels={name: values for name, values in recorded.channels.items() if name in kept},
-        units={name: unit_ for name, unit_ in recorded.units.items() if name in kept},
+        channels=channels,
+        units={name: CHANNEL_UNITS[name] for name in channels},
         provenance=provenance,
         history=(f"unit {path.name} run with communication steps of {1.0 / (rate * factor):.4g} s",),
     )

@@ -21,7 +21,7 @@ recorded; the live balance takes the sensors' noise off it, a few per cent.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -29,11 +29,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import carray
 
-from sealscope.compiled import large_law, law, record_at
+from sealscope.compiled import large_law, law, layout_of, record_at
 from sealscope.diagnosis.inference.blocks import Columns
 from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.inference.row_weights import SUPPORT, Workspace, median, weigh, workspace_shapes
-from sealscope.diagnosis.inference.terms import ATMOSPHERE, HALF_DIFFERENCE, LEAST_ABSOLUTE
+from sealscope.diagnosis.inference.terms import HALF_DIFFERENCE, LEAST_ABSOLUTE
 from sealscope.diagnosis.inference.weak_form import LARGEST, SPAN, STRIDE, stride_samples, test_function
 from sealscope.diagnosis.live.balance import BLOCK_SECONDS, LEARNED, TELLS, WAKES, live_equations, size_error
 from sealscope.diagnosis.live.known import (
@@ -53,6 +53,7 @@ from sealscope.fmu.machine import unit_code
 from sealscope.fmu.variables import SENSOR_RESULTS, VALUES, Variable, inputs, outputs, parameter
 from sealscope.parameters import Rig
 from sealscope.recordings.channels import CHANNEL_UNITS, LONG_NAMES
+from sealscope.units import P_ATM
 
 #: Channels that a soft sensor reads, in the order of the samples.
 INPUTS = ("p_A", "p_B", "theta", "x")
@@ -133,29 +134,24 @@ def memory_of(choice: SensorChoice) -> np.dtype[Any]:
     """
     n, slow = _Numbers.of(choice.rate), len(choice.place) - choice.fast - 1
     rows = SUPPORT * n.strides
-    shapes: dict[str, tuple[int, ...]] = {
-        **dict.fromkeys(_COUNTERS, ()),
-        "ring": (len(INPUTS), 2 * n.half + 3),
-        "increments": (_WIDTH,),
-        "opened": (SPAN, _WIDTH),
-        "rows": (rows, _WIDTH),
-        "ends": (SUPPORT,),
-        "gram": (SUPPORT, _WIDTH, _WIDTH),
-        "sizes": (SUPPORT + 1, 2),
-        "support": (slow + 1, slow + 1),
-        "waits": (LEARNED, _WIDTH, _WIDTH),
-        "waiting": (LEARNED, 3),
-        "ordered": (LEARNED,),
-        "last": (WINDOW, 5),
-    }
-    workspace = zip(Workspace._fields, workspace_shapes(rows, SUPPORT, len(choice.place), slow), strict=True)
-    known = zip(Known._fields, known_shapes(_LEAK), strict=True)
-    records = [("workspace", _doubles(workspace)), ("known", _doubles(known))]
-    return np.dtype([*_doubles(shapes.items()).descr, *records])
-
-
-def _doubles(shapes: Iterable[tuple[str, tuple[int, ...]]]) -> np.dtype[Any]:
-    return np.dtype([(name, "f8", shape) for name, shape in shapes])
+    workspace = workspace_shapes(rows, SUPPORT, len(choice.place), slow)
+    return layout_of(
+        *_COUNTERS,
+        ring=(len(INPUTS), 2 * n.half + 3),
+        increments=(_WIDTH,),
+        opened=(SPAN, _WIDTH),
+        rows=(rows, _WIDTH),
+        ends=(SUPPORT,),
+        gram=(SUPPORT, _WIDTH, _WIDTH),
+        sizes=(SUPPORT + 1, 2),
+        support=(slow + 1, slow + 1),
+        waits=(LEARNED, _WIDTH, _WIDTH),
+        waiting=(LEARNED, 3),
+        ordered=(LEARNED,),
+        last=(WINDOW, 5),
+        workspace=layout_of(**dict(zip(Workspace._fields, workspace, strict=True))),
+        known=layout_of(**dict(zip(Known._fields, known_shapes(_LEAK), strict=True))),
+    )
 
 
 def functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
@@ -247,7 +243,7 @@ def _increments(ring: Any, k: int, half: int, rate: float, displacement: float, 
     out[2], out[3] = (by_A - out_A) * dx, (1.0 - outward - by_A + out_A) * dx
     for side in range(2):
         before, after = ring[side, here], ring[side, there]
-        low, high = max(before + ATMOSPHERE, LEAST_ABSOLUTE), max(after + ATMOSPHERE, LEAST_ABSOLUTE)
+        low, high = max(before + P_ATM, LEAST_ABSOLUTE), max(after + P_ATM, LEAST_ABSOLUTE)
         at = 4 + 4 * side
         out[at], out[at + 1] = after - before, x * (after - before)
         out[at + 2], out[at + 3] = 1.0 / high - 1.0 / low, math.log(high) - math.log(low)

@@ -10,12 +10,12 @@ from typing import Any, Literal, NamedTuple
 
 from sealscope.parameters import Rig
 from sealscope.parameters.fields import absent_of, leaves, unit_of
-from sealscope.physics.rig import DERIVED_FROM, PARAMETERS
+from sealscope.physics.rig import VALUES as NAMES_OF_VALUES
 from sealscope.physics.state import OUTPUTS
 from sealscope.recordings.channels import CHANNEL_UNITS, LONG_NAMES
 
 #: Parameters of a unit in the order of its code: those that the laws take, and those that their numbers follow from.
-VALUES = tuple(dict.fromkeys((*PARAMETERS.values(), *DERIVED_FROM)))
+VALUES = tuple(NAMES_OF_VALUES.values())
 _TABLES: dict[str, Any] = tomllib.loads((files("sealscope.fmu") / "variables.toml").read_text("utf-8"))
 #: Inputs, outputs and a soft sensor's outputs in the order of the code: unit, words.
 INPUTS: Mapping[str, tuple[str, str]] = _TABLES["inputs"]

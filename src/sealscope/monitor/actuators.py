@@ -1,4 +1,9 @@
-"""Every actuator's detector and alarm, and the database behind them: a block is taken whole or not at all."""
+"""Every actuator's detector and alarm, and the database behind them: a block is taken whole or not at all.
+
+Each transaction stores blocks' identities, estimates, alarms and pending samples; every 16 blocks or 400 kB of an
+actuator, and with each mark, its whole state takes the place of the pending samples. So a restart is the last state and
+the pending samples gone through once more, with the settings that they were judged by.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +13,14 @@ import math
 import threading
 import time
 import zlib
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
+from sqlalchemy import Connection
 from sqlalchemy.exc import IntegrityError
 
 from sealscope.diagnosis.live.estimates import BlockEstimate
@@ -22,10 +29,9 @@ from sealscope.diagnosis.verdict.states import LEAKING, MachineState, state_of
 from sealscope.errors import InputError
 from sealscope.monitor.alarms import Alarm, AlarmJudge
 from sealscope.monitor.database.machine_files import pass_on
-from sealscope.monitor.database.sharing import Share
 from sealscope.monitor.database.store import KEPT_IDENTITIES, MonitorStore, StoredRows, away
-from sealscope.monitor.settings import ActuatorSettings
-from sealscope.monitor.sources.source_block import SourceBlock, bytes_of, nothing
+from sealscope.monitor.settings import ActuatorSettings, WatchSettings
+from sealscope.monitor.sources.source_block import SourceBlock, bytes_of
 from sealscope.monitor.supervisor import Supervisor
 from sealscope.recordings.recording import Recording
 from sealscope.storage.plain_state import part_of, restored, saved
@@ -34,8 +40,8 @@ _log = logging.getLogger(__name__)
 _LONGEST_TEXT = 2000
 #: Blocks of samples between two checkpoints, and their bytes.
 PENDING_BLOCKS, PENDING_BYTES = 16, 400_000
-#: How long blocks of others' actuators are kept, in leases: until a takeover, with time to spare.
-_KEPT_LEASES = 4.0
+#: What a block is counted under that raised an error.
+DROPPED = "blocks that raised an error"
 #: How long the samples of an alarm are kept [s].
 _KEPT_S = 120.0
 
@@ -60,7 +66,9 @@ class _Actuator:
     judged_s: float | None = None
     kept: list[Recording] = field(default_factory=list)
 
-    def judged(self, samples: Recording, follows: bool) -> tuple[list[BlockEstimate], list[tuple[Alarm, str, float]]]:
+    def judged(
+        self, samples: Recording, follows: bool, settings: WatchSettings
+    ) -> tuple[list[BlockEstimate], list[tuple[Alarm, str, float]]]:
         """Return the estimates of samples, and what happened to alarms: the same whenever it is gone through."""
         estimates, happened = [], []
         self.pending += 1
@@ -71,7 +79,7 @@ class _Actuator:
                 self.oil_celsius = float(known.mean()) - 273.15
         for estimate, leak in self.watch.each(samples, follows=follows):
             version = 0 if self.watch.baseline is None else self.watch.baseline.version
-            change = self.judge.take(estimate, leak, version, self.settings)
+            change = self.judge.take(estimate, leak, version, settings)
             estimates.append(estimate)
             self.last = estimate
             if estimate.judged or self.judged_s is None or self.judged_s > estimate.t:  # the clock may be set back
@@ -126,6 +134,14 @@ class _Actuator:
         }
 
 
+def _settings_of(stored: str) -> WatchSettings | None:
+    """Return the settings of a checkpoint, None where an earlier Sealscope stored others."""
+    try:
+        return WatchSettings.model_validate_json(stored)
+    except ValidationError:
+        return None
+
+
 class _Repeated(Exception):  # noqa: N818 (says what happened)
     """One of the blocks is stored already."""
 
@@ -133,26 +149,15 @@ class _Repeated(Exception):  # noqa: N818 (says what happened)
 class WatchedActuators:
     """The actuators of a monitor, restored from its database, which keeps estimates of `keep_days` of operation."""
 
-    def __init__(
-        self,
-        settings: list[ActuatorSettings],
-        store: MonitorStore,
-        keep_days: float = 90.0,
-        share: Share | None = None,
-    ) -> None:
-        self.store, self._share = store, share
-        self.settings = {each.name: each for each in settings}
-        #: When the last block of each came [s], and those of others' actuators with the clock at which they came.
-        self._heard = dict.fromkeys(self.settings, time.monotonic())
-        self._elsewhere = {name: deque[tuple[float, SourceBlock]]() for name in self.settings}
+    def __init__(self, settings: list[ActuatorSettings], store: MonitorStore, keep_days: float = 90.0) -> None:
+        self.store, self.settings = store, {each.name: each for each in settings}
+        self._heard = dict.fromkeys(self.settings, time.monotonic())  # when the last block of each came [s]
         self._keep_s = keep_days * 86_400.0
         self._counters, self._counting = Counter[str](), threading.Lock()
         self._changes, self.changed, self.closed = itertools.count(1), 0, False
         self.supervisor = Supervisor(away, self._tell)
         self._lock = threading.RLock()
-        self._actuators: dict[str, _Actuator] = {}
-        if share is None:
-            self._actuators = {name: self._restored(each) for name, each in self.settings.items()}
+        self._actuators = {name: self._restored(self.settings[name]) for name in self.settings if name in self.held}
 
     def _restored(self, settings: ActuatorSettings) -> _Actuator:
         """Return an actuator as its last transaction left it, or begun anew where it is new or the settings changed."""
@@ -161,7 +166,8 @@ class WatchedActuators:
         fresh = watch(settings.rig, false_alarms_per_1000_h=rate, learn_hours=settings.learn_hours)
         actuator, anew = _Actuator(settings, fresh, AlarmJudge(name), taken=taken), True
         if state is not None:
-            learned_with, own, pending = state
+            stored, own, pending = state
+            before = _settings_of(stored)
             actuator.judge = restored(AlarmJudge, own["judge"], "alarm")
             if (version := part_of(own["watch"], "version", int)) != STATE_VERSION:
                 _log.warning("%s: its state has version %s, not %d, begins anew", name, version, STATE_VERSION)
@@ -171,12 +177,12 @@ class WatchedActuators:
                 actuator.watch = Watch.from_state(own["watch"])
                 actuator.last = None if own["last"] is None else restored(BlockEstimate, own["last"], "last")
                 actuator.oil_celsius, actuator.judged_s = own.get("oil_celsius"), own.get("judged_s")
-                for samples, follows in pending:
-                    actuator.judged(samples, follows)
-                anew = actuator.watch.false_alarms_per_1000_h != rate
+                for samples, follows in pending:  # as they were judged before
+                    actuator.judged(samples, follows, before or settings)
+                anew = before != settings.watched_with
                 actuator.watch.false_alarms_per_1000_h = rate  # with the same baseline
-                if learned_with != settings.learned_with:
-                    _log.warning("%s: learned with %s, begins anew with other settings", name, learned_with)
+                if actuator.watch.learned_with != fresh.learned_with:
+                    _log.warning("%s: its rig or learn_hours are others than it learned with, begins anew", name)
                     fresh.continue_from(actuator.watch.blocks, actuator.watch.baseline_version)
                     actuator.watch, anew = fresh, True
         if anew:
@@ -197,56 +203,20 @@ class WatchedActuators:
         with self._counting:
             return dict(self._counters)
 
-    def renew(self) -> None:
-        """Renew the share in the actuators; of one that is taken over the blocks since then are taken at once.
-
-        Raises what the database raises.
-        """
-        assert self._share is not None
-        with self._lock:
-            gained, lost = self._share.renew()
-            for name in gained | lost:
-                self._actuators.pop(name, None)  # the database knows better
-            for name in sorted(self._share.held & set(self.settings)):
-                self._take_over(name)
-
-    def _take_over(self, name: str) -> None:
-        """Take the blocks that came while another monitor watched an actuator; those it stored are passed over."""
-        waiting = self._elsewhere[name]
-        for _ in range(len(waiting)):
-            self._take([waiting[0][1]])
-            waiting.popleft()
-
-    def _keep_elsewhere(self, block: SourceBlock) -> None:
-        """Keep a block of another monitor's actuator for as long as its takeover may last."""
-        assert self._share is not None
-        self.count("blocks of another monitor's actuator")
-        waiting, now = self._elsewhere[block.actuator], time.monotonic()
-        waiting.append((now, replace(block, done=nothing)))
-        while waiting and waiting[0][0] < now - _KEPT_LEASES * self._share.lease_s:
-            waiting.popleft()
-
     def take(self, blocks: Sequence[SourceBlock]) -> None:
         """Take blocks in one transaction: samples, estimates, alarms and the blocks' identities, or nothing of it.
 
         Raises what the database raises; the blocks can then be taken again.
         """
         with self._lock:
-            known, held = [block for block in blocks if block.actuator in self.settings], self.held
-            mine = [block for block in known if block.actuator in held]
+            known = [block for block in blocks if block.actuator in self.settings]
             for name in {block.actuator for block in known}:
                 self._heard[name] = time.monotonic()
-            if self._share is not None:
-                for name in {block.actuator for block in mine}:
-                    self._take_over(name)
-            self._take(mine)
-            for block in known:
-                if block.actuator not in held:
-                    self._keep_elsewhere(block)
+            self._take(known)
             self.count("blocks of an actuator that is not in the settings", len(blocks) - len(known))
 
     def _take(self, blocks: Sequence[SourceBlock]) -> None:
-        """Take blocks of actuators that are this monitor's to watch.
+        """Take blocks of known actuators.
 
         None of them is likely to be stored: that is asked only where the database refuses to store one again.
         """
@@ -256,34 +226,31 @@ class WatchedActuators:
         fresh = [block for block in blocks if new[block.actuator, block.identity] is block]
         try:
             try:
-                lost = self._stored(fresh)
+                self._stored(fresh)
             except _Repeated:
                 known = self.store.known(new)
                 fresh = [block for block in fresh if (block.actuator, block.identity) not in known]
-                lost = self._stored(fresh)
+                self._stored(fresh)
         except BaseException:
             # what the detectors took is not stored: the next blocks begin at the last transaction
             for name in {block.actuator for block in blocks}:
                 self._actuators.pop(name, None)
             raise
-        for block in fresh:
-            if block.actuator in lost:
-                self._actuators.pop(block.actuator, None)
-                self._keep_elsewhere(block)
         self.count("blocks stored already", len(blocks) - len(fresh))
         self._tell()
 
-    def _stored(self, blocks: Sequence[SourceBlock]) -> set[str]:
-        """Take blocks in one transaction; return the actuators whose lease is another's.
+    def _own(self, blocks: Sequence[SourceBlock], connection: Connection) -> Sequence[SourceBlock]:
+        """Return the blocks that are this monitor's to store, in the transaction that stores them."""
+        return blocks
+
+    def _stored(self, blocks: Sequence[SourceBlock]) -> None:
+        """Take blocks in one transaction.
 
         Raises _Repeated, and no detector has taken anything, where one of the blocks is stored already.
         """
-        rows, lost = StoredRows(), set[str]()
+        rows = StoredRows()
         with self.store.writing() as connection:
-            if (share := self._share) is not None:
-                names = sorted({block.actuator for block in blocks})
-                lost = {name for name in names if not share.holds(connection, name)}
-            mine = [(block, self._actuator(block.actuator)) for block in blocks if block.actuator not in lost]
+            mine = [(block, self._actuator(block.actuator)) for block in self._own(blocks, connection)]
             numbers = {actuator.settings.name: itertools.count(actuator.taken + 1) for _, actuator in mine}
             numbered = [(block.actuator, block.identity, next(numbers[block.actuator])) for block, _ in mine]
             if numbered:
@@ -296,7 +263,6 @@ class WatchedActuators:
                 if block.samples is not None:
                     self._taken(rows, actuator, block.samples, block.follows)
             self.store.keep_rows(connection, rows)
-        return lost
 
     def _actuator(self, name: str) -> _Actuator:
         if name not in self._actuators:
@@ -306,7 +272,7 @@ class WatchedActuators:
     def _taken(self, rows: StoredRows, actuator: _Actuator, samples: Recording, follows: bool) -> None:
         """Add to the rows what samples make of an actuator."""
         name = actuator.settings.name
-        estimates, happened = actuator.judged(samples, follows)
+        estimates, happened = actuator.judged(samples, follows, actuator.settings)
         rows.add_estimates(name, estimates, actuator.oil_celsius)
         for alarm, kind, t in happened:
             rows.add_alarm(alarm, kind, t)
@@ -320,7 +286,7 @@ class WatchedActuators:
     def _checkpoint(self, actuator: _Actuator, rows: StoredRows) -> None:
         """Add the state to the rows, and what is old then."""
         settings = actuator.settings
-        rows.add_checkpoint(settings.name, settings.learned_with, actuator.state())
+        rows.add_checkpoint(settings.name, settings.watched_with.model_dump_json(), actuator.state())
         self._show(actuator, rows)
         kept = self._keep_s / actuator.watch.block_seconds
         rows.old[settings.name] = actuator.taken - KEPT_IDENTITIES, math.floor(actuator.watch.blocks - kept)
@@ -353,7 +319,8 @@ class WatchedActuators:
             if name not in self.held:
                 raise InputError(f"{name} is watched by another monitor; mark its alarm on that one's page")
             actuator, rows = self._actuator(name), StoredRows()
-            at, kept = actuator.last.t if actuator.last is not None else 0.0, list(actuator.kept)
+            at = getattr(actuator.last, "t", getattr(actuator.judge.alarm, "updated_s", 0.0))
+            kept = list(actuator.kept)
             alarm = actuator.judge.marked(mark, at, until=at + hours * 3600.0, reason=text)
             try:
                 if mark == "invalid":
@@ -376,8 +343,8 @@ class WatchedActuators:
 
     @property
     def held(self) -> frozenset[str]:
-        """The actuators that this monitor watches: all of its settings, or its share of them."""
-        return frozenset(self.settings) & (frozenset(self.settings) if self._share is None else self._share.held)
+        """The actuators that this monitor watches."""
+        return frozenset(self.settings)
 
     @property
     def false_alarms_per_1000_h(self) -> float:

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+from sealscope.diagnosis.commissioned.machine import JUDGEMENTS
 from sealscope.diagnosis.live.estimates import BlockEstimate, Interval, WatchedLeak
 from sealscope.diagnosis.verdict.states import state_of
 from sealscope.errors import InputError
@@ -26,7 +27,7 @@ _CONDITIONS: dict[Level, str] = {"warning": "leak", "error": "leak over the limi
 #: Bits of the status word.
 WARNING_BIT, ERROR_BIT, NEW_BIT = 1, 2, 4
 #: What a person may say of an alarm.
-MARKS = ("acknowledged", "comment", "shelved", "valid", "invalid", "repaired")
+MARKS = ("acknowledged", "comment", "shelved", *JUDGEMENTS)
 
 
 @dataclass(frozen=True)
@@ -116,11 +117,12 @@ class AlarmJudge:
     ) -> tuple[Alarm, str] | None:
         """Return the alarm and what happened to it ("raised", "error", "warning", "returned"), None for nothing.
 
-        A leak without L/min is a warning; blocks that are not judged change nothing.
+        A leak without L/min is a warning; blocks that are not judged change nothing. One that rises again before
+        anybody saw it is the same alarm. No leak while an alarm lasts: the detector began anew, the leak may last.
         """
         if not estimate.judged:
             return None
-        lpm = estimate.leak_lpm if leak is not None else 0.0
+        lpm = estimate.leak_lpm
         above = leak is not None and (lpm is None or lpm >= settings.warning_lpm)
         error = leak is not None and lpm is not None and lpm >= (settings.error_lpm or math.inf)
         self.above = self.above + 1 if above or error else 0
@@ -129,7 +131,7 @@ class AlarmJudge:
         if self.alarm is None or not self.alarm.active:
             if leak is None or self.above < settings.debounce_blocks:
                 return None
-            self.raised, self.below = self.raised + 1, 0
+            self.raised, self.below = self.raised + (self.alarm is None), 0
             level: Level = "error" if self.error >= settings.debounce_blocks else "warning"
             self.alarm = Alarm(
                 id=f"{self.actuator}-{self.raised}",
@@ -146,13 +148,16 @@ class AlarmJudge:
                 evidence=leak.reason,
                 next_check=state_of(_CONDITIONS[level], leak.cause).action,
                 baseline=baseline,
+                shelved_until_s=0.0 if self.alarm is None else self.alarm.shelved_until_s,
                 by_chance_per_1000_h=by_chance,
             )
             return self.alarm, "raised"
-        limit = settings.warning_lpm if self.alarm.level == "warning" else (settings.error_lpm or 0.0)
-        low = leak is None or (lpm is not None and lpm < settings.return_share * limit)
+        limit = settings.warning_lpm if self.alarm.level == "warning" else (settings.error_lpm or math.inf)
+        low = leak is not None and lpm is not None and lpm < settings.return_share * limit
         self.below = self.below + 1 if low else 0
-        now, happened = replace(self.alarm, updated_s=estimate.t), ""
+        back = min(0.0, estimate.t - self.alarm.updated_s)  # where the clock was set back, so is the end of the shelf
+        until = self.alarm.shelved_until_s + back
+        now, happened = replace(self.alarm, updated_s=estimate.t, shelved_until_s=until), ""
         if self.below >= settings.debounce_blocks:
             self.below = 0
             if now.level == "error" and above and not error:
@@ -221,6 +226,6 @@ def ranked(summaries: Mapping[str, Mapping[str, Any]], alarms: list[dict[str, An
         evidence = math.inf if chance is None else chance, -low, -(row["leak_lpm"] or 0.0)
         return -row["state"]["severity"], -(row["status_word"] & NEW_BIT), *evidence, row["name"]
 
-    by_actuator = {alarm["actuator"]: alarm for alarm in alarms}
+    by_actuator = {alarm["actuator"]: alarm for alarm in reversed(alarms)}  # of several the latest
     rows = [{"name": name, **summary, "alarm": by_actuator.get(name)} for name, summary in summaries.items()]
     return sorted(rows, key=order)

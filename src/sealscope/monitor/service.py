@@ -17,7 +17,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from threadpoolctl import threadpool_limits
 
 from sealscope.errors import InputError
-from sealscope.monitor.actuators import WatchedActuators
+from sealscope.monitor.actuators import DROPPED, WatchedActuators
 from sealscope.monitor.database.sharing import Share
 from sealscope.monitor.database.store import MonitorStore, away
 from sealscope.monitor.outputs.events import EventLines, Webhook
@@ -25,6 +25,7 @@ from sealscope.monitor.outputs.sparkplug_node import SparkplugNode
 from sealscope.monitor.page.live import LiveSamples
 from sealscope.monitor.page.site import PageServer
 from sealscope.monitor.settings import MonitorSettings, secret_of
+from sealscope.monitor.shared import SharedActuators
 from sealscope.monitor.sources.broker import broker_of
 from sealscope.monitor.sources.folder import folders_of
 from sealscope.monitor.sources.lines import lines_of
@@ -41,8 +42,6 @@ _WAITING, _WAITING_BYTES, _LONG_WAIT_S = 512, 256_000_000, 5.0
 _LOOK_S, _END_S = 0.2, 2.5
 #: Blocks that are stored in one transaction, at most, and how long the first one waits for others [s].
 _TOGETHER, _GATHER_S = 256, 0.02
-#: What a block is counted under that raised an error.
-_DROPPED = "blocks that raised an error"
 #: Lines in the log about the same trouble before only each power of two gets one.
 _FIRST_LINES = 3
 
@@ -84,15 +83,18 @@ class Service:
             self._hold.enter_context(locked(Path(settings.database + ".lock"), busy))
         try:
             self.store = MonitorStore(settings.database)
-            names, share = [actuator.name for actuator in settings.actuator], settings.share
-            self._share = None if share is None else Share(self.store, share, names)
+            watched = settings.actuator, self.store, settings.keep_days
             with threadpool_limits(limits=1):  # as in `run`: sums in another order end in other digits
-                self.actuators = WatchedActuators(settings.actuator, self.store, settings.keep_days, self._share)
+                if settings.share is None:
+                    self.actuators = WatchedActuators(*watched)
+                else:
+                    share = Share(self.store, settings.share, [actuator.name for actuator in settings.actuator])
+                    self.actuators = SharedActuators(*watched, share)
             own = self.actuators
             self.supervisor, self.count, self.plain = own.supervisor, own.count, own.plain
             self.stopping, self._database = self.supervisor.stopping, self.supervisor.part(DATABASE)
-            if self._share is not None:
-                self.actuators.renew()
+            if isinstance(own, SharedActuators):
+                own.renew()
             self._live = LiveSamples(self.store.last_samples)
             self._lines = EventLines(self.store, stdout or sys.stdout)
             self.page: PageServer | None = None
@@ -155,9 +157,9 @@ class Service:
             for thread in ending:
                 if thread.name != _LINES:  # which may wait for a line for ever
                     thread.join(max(0.0, deadline - time.monotonic()))
-            if self._share is not None:
+            if isinstance(self.actuators, SharedActuators):
                 with suppress(SQLAlchemyError):
-                    self._share.give_back()
+                    self.actuators.share.give_back()
             if self.page is not None:
                 self.page.close()
             self.close()
@@ -179,8 +181,8 @@ class Service:
         """Start what sends, and what renews the share in the actuators."""
         repeat = self.supervisor.repeat
         threads = [repeat("standard output", self._pass_on, _LOOK_S, last=self._pass_on)]
-        if self._share is not None:
-            repeat("share", self.actuators.renew, self._share.lease_s / 4.0)
+        if isinstance(own := self.actuators, SharedActuators):
+            repeat("share", own.renew, own.share.lease_s / 4.0)
         if (settings := self.settings.sparkplug) is not None and (broker := self.settings.mqtt) is not None:
             password = secret_of(broker.password_file, "mqtt.password_file")
             node = SparkplugNode(self.store, self.plain, self.count, broker, settings, password)
@@ -231,8 +233,8 @@ class Service:
                 for block in blocks:
                     self._store([block], write)
                 return
-            self.count(_DROPPED)
-            if _worth_a_line(self.actuators.counters[_DROPPED]):
+            self.count(DROPPED)
+            if _worth_a_line(self.actuators.counters[DROPPED]):
                 _log.exception("a block is dropped: %s", str(getattr(blocks[0], "actuator", blocks[0]))[:60])
         else:
             self._blocked = False

@@ -48,9 +48,9 @@ class WatchSettings(_Part):
     not_comparable_s: float = Field(default=3600.0, gt=0)
 
     @property
-    def learned_with(self) -> str:
-        """The settings that a baseline depends on."""
-        return f"{Path(self.rig).name}, {self.learn_hours:g} h"
+    def watched_with(self) -> WatchSettings:
+        """How it is watched, alone."""
+        return WatchSettings(**{name: getattr(self, name) for name in WatchSettings.model_fields})
 
 
 class SimulateSettings(_Part):

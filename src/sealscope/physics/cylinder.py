@@ -7,9 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.compiled import contracted
-from sealscope.physics.fluid import P_ATM
+from sealscope.compiled import contracted, law
 from sealscope.physics.lanes import select
+from sealscope.units import P_ATM
+
+
+@law
+def volumes_at_middle(c: Any) -> tuple[float, float]:
+    """Return the oil volumes of both sides [m^3] at mid-stroke, chamber and hose.
+
+    `c`: a cylinder, or other numbers with its V, V_rod, V_hose_A and V_hose_B [m^3].
+    """
+    return c.V + c.V_hose_A, c.V - c.V_rod + c.V_hose_B
 
 
 @contracted

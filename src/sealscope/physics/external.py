@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 from sealscope.compiled import contracted
-from sealscope.physics.fluid import P_ATM
 from sealscope.physics.lanes import select
+from sealscope.units import P_ATM
 
 
 @contracted

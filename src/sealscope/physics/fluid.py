@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from sealscope.compiled import contracted
 from sealscope.physics.lanes import anywhere, exponential
+from sealscope.units import P_ATM
 
-#: Atmospheric pressure [Pa]; every pressure of the rig is counted from it.
-P_ATM = 101325.0
 #: 40 and 100 deg C [K], at which viscosities are stated.
 _T_40, _T_100 = 313.15, 373.15
 #: Relative change of the bulk modulus of mineral oils with temperature, as a power of ten [1/K].

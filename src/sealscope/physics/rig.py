@@ -24,7 +24,7 @@ from sealscope.compiled import contracted, law
 from sealscope.parameters import Rig
 from sealscope.parameters.fields import leaves, unit_of
 from sealscope.physics import cylinder, external, friction, motor, pump, restrictors, valve
-from sealscope.physics.fluid import P_ATM, effective_bulk_modulus, mixture_density_ratio, oil_density_ratio
+from sealscope.physics.fluid import effective_bulk_modulus, mixture_density_ratio, oil_density_ratio
 from sealscope.physics.lanes import select
 from sealscope.physics.leakage import piston_leakage
 from sealscope.physics.state import (
@@ -48,21 +48,25 @@ from sealscope.physics.state import (
     pressures_moved,
 )
 from sealscope.physics.state import OUTPUTS as OUTPUTS  # noqa: PLC0414
+from sealscope.units import P_ATM
 
-#: Parameters that no law takes under its own symbol: informative ones, those within the throttles' coefficients, the
-#: pump's losses or the volumes of a side, and those of what only changes within a run.
+#: Parameters that the laws take within other numbers alone (`DERIVED`).
+_WITHIN = (
+    *("line.C_d", "line.d_line", "line.closed_A", "line.closed_B", "line.open_A", "line.open_B", "fluid.rho"),
+    *("cylinder.V_rod", "cylinder.V_hose_A", "cylinder.V_hose_B", "pump.C_st", "pump.C_h"),
+)
+#: Parameters that are informative, and those of what only changes within a run.
 _NOT_TAKEN = {
-    *("pump.omega_max", "line.C_d", "line.d_line", "line.closed_A", "line.closed_B", "fluid.rho"),
-    *("line.open_A", "line.open_B", "line.G_circ", "pump.C_st", "pump.C_h"),
-    *("cylinder.V_hose_A", "cylinder.V_hose_B", "cylinder.V_rod"),
-    *("fluid.T_oil", "fluid.nu_40", "fluid.nu_100", "fluid.alpha"),
+    *("pump.omega_max", "line.G_circ", "fluid.T_oil", "fluid.nu_40", "fluid.nu_100", "fluid.alpha"),
 }
 #: Dotted name of each parameter that the laws take, by its symbol, as the models declare them.
 PARAMETERS = {
     name.rpartition(".")[2]: name
     for name, field in leaves(Rig)
-    if unit_of(field) and not name.startswith(("sensors.", "daq.")) and name not in _NOT_TAKEN
+    if unit_of(field) and not name.startswith(("sensors.", "daq.")) and name not in _NOT_TAKEN | {*_WITHIN}
 }
+#: ... and of those that the laws' numbers follow from.
+VALUES = {**PARAMETERS, **{name.rpartition(".")[2]: name for name in _WITHIN}}
 #: Choices that the laws take as truth values, each with the parameter and the value that stand for True; `made_up` is
 #: True with check valves of either kind.
 _CHOICES = {
@@ -71,14 +75,8 @@ _CHOICES = {
     "literal_bracket": ("friction.bracket", "literal"),
 }
 #: Numbers that follow from parameters: coefficients of throttle A (from the pump to the cylinder, back) and B, with
-#: their shut-off valves, volumes of both sides at mid-stroke, coefficients of the pump's losses; and the parameters
-#: they follow from (`derived_numbers`).
+#: their shut-off valves, volumes of both sides at mid-stroke, coefficients of the pump's losses (`derived_numbers`).
 DERIVED = ("c_A_in", "c_A_out", "c_B_in", "c_B_out", "V_A", "V_B", "c_slip", "k_h")
-DERIVED_FROM = (
-    *("line.C_d", "line.d_line", "line.closed_A", "line.closed_B", "line.open_A", "line.open_B", "fluid.rho"),
-    *("cylinder.V", "cylinder.V_rod", "cylinder.V_hose_A", "cylinder.V_hose_B"),
-    *("pump.q_b", "pump.C_st", "pump.C_h"),
-)
 #: The numbers of `RigNumbers`.
 NUMBERS = (*PARAMETERS, *DERIVED)
 #: Laws that some rigs do without: tuples, empty where the law is not in force, so that the compiler leaves it out.
@@ -108,66 +106,44 @@ if TYPE_CHECKING:
         def _replace(self, **fields: Any) -> RigNumbers: ...
         def _asdict(self) -> dict[str, Any]: ...
 
+    RigValues = RigNumbers
 else:  # numba takes a named tuple apart; its fields are those of the models
     RigNumbers = namedtuple("RigNumbers", (*NUMBERS, *CHOICES))
+    RigValues = namedtuple("RigValues", VALUES)
 
 
 @law
-def coefficients_of_throttles(
-    C_d: float,
-    d_line: float,
-    closed_A: float,
-    closed_B: float,
-    open_A: float,
-    open_B: float,
-    rho: float,
-    exponent: float,
-    literal: bool,
-) -> tuple[float, float, float, float]:
+def coefficients_of_throttles(v: RigValues, exponent: float, literal: bool) -> tuple[float, float, float, float]:
     """Return the flow coefficients (c_A_in, c_A_out, c_B_in, c_B_out) [m^3/(s Pa^0.5)], eqs. (4.7)-(4.12).
 
     "Closed" is a share of the area (`exponent` 1, eq. 4.8) or of the diameter (2, the text). Metering "meter-out": free
     flow towards the cylinder and throttled return on both sides (the text and Appendix A); `literal`: as eqs.
     (4.9)-(4.12) are printed, side B the other way round. Shut-off valves are in series with them (`behind_valve`).
     """
-    free = restrictors.orifice_coefficient(C_d, math.pi / 4.0 * d_line**2, rho)  # eq. (4.7)
-    throttled_A = free * (1.0 - closed_A) ** exponent  # eq. (4.8)
-    throttled_B = free * (1.0 - closed_B) ** exponent
-    A_in, A_out = restrictors.behind_valve(free, free, open_A), restrictors.behind_valve(throttled_A, free, open_A)
-    B_free, B_throttled = (
-        restrictors.behind_valve(free, free, open_B),
-        restrictors.behind_valve(throttled_B, free, open_B),
-    )
+    free = restrictors.orifice_coefficient(v.C_d, math.pi / 4.0 * v.d_line**2, v.rho)  # eq. (4.7)
+    throttled_A = free * (1.0 - v.closed_A) ** exponent  # eq. (4.8)
+    throttled_B = free * (1.0 - v.closed_B) ** exponent
+    A_in = restrictors.behind_valve(free, free, v.open_A)
+    A_out = restrictors.behind_valve(throttled_A, free, v.open_A)
+    B_free = restrictors.behind_valve(free, free, v.open_B)
+    B_throttled = restrictors.behind_valve(throttled_B, free, v.open_B)
     if literal:
         return A_in, A_out, B_throttled, B_free
     return A_in, A_out, B_free, B_throttled
 
 
 @law
-def derived_numbers(
-    C_d: float,
-    d_line: float,
-    closed_A: float,
-    closed_B: float,
-    open_A: float,
-    open_B: float,
-    rho: float,
-    V: float,
-    V_rod: float,
-    V_hose_A: float,
-    V_hose_B: float,
-    q_b: float,
-    C_st: float,
-    C_h: float,
-    exponent: float,
-    literal: bool,
-) -> tuple[float, float, float, float, float, float, float, float]:
-    """Return the numbers of `DERIVED` from the parameters of `DERIVED_FROM`; `exponent`, `literal`: see above."""
-    c_A_in, c_A_out, c_B_in, c_B_out = coefficients_of_throttles(
-        C_d, d_line, closed_A, closed_B, open_A, open_B, rho, exponent, literal
-    )
-    c_slip, k_h = pump.loss_coefficients(q_b, C_st, C_h, rho)
-    return c_A_in, c_A_out, c_B_in, c_B_out, V + V_hose_A, V - V_rod + V_hose_B, c_slip, k_h
+def derived_numbers(v: RigValues, exponent: float, literal: bool) -> tuple[float, ...]:
+    """Return the numbers of `DERIVED`; `exponent`, `literal`: see `coefficients_of_throttles`."""
+    c_A_in, c_A_out, c_B_in, c_B_out = coefficients_of_throttles(v, exponent, literal)
+    V_A, V_B = cylinder.volumes_at_middle(v)
+    c_slip, k_h = pump.loss_coefficients(v.q_b, v.C_st, v.C_h, v.rho)
+    return c_A_in, c_A_out, c_B_in, c_B_out, V_A, V_B, c_slip, k_h
+
+
+def values_of(rig: Rig) -> RigValues:
+    """Return the rig's parameters that its numbers are made of."""
+    return RigValues(*(float(attrgetter(name)(rig)) for name in VALUES.values()))
 
 
 def throttle_readings(rig: Rig) -> tuple[float, bool]:
@@ -177,15 +153,12 @@ def throttle_readings(rig: Rig) -> tuple[float, bool]:
 
 def throttle_coefficients(rig: Rig) -> tuple[float, float, float, float]:
     """Return the coefficients of the rig's throttles (`coefficients_of_throttles`)."""
-    line = rig.line
-    openings = line.closed_A, line.closed_B, line.open_A, line.open_B
-    return coefficients_of_throttles(  # type: ignore[no-any-return]
-        line.C_d, line.d_line, *openings, rig.fluid.rho, *throttle_readings(rig)
-    )
+    return coefficients_of_throttles(values_of(rig), *throttle_readings(rig))  # type: ignore[no-any-return]
 
 
 def rig_numbers(rig: Rig) -> RigNumbers:
     """Return the rig's parameters as the compiled laws take them."""
+    values = values_of(rig)
     choices = {name: attrgetter(parameter)(rig) == value for name, (parameter, value) in _CHOICES.items()}
     choices["made_up"] = rig.makeup.check_valves != "absent"
     laws = {
@@ -210,8 +183,8 @@ def rig_numbers(rig: Rig) -> RigNumbers:
         "bypassed": rig.line.G_bypass > 0,
     }
     return RigNumbers(
-        *(attrgetter(name)(rig) for name in PARAMETERS.values()),
-        *derived_numbers(*(attrgetter(name)(rig) for name in DERIVED_FROM), *throttle_readings(rig)),  # type: ignore[call-arg]
+        *values[: len(PARAMETERS)],
+        *derived_numbers(values, *throttle_readings(rig)),
         **choices,
         **{name: (True,) if there else () for name, there in laws.items()},
     )

@@ -2,59 +2,69 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sealscope.compiled import law
 from sealscope.errors import InputError
 from sealscope.physics.cylinder import hard_stop_force, load_force, opposing_force
-from sealscope.physics.fluid import P_ATM
 from sealscope.physics.pump import friction_torque, pump_flow, pump_torque, turbulent_slip
 from sealscope.physics.rig import RigNumbers, rig_numbers, valve_rates
 from sealscope.physics.state import CURRENT, INTEGRAL, OMEGA, P_1, P_2, P_A, P_B, POSITION, STATES, state_of
+from sealscope.units import P_ATM
 
 if TYPE_CHECKING:
-    from sealscope.parameters import Cylinder, Rig
+    from sealscope.parameters import Rig
+
+
+#: What `stand_still` returns where there is no standstill.
+BELOW_VACUUM, NOT_HELD = 2, 3
 
 
 @law
-def carried_at_standstill(
-    x: float, F_l: float, k_load: float, A_opp: float, p_opp: float, L: float, k_stop: float, d_stop: float
-) -> float:
-    """Force [N] against +x that the pressures carry at standstill at x [m]: the load less that of a stop."""
-    load = load_force(x, F_l, k_load) + opposing_force(0.0, A_opp, p_opp, 1.0)
-    return load - hard_stop_force(x, 0.0, L, k_stop, d_stop)
+def carried_at_standstill(x: float, p: RigNumbers) -> float:
+    """Force [N] against +x that the pressures carry at standstill at x [m]: the rig's load less that of a stop."""
+    load = load_force(x, p.F_l, p.k_load) + opposing_force(0.0, p.A_opp, p.p_opp, 1.0)
+    return load - hard_stop_force(x, 0.0, p.L, p.k_stop, p.d_stop)  # type: ignore[no-any-return]
 
 
 @law
-def holding_current(dp: float, q_b: float, C_m: float) -> float:
-    """Winding current [A] that holds the pump against dp [Pa]: T_load/C_m, eq. (4.5) at standstill."""
-    return pump_torque(dp, q_b) / C_m
-
-
-@law
-def holding_integral(i: float, R_c: float, K_i: float) -> float:
-    """Integral [rad] of the speed controller that gives the winding i [A] at standstill: R_c i/K_i, eq. (4.3)."""
-    return R_c * i / K_i if K_i > 0.0 else 0.0
-
-
-@law
-def pressures_at_standstill(
-    force: float, A_A: float, A_B: float, V_A: float, V_B: float, p_charge: float, made_up: bool
-) -> tuple[float, float]:
+def pressures_at_standstill(force: float, p: RigNumbers) -> tuple[float, float]:
     """Return p_A, p_B [Pa] that carry `force` [N] against +x at standstill: p_A A_A - p_B A_B = force.
 
     With a make-up the lower of both is at the accumulator's charge pressure. Without one the circuit holds as much oil
-    as at the charge pressure throughout: the mean of both, weighted by the volumes V_A, V_B of the sides [m^3], stays.
+    as at the charge pressure throughout: the mean of both, weighted by the volumes of the sides (chamber, hose, and the
+    line where there is one), stays.
     """
-    if made_up:
-        p_B = max((p_charge * A_A - force) / A_B, p_charge)
-        p_A = max((p_charge * A_B + force) / A_A, p_charge)
+    if p.made_up:
+        p_B = max((p.p_charge * p.A_A - force) / p.A_B, p.p_charge)
+        p_A = max((p.p_charge * p.A_B + force) / p.A_A, p.p_charge)
         return p_A, p_B
-    lack = force - p_charge * (A_A - A_B)  # of force, at the charge pressure
-    moved = lack / (A_A / V_A + A_B / V_B)
-    return p_charge + moved / V_A, p_charge - moved / V_B
+    V_A, V_B = p.V_A, p.V_B
+    if len(p.throttled) > 0:
+        V_A, V_B = V_A + p.V_1, V_B + p.V_2
+    lack = force - p.p_charge * (p.A_A - p.A_B)  # of force, at the charge pressure
+    moved = lack / (p.A_A / V_A + p.A_B / V_B)
+    return p.p_charge + moved / V_A, p.p_charge - moved / V_B
+
+
+@law
+def stand_still(y: Any, x: float, force: float, p: RigNumbers) -> int:
+    """Put a pump-controlled rig at standstill at x [m] under `force` [N] against +x, into a state `y` of zeros.
+
+    The motor holds the pump against the pressures: i = T_load/C_m, eq. (4.5), with the speed controller's integral at
+    R_c i/K_i, which gives that current, eq. (4.3). Returns 0, or `BELOW_VACUUM` or `NOT_HELD` (by the drive).
+    """
+    p_A, p_B = pressures_at_standstill(force, p)
+    y[POSITION] = x
+    y[P_A] = y[P_1] = p_A
+    y[P_B] = y[P_2] = p_B
+    y[CURRENT] = pump_torque(p_A - p_B, p.q_b) / p.C_m
+    y[INTEGRAL] = p.R_c * y[CURRENT] / p.K_i if p.K_i > 0.0 else 0.0
+    if not min(p_A, p_B) >= -P_ATM:
+        return BELOW_VACUUM
+    return 0 if abs(y[CURRENT]) <= p.i_max and p.R_c * abs(y[CURRENT]) <= p.V_max else NOT_HELD
 
 
 @law
@@ -89,77 +99,51 @@ def supply_at_standstill(force: float, x: float, p: RigNumbers) -> tuple[float, 
     return low, p_A, p_B
 
 
-def _carried(c: Cylinder, x: float) -> float:
-    return carried_at_standstill(x, c.F_l, c.k_load, c.A_opp, c.p_opp, c.L, c.k_stop, c.d_stop)  # type: ignore[no-any-return]
-
-
-def side_volumes(rig: Rig) -> tuple[float, float]:
-    """Oil volumes [m^3] of both sides at mid-stroke: chamber, hose, and the line where there is one."""
-    c, line = rig.cylinder, rig.line
-    V_1, V_2 = (line.V_1, line.V_2) if line.orifices == "present" else (0.0, 0.0)
-    return c.V + c.V_hose_A + V_1, c.V - c.V_rod + c.V_hose_B + V_2
-
-
-def standstill_pressures(rig: Rig, force: float) -> tuple[float, float]:
-    """Return p_A, p_B [Pa] that carry `force` [N] against +x at standstill (`pressures_at_standstill`).
-
-    Raises InputError where one of them is below vacuum.
-    """
-    c, made_up = rig.cylinder, rig.makeup.check_valves != "absent"
-    p_A, p_B = pressures_at_standstill(force, c.A_A, c.A_B, *side_volumes(rig), rig.fluid.p_charge, made_up)
-    if min(p_A, p_B) < -P_ATM:
-        raise InputError(
-            f"a load of {force:.4g} N must be carried at standstill by pressures above vacuum, got p_A = {p_A:.4g} Pa "
-            f"and p_B = {p_B:.4g} Pa; raise fluid.p_charge, or let a make-up hold the low side (makeup.check_valves)"
-        )
-    return p_A, p_B
-
-
 def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
-    """State (12,) at standstill with the piston at x_0 [m] from mid-stroke, under `push` [N] beside the rig's own load.
+    """State (14,) at standstill with the piston at x_0 [m] from mid-stroke, under `push` [N] beside the rig's own load.
 
-    The pressures carry the load (`standstill_pressures`), the motor holds the pump against them: i = T_load/C_m, with
-    the speed controller's integral at R_c i/K_i, which gives that current. A machine that leaks creeps from there.
-    Without a load and with equal areas all pressures are at the charge pressure and all else is zero.
+    The pressures carry the load (`pressures_at_standstill`), the motor holds the pump against them (`stand_still`). A
+    machine that leaks creeps from there. Without a load and with equal areas all pressures are at the charge pressure
+    and all else is zero.
 
     Behind a servo valve at null the motor turns at the supply's speed, whose pressure stays (`supply_at_standstill`).
     An underlapped valve lets a loaded piston creep from there.
 
     Raises InputError where the pressures are below vacuum or beyond the supply's, or the drive cannot hold them.
     """
-    c, m = rig.cylinder, rig.motor
-    y = np.zeros(len(STATES))
-    y[POSITION] = x_0
+    p, y = rig_numbers(rig), np.zeros(len(STATES))
+    force = carried_at_standstill(x_0, p) + push
     if rig.valve.spool == "present":
-        return _at_valve(rig, y, push)
-    force = _carried(c, x_0) + push
-    p_A, p_B = standstill_pressures(rig, force)
-    y[[P_A, P_1]], y[[P_B, P_2]] = p_A, p_B
-    y[CURRENT] = holding_current(p_A - p_B, rig.pump.q_b, m.C_m)
-    if abs(y[CURRENT]) > m.i_max or m.R_c * abs(y[CURRENT]) > m.V_max:
-        most = min(m.i_max, m.V_max / m.R_c)
+        return _at_valve(rig, y, x_0, force, p)
+    failure = stand_still(y, x_0, force, p)
+    if failure == BELOW_VACUUM:
+        raise InputError(
+            f"a load of {force:.4g} N must be carried at standstill by pressures above vacuum, got p_A = {y[P_A]:.4g} "
+            f"Pa and p_B = {y[P_B]:.4g} Pa; raise fluid.p_charge, or let a make-up hold the low side "
+            "(makeup.check_valves)"
+        )
+    if failure == NOT_HELD:
+        most = min(p.i_max, p.V_max / p.R_c)
         raise InputError(
             f"the drive must hold the load of {force:.4g} N at standstill, which takes {abs(y[CURRENT]):.4g} A, got at "
             f"most {most:.4g} A (motor.i_max, motor.V_max); take a smaller load or pump"
         )
-    y[INTEGRAL] = holding_integral(y[CURRENT], m.R_c, m.K_i)
     return y
 
 
-def _at_valve(rig: Rig, y: np.ndarray, push: float) -> np.ndarray:
-    """Return the state `y` at standstill behind a servo valve, under `push` [N] beside the rig's own load."""
-    c, m, p = rig.cylinder, rig.motor, rig_numbers(rig)
-    force = _carried(c, y[POSITION]) + push
-    p_1, p_A, p_B = supply_at_standstill(force, y[POSITION], p)
+def _at_valve(rig: Rig, y: np.ndarray, x: float, force: float, p: RigNumbers) -> np.ndarray:
+    """Return the state `y` at standstill at x [m] behind a servo valve, under `force` [N] against +x."""
+    m = rig.motor
+    p_1, p_A, p_B = supply_at_standstill(force, x, p)
     if not rig.supply.p_return <= min(p_A, p_B) <= max(p_A, p_B) <= p_1:
         raise InputError(
             f"a load of {force:.4g} N must be carried at standstill by pressures between the return's "
             f"{rig.supply.p_return:.4g} Pa and the supply's {p_1:.4g} Pa, got p_A = {p_A:.4g} Pa and p_B = {p_B:.4g} "
             "Pa; raise supply.p_set, or take a smaller load"
         )
-    y[P_1], y[P_2], y[P_A], y[P_B] = p_1, rig.supply.p_return, p_A, p_B
+    y[POSITION], y[P_1], y[P_2], y[P_A], y[P_B] = x, p_1, rig.supply.p_return, p_A, p_B
     y[OMEGA] = rig.supply.omega_P
-    y[CURRENT] = holding_current(p_1 - y[P_2], rig.pump.q_b, m.C_m) + m.B_M * y[OMEGA] / m.C_m
+    y[CURRENT] = pump_torque(p_1 - y[P_2], p.q_b) / m.C_m + m.B_M * y[OMEGA] / m.C_m
     if len(p.lossy) > 0:
         y[CURRENT] += friction_torque(y[OMEGA], p_1 - y[P_2], p.q_b, p.T_f, p.C_f, p.k_h, p.omega_f) / m.C_m
     volts = m.R_c * y[CURRENT] + m.C_e * y[OMEGA]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from types import MappingProxyType
 
 import numpy as np
@@ -27,6 +27,8 @@ CHANNEL_UNITS: Mapping[str, str] = MappingProxyType(
         "T_oil": "K",
     }
 )
+#: What tells the flow to the cylinder, best first: the pump's angle, its speed, a flow meter, the command.
+FLOW_SOURCES = ("theta", "omega", "q_pump", "u")
 #: Channels that change over minutes: that such a channel is constant, or missing in most rows, is no defect.
 SLOW = frozenset({"T_oil"})
 #: What each channel, and the time, measures.
@@ -52,3 +54,8 @@ COUNTS = "count"
 
 #: Beginning of the line of a history that names the columns of a file that are no channels.
 UNUSED = "columns not used"
+
+
+def flow_source(channels: Container[str]) -> str | None:
+    """Return the channel that tells the flow to the cylinder, None where none does."""
+    return next((name for name in FLOW_SOURCES if name in channels), None)

@@ -24,7 +24,7 @@ from sealscope.recordings.formats.structured.lvm import is_lvm
 from sealscope.recordings.formats.table import RecordingFields
 from sealscope.recordings.formats.text import read_text_parts
 from sealscope.recordings.formats.text_layout import SNIFF, encoding_of
-from sealscope.recordings.recording import Recording
+from sealscope.recordings.recording import Recording, recording_of
 from sealscope.storage.atomic import atomic_write
 from sealscope.storage.opening import open_regular, whole
 from sealscope.storage.unpacking import most_unpacked
@@ -205,7 +205,7 @@ def _parts(file: Path, every: float, wanted: Wanted) -> Iterator[Recording]:
             return
         with whole("a text file", inner):
             for fields in read_text_parts(inner, wanted, every):
-                yield Recording(*fields[:-1])
+                yield recording_of(fields)
 
 
 @contextmanager
@@ -240,17 +240,15 @@ def _read(file: Path, kind: str, wanted: Wanted) -> Recording:
             fields = file_apart(_read_here, file, kind, wanted, limit=limit, memory=memory, disk=most_unpacked(file))
         if _SUFFIXES.get(file.suffix.lower(), kind) != kind:
             fields = fields.with_note(f"name ends in {file.suffix}, content is {fields.kind}")
-        return Recording(*fields[:-1])
+        return recording_of(fields)
 
 
 def check_target(path: str | os.PathLike[str]) -> str:
-    """Return the format of a file to write by its suffix; raise InputError for another, or without its folder."""
+    """Return the format of a file to write by its suffix; raise InputError for another."""
     file = Path(path)
     kind = SUFFIXES.get(file.suffix.lower())
     if kind is None:
         raise InputError(f"a recording's file must end in {', '.join(SUFFIXES)}, got {file.name}")
-    if not file.parent.is_dir():
-        raise InputError(f"the folder of a file to write must exist, got {file.parent} ({file})")
     return kind
 
 

@@ -13,6 +13,7 @@ from sealscope.errors import InputError
 from sealscope.recordings.channels import LONG_NAMES, Array
 from sealscope.recordings.formats.columns import Wanted
 from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.preamble import entries, stated_rate
 from sealscope.recordings.formats.libraries import library
 from sealscope.recordings.formats.netcdf import attributes
 from sealscope.recordings.formats.table import FORMAT_VERSION, RecordingFields, Series, parse_description, table_of
@@ -55,7 +56,8 @@ def read_pandas(frame: pandas.DataFrame, wanted: Wanted) -> RecordingFields:
         own = parse_description({"format": FORMAT_VERSION, **frame.attrs})
     except InputError:  # it is not of our making
         own = None
-    return table_of(series, wanted, "pandas", own=own)
+    about = entries((name, value) for name, value in frame.attrs.items() if isinstance(value, str | int | float))
+    return table_of(series, wanted, "pandas", about, stated_rate(about), own=own)
 
 
 def _values(types: Any, series: Any, name: str) -> NDArray[Any]:

@@ -81,12 +81,12 @@ def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
 
 
 def filled(recording: Recording, needed: Sequence[str]) -> Recording:
-    """Return the recording with short gaps filled by a line where a channel is none of the `needed`.
+    """Return the recording with short gaps filled by a line where a channel is none of the `needed`; the same for none.
 
     Those of positions, angles, speeds and flows up to `MOTION_SECONDS`, as a slower sensor leaves between its samples;
     those of pressures up to `SPLINE` samples.
     """
-    channels = dict(recording.channels)
+    channels: dict[str, Array] = {}
     for name, values in recording.channels.items():
         missing = ~np.isfinite(values)
         if name in needed or not missing.any() or missing.all():
@@ -97,7 +97,7 @@ def filled(recording: Recording, needed: Sequence[str]) -> Recording:
             short[first : first + length] = first > 0 and first + length < len(values) and length <= most
         channels[name] = values.copy()
         channels[name][short] = np.interp(np.flatnonzero(short), np.flatnonzero(~missing), values[~missing])
-    return replace(recording, channels=channels)
+    return replace(recording, channels={**recording.channels, **channels}) if channels else recording
 
 
 def touched(recording: Recording, bounds: Array | NDArray[np.integer]) -> Flags:

@@ -26,7 +26,9 @@ if TYPE_CHECKING:
     import pandas
     import xarray
 
-__all__ = ["CHANNEL_UNITS", "COUNTS", "Array", "Recording", "remembered"]
+    from sealscope.recordings.formats.table import RecordingFields
+
+__all__ = ["CHANNEL_UNITS", "COUNTS", "Array", "Recording", "recording_of", "remembered"]
 
 _T = TypeVar("_T")
 
@@ -129,6 +131,18 @@ class Recording:
         frozen |= {"provenance": MappingProxyType(dict(self.provenance)), "history": tuple(self.history)}
         for name, value in (frozen | {"bridged": bridged if bridged is not None and bridged.any() else None}).items():
             object.__setattr__(self, name, value)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        own = (
+            self.t,
+            dict(self.channels),
+            dict(self.units),
+            self.rate,
+            dict(self.provenance),
+            self.history,
+            self.bridged,
+        )
+        return type(self), own
 
     def __getitem__(self, name: str) -> Array:
         try:
@@ -257,9 +271,14 @@ class Recording:
         wanted = Wanted(map or {}, rate)
         try:
             with whole("a data frame", "data frame"):
-                return cls(*read_pandas(frame, wanted)[:-1])
+                return recording_of(read_pandas(frame, wanted))
         except UnreadableFile as error:
             raise InputError(str(error)) from None
+
+
+def recording_of(fields: RecordingFields) -> Recording:
+    """Return the recording that a reader's fields make."""
+    return Recording(*fields[:-1])
 
 
 def remembered(

@@ -12,9 +12,10 @@ from textwrap import shorten
 from typing import Any
 
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
-from sealscope.diagnosis.verdict.evidence import LEAKS
+from sealscope.diagnosis.verdict.evidence import LEAKS, LEAST_SPECIFIC
 from sealscope.diagnosis.verdict.machine import AssumedMachine
-from sealscope.paragraphs import WIDTH, paragraphs, printable
+from sealscope.errors import printable
+from sealscope.paragraphs import WIDTH, paragraphs
 from sealscope.recordings.formats.columns import counted, listed
 
 ABSENT = "–"
@@ -270,6 +271,7 @@ def false_alarms(diagnosis: Diagnosis) -> str:
 def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
     """Return what to check next, most useful first."""
     level = None if diagnosis.severity is None else diagnosis.severity.level
+    judge = diagnosis.methods[0].detector if diagnosis.methods else ""
     confirmed = say(f"once_confirmed.{level or 'plan'}", limit=diagnosis.limit)
     named = diagnosis.cause is not None and (diagnosis.verdict == "leak") == (diagnosis.cause in LEAKS)
     if named and diagnosis.verdict == "leak":
@@ -278,6 +280,8 @@ def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
         steps = [diagnosis.next_check, say("next.resolved")]
     elif diagnosis.verdict == "leak":
         steps = [*map(say, ("next.repeat", "next.bypass", "next.creep")), confirmed]
+    elif diagnosis.verdict == "no leak" and judge == LEAST_SPECIFIC:
+        steps = [say("next.ringing"), say("next.longer")]
     elif diagnosis.verdict == "no leak":
         steps = [diagnosis.next_check, say("next.longer")]
     else:

@@ -60,7 +60,7 @@ def circuit_of(rig: Rig | None, recorded: Container[str]) -> Circuit:
     return Circuit(
         *(("double-rod cylinder", "AB", _ROD) if ratio > _ALIKE else single),
         throttles=rig.line.orifices == "present" or max(rig.line.closed_A, rig.line.closed_B) > 0,
-        make_up=rig.makeup.check_valves == "present",
+        make_up=rig.makeup.check_valves != "absent",
         bypass=bypass,
         valve=rig.valve.spool == "present",
         values={

@@ -9,10 +9,10 @@ import numpy as np
 from sealscope.control.controller import Controller, Measured, law_of, raise_within
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.parameters import Rig
-from sealscope.physics.fluid import P_ATM
 from sealscope.physics.solvers.loop import ASKED, REPORTED, TAKEN, Loop
 from sealscope.recordings.recording import Array
 from sealscope.simulation.courses import Position
+from sealscope.units import P_ATM
 
 #: Most outputs of the solver to a sample of the recording that a controller's rate may ask for.
 _MOST_OUTPUTS = 64

@@ -307,9 +307,14 @@ _LONGEST_TEXT = 1000
 
 
 def plain_text(text: str, what: str) -> str:
-    """Return the text of an option with single blanks; raise InputError for one of more than 1000 characters."""
+    """Return the text of an option with single blanks, but for a path after ``file``.
+
+    Raises InputError for one of more than 1000 characters.
+    """
     if len(text) > _LONGEST_TEXT:
         raise InputError(f"{what} must be of at most {_LONGEST_TEXT} characters, got {len(text)}")
+    if file := re.fullmatch(r"(?:(position)\s+)?(file)\s+(.*)", text.strip(), re.IGNORECASE):
+        return " ".join(filter(None, file.groups()))
     return " ".join(text.split())
 
 

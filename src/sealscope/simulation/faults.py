@@ -85,7 +85,7 @@ class FaultRow:
     def read(self, text: str) -> Fault | None:
         """Return the fault that a text states; None where it is another."""
         pattern = self.pattern.format(**_PATTERNS).replace(" ", r"\s+") + _WHEN[self.when]
-        match = re.fullmatch(pattern, text)
+        match = re.fullmatch(pattern, text, re.IGNORECASE)
         if match is None:
             return None
         part = match.groupdict()

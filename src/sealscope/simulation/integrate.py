@@ -26,7 +26,7 @@ from sealscope.simulation.experiment import LONGEST_STEP, PRESSURE_TOLERANCE, Ex
 from sealscope.simulation.instruments import FILTER_REACH
 from sealscope.simulation.leaks import Leak
 from sealscope.simulation.sizing import leak_flow, mean_while_open, settled
-from sealscope.units import LITRE_PER_MINUTE
+from sealscope.units import LITRE_PER_MINUTE, P_ATM
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -38,7 +38,7 @@ DEFAULT_STEP = {"rk4": 5e-4, "imex": 1e-3}
 #: How many times finer than `LONGEST_STEP` a step that is chosen by error may become.
 FINEST = 20
 #: Lowest gauge pressure [Pa] the model is valid for where the oil does not boil (`fluid.p_vap`): it holds no tension.
-VACUUM = -101325.0
+VACUUM = -P_ATM
 #: The share by which a detail's RMS in a recording (truth and noise together) may be off.
 DETAIL_TOLERANCE = 1e-3
 #: What moves in windows, times this, stands for the whole run; a difference to half the step is at least 14/15 of the

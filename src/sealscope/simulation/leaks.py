@@ -230,17 +230,17 @@ def parse_leak(text: str) -> Leak | None:
         if not (np.all(np.isfinite(flow)) and peak > 0 and flow.min() >= 0):
             raise InputError(f"q_leak of a leak table must be finite, >= 0 and somewhere > 0 ({stripped[6:].strip()})")
         return Leak("laminar", mean=peak, opening=Tabulated(table.t, flow / peak))
-    match = re.fullmatch(_LEAK, plain_text(text, "leak"))
+    match = re.fullmatch(_LEAK, plain_text(text, "leak"), re.IGNORECASE)
     if not match:
         raise InputError(
             "leak must be like '0.0042 L/min from 90 s', '0.01 L/min orifice growing from 60 s to 120 s', "
             f"'G = 6.1e-13 from 90 s', 'C = 2e-10', 'table LEAK.csv' or 'none', got {text!r}"
         )
-    part = match.groupdict()
-    if part["letter"]:
-        law: Literal["laminar", "orifice"] = "laminar" if part["letter"] == "G" else "orifice"
-        if part["law"] not in (None, law):
-            raise InputError(f"{part['letter']} is the coefficient of the {law} law, got law {part['law']} ({text!r})")
+    part, asked = match.groupdict(), (match["law"] or "").lower()
+    if letter := (part["letter"] or "").upper():
+        law: Literal["laminar", "orifice"] = "laminar" if letter == "G" else "orifice"
+        if asked not in ("", law):
+            raise InputError(f"{letter} is the coefficient of the {law} law, got law {asked} ({text!r})")
         return Leak(law, coefficient=float(part["coefficient"]), opening=opening_of(part))
     mean = parse_quantity(part["mean"], "m^3/s", name="a leak")
-    return Leak(part["law"] or "laminar", mean=mean, opening=opening_of(part))  # type: ignore[arg-type]
+    return Leak(asked or "laminar", mean=mean, opening=opening_of(part))  # type: ignore[arg-type]

@@ -24,6 +24,12 @@ def _machine() -> str:
     return sha256(platform.node().encode()).hexdigest()[:6]
 
 
+def check_folder(file: Path) -> None:
+    """Raise InputError where the folder of a file to write is not there."""
+    if not file.parent.is_dir():
+        raise InputError(f"the folder of a file to write must exist, got {file.parent} ({file})")
+
+
 @contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary file in the folder of `path`: renamed to `path` when the block ends well, else removed.
@@ -34,6 +40,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     target = Path(path)
     try:
+        check_folder(target)
         if target.is_dir():
             raise InputError(f"a file to write must not be a folder, got {target}")
         handle, name = tempfile.mkstemp(

@@ -1,7 +1,8 @@
-"""Folders of results: made, entered and held by one process; a link in them leads nowhere."""
+"""Folders of results: made, entered and held by one process, a link in them leads nowhere; the order of their files."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -30,6 +31,11 @@ def inner_folder(folder: Path, *names: str) -> Path:
             raise InputError(f"a folder of results must not be a link, got one ({folder})")
         make_folder(folder)
     return folder
+
+
+def by_numbers(name: str) -> list[str | int]:
+    """Return a key that orders names as people count: day_2 before day_10."""
+    return [int(word) if word.isdecimal() else word for word in re.split(r"(\d+)", name)]
 
 
 @contextmanager

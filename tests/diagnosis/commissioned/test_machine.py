@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import random
 import signal
 from dataclasses import replace
+from datetime import UTC, datetime
 from itertools import cycle
 from multiprocessing import get_context
 from pathlib import Path
@@ -15,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import sealscope as ss
+from sealscope.diagnosis.commissioned.machine import JudgedAlarm
 from sealscope.errors import InputError
 from sealscope.storage.atomic import remove_temporaries
 
@@ -102,6 +105,52 @@ def test_a_recording_is_added_once_and_never_a_leaking_one(machine, folder):
         machine.with_healthy(ss.read(folder / "run1.nc"))
     with pytest.raises(InputError, match="must not leak"):
         machine.with_healthy(ss.simulate(command="3 sin(4t)", duration="20 s", leak="0.1 L/min", seed=31))
+
+
+def test_the_date_in_a_file_s_name_is_that_of_what_it_teaches(machine):
+    new = replace(ss.simulate(command="3 sin(4t)", duration="20 s", seed=32), provenance={})
+    taught = machine.with_healthy(new, file="press_20240531.csv")
+    assert [own.file for own in taught.since(1.7171e9).healthy] == ["press_20240531.csv"]
+
+
+def test_what_was_left_out_is_known_whenever_the_file_is_written(folder, tmp_path):
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "good.nc").write_bytes((folder / "run1.nc").read_bytes())
+    (tmp_path / "runs" / "torn.csv").write_text("no recording")
+    machine = ss.commission(tmp_path / "runs", rig="thesis")
+    assert "torn.csv" in machine.left_out[0]
+    path = ss.write_machine(machine, tmp_path / "machine.toml")
+    again = ss.load_machine(path)
+    assert (again.left_out, again.summary.problems) == (machine.left_out, machine.summary.problems)
+    ss.write_machine(again, path)
+    assert ss.load_machine(path).summary.problems == machine.summary.problems
+
+
+def test_a_recording_in_which_a_found_leak_begins_or_is_repaired_is_not_taught(machine):
+    new = replace(ss.simulate(command="3 sin(4t)", duration="20 s", seed=33), provenance={})
+    onset = 1.7171e9
+    repaired = JudgedAlarm("a-1", "repaired", onset + 3600.0, onset)
+    known = replace(machine, alarms=(JudgedAlarm("a-1", "valid", onset + 60.0, onset), repaired))
+    for start, taught in ((-60.0, True), (-10.0, False), (60.0, False), (3590.0, False), (3601.0, True)):
+        moment = datetime.fromtimestamp(onset + start, UTC).replace(tzinfo=None)
+        recording = replace(new, provenance={"start": moment.isoformat()})
+        if taught:
+            assert len(known.with_healthy(recording).healthy) == 5
+        else:
+            with pytest.raises(InputError, match="a time without a leak"):
+                known.with_healthy(recording)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="names of files are bytes as POSIX has them")
+def test_a_file_whose_name_is_no_text_is_kept_by_its_escaped_name(folder, tmp_path):
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "a\udcff.nc").write_bytes((folder / "run1.nc").read_bytes())
+    path = ss.write_machine(ss.commission(tmp_path / "runs", rig="thesis"), tmp_path / "machine.toml")
+    assert [own.file for own in ss.load_machine(path).healthy] == ["a\\udcff.nc"]
+
+
+def test_a_machine_without_recordings_says_so():
+    assert "0 healthy" in str(ss.CommissionedMachine("a", ()))
 
 
 def test_the_map_of_raw_counts_goes_with_the_machine(folder, tmp_path):

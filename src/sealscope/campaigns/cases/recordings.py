@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
-import re
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -21,6 +20,7 @@ from sealscope.errors import InputError, SealscopeError
 from sealscope.recordings import read
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Recording
+from sealscope.storage.folders import by_numbers
 
 #: Share of the rms of p_A - p_B that its mean exceeds in a stroke of one direction.
 _ONE_WAY = 0.5
@@ -29,14 +29,10 @@ _log = logging.getLogger(__name__)
 ProgressCallback = Callable[[int, int, int], None]
 
 
-def _natural(path: Path) -> list[str | int]:
-    """Return a key that orders names as people count: stroke 2 before stroke 10."""
-    return [int(word) if word.isdigit() else word for word in re.split(r"(\d+)", path.name)]
-
-
 def _files(plan: RecordedPlan, folder: Path) -> Iterator[tuple[RecordingSet, Path]]:
     for recordings in plan.sets:
-        paths = sorted((path for path in folder.glob(recordings.files) if path.is_file()), key=_natural)
+        files = (path for path in folder.glob(recordings.files) if path.is_file())
+        paths = sorted(files, key=lambda path: by_numbers(path.name))
         chosen = paths[recordings.first - 1 : recordings.end - 1]
         if not chosen:
             raise InputError(f"a set's files must be there, got none for {recordings.files!r} ({folder})")

@@ -36,8 +36,8 @@ def carried_out(
 
     `cluster`: address of a Dask scheduler, whose workers are taken instead. An item is taken from `items` when a
     process is free for it. `task` and items are pickled; `task` goes to each process once. An item whose process dies,
-    by a hand or the memory's end, is tried once more after all others, and has then the result None. Processes ignore
-    the interrupt, and end when the generator is closed or the parent ends, however that ends. Raises what `task`
+    by a hand or the memory's end, is tried once more after all others, alone, and has then the result None. Processes
+    ignore the interrupt, and end when the generator is closed or the parent ends, however that ends. Raises what `task`
     raised; MissingExtra without Dask, InputError where no scheduler answers or a worker has another Sealscope.
     """
     if jobs == 1 and cluster is None:
@@ -48,7 +48,7 @@ def carried_out(
     busy: dict[Future[Result], tuple[Executor, Item]] = {}
     with _processes(task, jobs) if cluster is None else _on_cluster(task, cluster) as pools:
         while True:
-            for item in islice(waiting, pools.most - len(busy)):
+            for item in islice(waiting, (1 if tried_again else pools.most) - len(busy)):
                 pool = idle.pop() if idle else pools.new()
                 busy[pools.submit(pool, item)] = pool, item
             if not busy:
@@ -133,13 +133,8 @@ def _on_cluster(task: Callable[[Any], Any], address: str) -> Iterator[_Pools]:
             raise InputError(f"the cluster's workers must have Sealscope, got: {error} ({address})") from None
         if keys != {code_key()}:
             raise InputError(f"the cluster's workers must have this machine's Sealscope, got another ({address})")
-        pool, shared = client.get_executor(pure=False), client.scatter(task, broadcast=True)
-        most = _AHEAD * sum(client.nthreads().values())
-        yield _Pools(lambda: pool, most, lambda pool, item: pool.submit(_call, shared, item), Exception)
-
-
-def _call(task: Callable[[Item], Result], item: Item) -> Result:
-    return task(item)
+        pool, most = client.get_executor(pure=False), _AHEAD * sum(client.nthreads().values())
+        yield _Pools(lambda: pool, most, lambda pool, item: pool.submit(task, item), dask.KilledWorker)
 
 
 def _numbered(task: Callable[[Item], Result], numbered: tuple[int, Item]) -> Result:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,7 +12,7 @@ from typing import Any
 
 from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.judging.judge import ALLOWED_DETECTION, Judgement
-from sealscope.storage.atomic import atomic_write
+from sealscope.storage.csv_file import write_csv
 
 Value = str | float | int | None
 #: Name of a column -> value; every row of a table has the same columns.
@@ -138,12 +137,6 @@ def write_tables(folder: Path, tables: Mapping[str, Sequence[TableRow]]) -> list
         if not rows:
             path.unlink(missing_ok=True)
             continue
-        with (
-            atomic_write(path) as temporary,
-            temporary.open("w", encoding="utf-8", errors="backslashreplace", newline="") as file,
-        ):
-            writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
+        write_csv(path, list(rows[0]), rows)
         paths.append(path)
     return paths

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -38,11 +38,16 @@ NO_RECORDINGS = frozenset({".toml", ".html", ".htm", ".pdf", ".png", ".svg", ".m
 _WRITTEN = re.compile(rb'\s*\{\s*"(verdict|file)":|file,time[, ]')
 
 
+#: What a person may say of an alarm's leak.
+Judgement = Literal["valid", "invalid", "repaired"]
+JUDGEMENTS: tuple[Judgement, ...] = get_args(Judgement)
+
+
 class JudgedAlarm(NamedTuple):
     """What a person said of an alarm of the monitor.
 
-    `alarm`: its name, "" for a repair without one; `mark`: "valid", "invalid" or "repaired", said at `date_s`; of a
-    leak since `onset_s` [s since 1970]; `leak_lpm` [L/min] and `reason`, where they are known.
+    `alarm`: its name, "" for a repair without one; `mark`, said at `date_s`; of a leak since `onset_s` [s since 1970];
+    `leak_lpm` [L/min] and `reason`, where they are known.
     """
 
     alarm: str
@@ -56,6 +61,12 @@ class JudgedAlarm(NamedTuple):
         leak = "" if self.leak_lpm is None else f", {self.leak_lpm:.2g} L/min"
         since = "" if self.mark == "invalid" else f", since {_date(self.onset_s)}{leak}"
         return f"{self.alarm} {self.mark} {_date(self.date_s)}{since}{self.reason and f' ({self.reason})'}".strip()
+
+
+def _is_taken_back(word: JudgedAlarm, later: Iterable[JudgedAlarm]) -> bool:
+    """Whether a later word calls the alarm invalid; a new alarm of the same name begins after this word."""
+    own = (each for each in later if each.alarm == word.alarm and each.onset_s <= word.date_s)
+    return any(each.mark == "invalid" for each in own)
 
 
 def _date(moment: float) -> str:
@@ -151,7 +162,7 @@ class CommissionedMachine:
         if self.healthy and (result := self.diagnose(recording)).verdict == "leak":
             raise InputError(f"a healthy recording must not leak, got one that does: {result.reason} ({file})")
         start_s = start_seconds(recording, file)
-        if start_s is not None and (leak := self._leak_at(start_s)) is not None:
+        if start_s is not None and (leak := self._leak_in(start_s, start_s + recording.duration)) is not None:
             raise InputError(f"a healthy recording must be of a time without a leak, got {leak} ({file})")
         return added
 
@@ -163,11 +174,13 @@ class CommissionedMachine:
         healthy = sorted((*self.healthy, learnt), key=lambda own: (own.start_s or 0.0, own.file))
         return replace(self, healthy=tuple(healthy))
 
-    def _leak_at(self, moment: float) -> JudgedAlarm | None:
-        """Return the alarm of a leak that a person found, and that was not repaired at a moment [s since 1970]."""
+    def _leak_in(self, start_s: float, end_s: float) -> JudgedAlarm | None:
+        """Return the alarm of a leak that a person found, and that was not repaired, in a time [s since 1970]."""
         repairs = [own.date_s for own in self.alarms if own.mark == "repaired"]
-        leaks = (own for own in self.alarms if own.mark != "invalid" and own.onset_s <= moment)
-        return next((own for own in leaks if not any(own.onset_s <= at <= moment for at in repairs)), None)
+        words = enumerate(self.alarms, 1)
+        found = (own for k, own in words if own.mark != "invalid" and not _is_taken_back(own, self.alarms[k:]))
+        leaks = (own for own in found if own.onset_s <= end_s)
+        return next((own for own in leaks if not any(own.onset_s <= at <= start_s for at in repairs)), None)
 
     def since(self, start_s: float) -> CommissionedMachine:
         """Return the machine without the recordings of before a repair, `start_s` [s since 1970].
@@ -258,7 +271,7 @@ def learn(recording: Recording, rig: Rig, file: str, checksum: str = "") -> Lear
         raise InputError(f"a healthy recording must hold channels that a method reads, got none such ({file})")
     units = {name: part.units[name] for name in part.channels}
     about = {"sha256": checksum, **about_recording(recording, inspection)}
-    start = start_seconds(recording)
+    start = start_seconds(recording, file)
     return Learnt(file, inspection.digest, units, part.rate, recording.duration, start, lessons, about)
 
 

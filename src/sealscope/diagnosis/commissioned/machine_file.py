@@ -12,13 +12,13 @@ import os
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PositiveFloat, create_model
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.commissioned.machine import CommissionedMachine, JudgedAlarm
+from sealscope.diagnosis.commissioned.machine import CommissionedMachine, JudgedAlarm, Judgement
 from sealscope.diagnosis.learnt import Learnt
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
@@ -31,9 +31,6 @@ from sealscope.storage.toml_file import read_toml
 
 #: Largest file read [bytes]: some 10 kB a recording.
 LARGEST = 50_000_000
-#: What persons say of alarms.
-Mark = Literal["valid", "invalid", "repaired"]
-MARKS: tuple[Mark, ...] = get_args(Mark)
 _HEAD = """\
 # A machine commissioned by Sealscope: what its healthy recordings have taught. [machine], [map] and [rig] may be
 # edited; [learnt] is written anew with each change; [[healthy]] is what diagnoses compare with.
@@ -115,14 +112,14 @@ _HEALTHY = _table(
 )
 _ALARM = _table(
     alarm=str,
-    mark=Mark,
+    mark=Judgement,
     date_s=Annotated[_Moment, Field(alias="date")],
     onset_s=Annotated[_Moment, Field(alias="onset")],
     leak_lpm=(float, None),
     reason=(str, None),
 )
 _FILE = _table(
-    machine=_table(format=Literal[1], name=str, rate=(float, None), limit=(str, None)),
+    machine=_table(format=Literal[1], name=str, rate=(float, None), limit=(str, None), left_out=(list[str], None)),
     map=(dict[str, str], None),
     healthy=Annotated[list[_HEALTHY], Field(min_length=1)],  # type: ignore[valid-type]
     alarms=(list[_ALARM], None),  # type: ignore[valid-type]
@@ -179,7 +176,8 @@ def _tree(machine: CommissionedMachine) -> dict[str, Any]:
 
     summary, columns, now = machine.summary, machine.channel_map, datetime.now(UTC).isoformat(timespec="seconds")
     head = {"format": 1, "name": machine.name, "sealscope": version("sealscope"), "written": now}
-    tree: dict[str, Any] = {"machine": head | {"rate": machine.rate, "limit": machine.limit}}
+    head |= {"rate": machine.rate, "limit": machine.limit, "left_out": machine.left_out or None}
+    tree: dict[str, Any] = {"machine": head}
     if columns:
         tree["map"] = {REST: columns} if isinstance(columns, str) else columns
     if machine.rig is not None:
@@ -236,6 +234,8 @@ def _value(value: Any) -> str:
         return "[" + ", ".join(map(_value, value)) + "]"
     if isinstance(value, float):
         return repr(value)
+    if isinstance(value, str):  # names of files may be no text
+        value = value.encode("utf-8", "backslashreplace").decode()
     return json.dumps(value, ensure_ascii=False, default=str).replace("\x7f", "\\u007f")
 
 
@@ -282,5 +282,6 @@ def load_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
         channel_map=columns,
         rate=head.get("rate"),
         limit=head.get("limit"),
+        left_out=tuple(head.get("left_out", ())),
         alarms=tuple(JudgedAlarm(**row) for row in stated.get("alarms", ())),
     )

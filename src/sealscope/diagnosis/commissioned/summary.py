@@ -13,13 +13,13 @@ from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY
 from sealscope.diagnosis.inference.blocks import Columns, solve
 from sealscope.diagnosis.inference.detector import VolumeBalance
-from sealscope.diagnosis.inference.terms import ATMOSPHERE, equations
+from sealscope.diagnosis.inference.terms import equations
 from sealscope.diagnosis.inspection import Inspection
 from sealscope.diagnosis.verdict.machine import unstated
 from sealscope.paragraphs import paragraphs
 from sealscope.recordings.oil import oil_temperature
 from sealscope.recordings.recording import Array, Recording
-from sealscope.units import BAR, LITRE_PER_MINUTE, from_si
+from sealscope.units import BAR, LITRE_PER_MINUTE, P_ATM, from_si
 
 if TYPE_CHECKING:
     from sealscope.diagnosis.learnt import Learnt
@@ -68,17 +68,18 @@ class Summary:
 
     def text(self, healthy: Sequence[Learnt], rig: Rig | None) -> str:
         """Return it in some ten lines."""
+        units = healthy[0].units if healthy else {}
         starts = [own.start_s for own in healthy if own.start_s is not None]
         dates = sorted(datetime.fromtimestamp(at, UTC).date().isoformat() for at in starts)
         span = f", {' to '.join(dict.fromkeys((dates[0], dates[-1])))}" if dates else ""
         noise = []
         for name, value in self.noise.items():
-            unit = healthy[0].units.get(name, "")
+            unit = units.get(name, "")
             shown = {"Pa": "bar", "m": "mm"}.get(unit, unit)
             noise.append(f"{name} {from_si(value, shown, unit):.2g} {shown}")
         rows = [
             ("recordings", f"{len(healthy)} healthy, {sum(own.seconds for own in healthy):.4g} s in all{span}"),
-            ("channels", ", ".join(f"{name} [{unit}]" for name, unit in healthy[0].units.items())),
+            ("channels", ", ".join(f"{name} [{unit}]" for name, unit in units.items())),
             ("machine", _stated(rig)),
             ("duty", _duty(healthy)),
             ("noise", ", ".join(noise)),
@@ -91,6 +92,9 @@ class Summary:
                 half = f"{times * len(healthy)} healthy recordings instead of {len(healthy)}"
                 half += ", of as many more days" if dates else ""
             rows.append(("half of that", half))
+        else:
+            needs = "speed or angle of the pump, flow or command, and two recordings"
+            rows.append(("smallest leak", f"not known, that needs {needs}; the ringing alone judges"))
         rows += [("check", problem) for problem in self.problems]
         return "\n".join(paragraphs(rows, 16))
 
@@ -224,9 +228,9 @@ def _noise(values: Array) -> float:
 
 
 def _below_vacuum(part: Recording, name: str) -> str:
-    if part.units[name] != "Pa" or not (least := float(np.quantile(part[name], 0.01))) < -ATMOSPHERE:
+    if part.units[name] != "Pa" or not (least := float(np.quantile(part[name], 0.01))) < -P_ATM:
         return ""
-    off = (-ATMOSPHERE - least) / BAR
+    off = (-P_ATM - least) / BAR
     return f"{name} reads below vacuum: its zero is at least {off:.1g} bar too low"
 
 

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.beliefs import beliefs
-from sealscope.diagnosis.inference.blocks import Blocks, Columns, Weighting
+from sealscope.diagnosis.inference.blocks import Blocks, Columns, Weighting, solve
 from sealscope.diagnosis.inference.distribution import distribution
 from sealscope.diagnosis.inference.onset import FEWEST
-from sealscope.diagnosis.inference.row_weights import SUPPORT
+from sealscope.diagnosis.inference.row_weights import RIDGE, SUPPORT
 from sealscope.diagnosis.inference.terms import (
-    ATMOSPHERE,
     HALF_DIFFERENCE,
     LEAST_ABSOLUTE,
     START,
@@ -22,12 +21,14 @@ from sealscope.diagnosis.inference.terms import (
     Signals,
     equations,
 )
-from sealscope.diagnosis.inference.weak_form import SPAN, STRIDE, rows, stride_samples
+from sealscope.diagnosis.inference.weak_form import OVERLAP, SPAN, STRIDE, rows, stride_samples
 from sealscope.diagnosis.inference.zero import about_zero
+from sealscope.recordings.channels import flow_source
 from sealscope.recordings.gaps import long_gaps
 from sealscope.recordings.quality import clipped
 from sealscope.recordings.recording import Array, Recording
 from sealscope.storage.plain_state import array_of, part_of, plain_array
+from sealscope.units import P_ATM
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -162,15 +163,20 @@ class BlockStream:
         return {**samples, "omega": speed, START: np.exp(-drive.pace * index / self._rate)}
 
     def _oriented(self, rows: Sequence[Array]) -> tuple[float, ...]:
-        """Return the sign of each left side: friction takes work, so that p_A - p_B goes with the flow into A.
+        """Return the sign of each left side: an encoder, or the sides, may be connected the other way round.
 
-        An encoder, or the sides, may be connected the other way round.
+        Friction takes work, so that p_A - p_B goes with the flow into A; and oil leaks from the higher pressure to the
+        lower. Either is a number in its deviations, and the signs' likelihoods are those of both.
         """
         signs = []
         for balance, columns, own in zip(self._balances, self.columns, rows, strict=True):
+            gram = own.T @ own
             pressure, left = own[:, columns.leak], own[:, columns.left]
-            work = float((pressure - pressure.mean()) @ left) if len(own) else 0.0
-            signs.append(-1.0 if work * balance.takes < 0.0 else 1.0)
+            parts = (pressure - pressure.mean()) * left if len(own) else np.zeros(1)
+            size = max(float(np.linalg.norm(parts)) * np.sqrt(OVERLAP), np.finfo(float).tiny)
+            work = balance.takes * float(parts.sum()) / size
+            odds = sum(np.square(z) * np.sign(z) for z in (work, _leaks(gram, columns, len(own))))
+            signs.append(-1.0 if odds < 0.0 else 1.0)
         return tuple(signs)
 
     def _close(self, samples: Mapping[str, Array], first: int, end: int) -> Blocks:
@@ -230,11 +236,24 @@ class _Cut(NamedTuple):
     pressures: Array
 
 
+def _leaks(gram: Array, columns: Columns, count: int) -> float:
+    """Return the leak's coefficient over its deviation, by least squares over all rows; 0 where nothing tells it."""
+    others = [k for k in columns.nuisance if k != columns.leak]
+    right = gram[np.ix_(others, [columns.leak, columns.left])]
+    solved = solve(gram[np.ix_(others, others)], right)
+    rest = gram[np.ix_([columns.leak, columns.left], [columns.leak, columns.left])] - right.T @ solved
+    along, lead, square = float(rest[0, 0]), float(rest[0, 1]), float(rest[1, 1])
+    if not along > RIDGE * float(gram[columns.leak, columns.leak]) or count <= len(others) + 1:
+        return 0.0
+    variance = OVERLAP * max(square - lead**2 / along, 0.0) / (count - len(others) - 1)
+    return lead / max(float(np.sqrt(variance * along)), np.finfo(float).tiny)
+
+
 def _gauge_to_absolute(pressure: Array) -> float:
     """Return what makes a gauge pressure absolute: the atmosphere, or more where its zero is surely too low."""
     finite = pressure[np.isfinite(pressure)]
     lowest = float(np.min(finite)) if finite.size else 0.0
-    return max(ATMOSPHERE, LEAST_ABSOLUTE - lowest)
+    return max(P_ATM, LEAST_ABSOLUTE - lowest)
 
 
 def whole_samples(recording: Recording, names: Collection[str]) -> dict[str, Array]:
@@ -264,8 +283,8 @@ def blocks_of(recording: Recording, rig: Rig) -> tuple[Blocks, Blocks, tuple[Col
     balances = equations(rig, frozenset(names))
     if not balances:
         return None
-    needed = {"x", "p_A", "p_B", *(name for balance in balances for term in balance.terms for name in term.needs)}
-    needed |= {next(name for name in ("theta", "omega", "q_pump", "u") if name in names)}
+    needed = {"x", "p_A", "p_B", str(flow_source(names))}
+    needed |= {name for balance in balances for term in balance.terms for name in term.needs}
     samples = whole_samples(recording, needed)
     seconds = min(LONGEST, max(SHORTEST, recording.duration / _BLOCKS["wanted"]))
     zero = 0.0

@@ -24,13 +24,13 @@ import numpy as np
 
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.verdict.evidence import Cause
+from sealscope.recordings.channels import flow_source
 from sealscope.recordings.recording import Array
+from sealscope.units import P_ATM
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Pressure of the surroundings [Pa], by which a gauge pressure is less than the absolute one.
-ATMOSPHERE = 101325.0
 #: The least absolute pressure that the terms of air are computed for [Pa].
 LEAST_ABSOLUTE: float = beliefs("inference")["pressure"]["least"]
 #: Half the time over which speed and direction of motion are taken [s]: a few counts of an encoder at slow motion.
@@ -101,7 +101,7 @@ class Signals:
     def absolute(self) -> Mapping[str, Array]:
         """Absolute pressure [Pa] of each chamber, at least `LEAST_ABSOLUTE`."""
         return {
-            name: np.maximum(self._channels[name] + self._zeros.get(name, ATMOSPHERE), LEAST_ABSOLUTE)
+            name: np.maximum(self._channels[name] + self._zeros.get(name, P_ATM), LEAST_ABSOLUTE)
             for name in ("p_A", "p_B")
         }
 
@@ -332,8 +332,10 @@ def _of_side(side: str) -> tuple[Term, ...]:
 
 def _released(rig: Rig, share: Callable[[Signals], Array | float]) -> Term:
     """Return free air in both chambers at once, each by its volume; `share`: how far side A's balance counts."""
+    from sealscope.physics.cylinder import volumes_at_middle
+
     own = rig.cylinder
-    middle = {"A": own.V + own.V_hose_A, "B": own.V - own.V_rod + own.V_hose_B}
+    middle = dict(zip("AB", volumes_at_middle(own), strict=True))
     areas = {"A": own.A_A, "B": -own.A_B} if own.volumes == "position" else {"A": 0.0, "B": 0.0}
 
     def released(s: Signals) -> Array:
@@ -523,12 +525,14 @@ def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
     left = pump_volume(rig, channels)
     if left is None or not {"x", "p_A", "p_B"} <= channels:
         return ()
-    by_command = channels.isdisjoint(_SOURCES)
+    by_command = flow_source(channels) == "u"
     # an angle has no zero of a speed: what is lost whatever the pressures are is lost to the outside
     terms = [
         term._replace(cause="external leak", drift="outside") if term.name == BIAS and "theta" in channels else term
         for term in ((_START, *_CYLINDER) if by_command else _CYLINDER)
     ]
+    if flow_source(channels) == "q_pump":  # a meter reads what the pump's filling leaves
+        terms.remove(_SPEED_LOSS)
     one_side = rig.cylinder.single_rod
     terms.insert(-len(_LEAKS), _released(rig, lambda s: _middle(s.carried_by_A) if one_side else 0.5))
     balance = Equation(CYLINDER, left, tuple(terms), drive=SpeedLoop.of(rig) if by_command else None)
@@ -546,7 +550,7 @@ def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
     Over whole cycles or at standstill: neither motion nor position is in it. A zero of the flow is not told from
     leakage under a steady load, and is taken for none.
     """
-    left = pump_volume(rig, channels - {"u"} | ({"omega"} if "u" in channels else set()))
+    left = pump_volume(rig, channels)
     if rig.valve.spool == "present" or left is None or not {"p_A", "p_B"} <= channels:
         return None
     return Equation("circulation", left, (_START, *_STORED, _lost_outside("A"), _lost_outside("B", -1.0), *_LEAKS))
@@ -568,22 +572,18 @@ def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
     return Equation(LOCKED, gives_way, (*_STORED, _lost_outside("A"), _lost_outside("B", -1.0), *_LEAKS))
 
 
-#: Channels that give what the pump delivers, the first recorded one is taken.
-_SOURCES = ("theta", "omega", "q_pump")
-
-
 def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array] | None:
     """Return what gives the increments of the volume that the pump delivers [m^3]; None where nothing recorded does.
 
     By its angle, its speed, a flow meter, or the speed that the drive makes of the command. A meter's scale for each
     direction is in the areas of that direction.
     """
-    displacement = rig.pump.q_b / (2.0 * np.pi)
-    if "theta" in channels:
+    displacement, source = rig.pump.q_b / (2.0 * np.pi), flow_source(channels)
+    if source == "theta":
         return lambda s: displacement * s.step("theta")
-    if "q_pump" in channels and "omega" not in channels:
+    if source == "q_pump":
         return lambda s: s.mean("q_pump") * s.dt
-    if {"omega", "u"} & channels and (rig.valve.spool != "present" or "omega" in channels):
+    if source == "omega" or (source == "u" and rig.valve.spool != "present"):
         return lambda s: displacement * s.mean("omega") * s.dt
     return None
 

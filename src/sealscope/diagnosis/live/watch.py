@@ -111,6 +111,11 @@ class Watch:
         return json.dumps(self._rig.model_dump())
 
     @property
+    def learned_with(self) -> tuple[Rig, Mapping[str, bool], float]:
+        """What the baseline depends on: the rig's values, whether they state L/min, and the hours."""
+        return self._rig, self._litres, self.learn_hours
+
+    @property
     def method(self) -> str:
         """Way of watching, "volumes" where the position is recorded, else "pressures"."""
         return "volumes" if "x" in self._samples.names or not self._samples.names else "pressures"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Literal
@@ -23,11 +23,13 @@ from sealscope.diagnosis.verdict.machine import AssumedMachine, assumed_rig
 from sealscope.errors import InputError
 from sealscope.parameters import Rig
 from sealscope.recordings.chambers import CHAMBERS, chambers_of
+from sealscope.recordings.formats.columns import listed
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.oil import oil_temperature
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
 from sealscope.signals.details import QUANTITIES
+from sealscope.storage.folders import by_numbers
 from sealscope.units import DAY
 
 #: What a level rests on, the most specific first: a conductance, but for `ringing`, the damping of the pressures'
@@ -148,7 +150,7 @@ def timeline(readings: Sequence[LeakReading], every: float | None = None) -> tup
 
     `every`: time between them [s], in the order of their names. Raises InputError where the time of one is not known.
     """
-    ordered = sorted(readings, key=lambda reading: _natural(reading.file))
+    ordered = sorted(readings, key=lambda reading: by_numbers(reading.file))
     if every is not None:
         ordered = [replace(reading, start=k * every) for k, reading in enumerate(ordered)]
     if unknown := [reading for reading in ordered if reading.start is None]:
@@ -201,14 +203,8 @@ def findings_of(points: Sequence[TrendPoint], apart: Sequence[str]) -> list[Find
     return findings
 
 
-def _names(readings: Sequence[LeakReading]) -> str:
-    return ", ".join(reading.file for reading in readings[:3]) + (", ..." if len(readings) > 3 else "")
-
-
-def _natural(name: str) -> list[tuple[int, int, str]]:
-    """Return what orders names with numbers as people do: day_2 before day_10."""
-    parts = re.findall(r"\d+|\D+", name)
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts]
+def _names(readings: Iterable[LeakReading]) -> str:
+    return listed((reading.file for reading in readings), 3)
 
 
 def _change(scale: float | None, other: float | None) -> float:
@@ -227,7 +223,7 @@ def _clock(ordered: Sequence[TrendPoint]) -> list[Finding]:
     ]
     back = [
         f"{late.file} is numbered after {early.file} and has an earlier time: a clock was set back"
-        for early, late in pairwise(sorted(ordered, key=lambda reading: _natural(reading.file)))
+        for early, late in pairwise(sorted(ordered, key=lambda reading: by_numbers(reading.file)))
         if late.start < early.start
     ]
     alike = len({re.split(r"[\d\W_]", reading.file, maxsplit=1)[0].lower() for reading in ordered}) == 1

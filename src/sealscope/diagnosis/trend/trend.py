@@ -6,6 +6,7 @@ import math
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.diagnosis.verdict.states import state_of
 from sealscope.errors import InputError
+from sealscope.recordings.formats.columns import listed
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
 from sealscope.storage.plain_values import plain
@@ -285,14 +287,14 @@ def _with_levels(trend: Trend) -> Trend:
     apart = "apart from the recordings before and after: it counts as if it were near"
     findings = [*trend.findings]
     if alone.size:
-        files = ", ".join(points[rows[k]].file for k in alone[:3])
+        files = listed((points[rows[k]].file for k in alone), 3)
         text = f"{alone.size} of {len(points)} {apart} ({files})"
         findings.append(Finding("outlier", "warning", None, alone.size, None, text))
     for k, row in enumerate(rows):
         value, half = float(levels.value[k]), WITHIN_95 * float(levels.error[k])
         note = apart if k in alone else ""
         points[row] = replace(points[row], value=value, low=value - half, high=value + half, note=note)
-    known = max(1, round(trend.healthy * len(few) / len(levels)))
+    known = max(1, _known(trend) * len(few) // len(levels))
     return replace(
         trend,
         points=tuple(points),
@@ -302,13 +304,20 @@ def _with_levels(trend: Trend) -> Trend:
     )
 
 
+def _known(trend: Trend) -> int:
+    """Return how many of the compared recordings are among the first ones, known to be healthy; at least the first."""
+    first = dict.fromkeys(point.digest for point in trend.points)  # a copy counts once
+    known = {*islice(first, trend.healthy)}
+    return max(1, sum(trend.points[row].digest in known for row in trend.rows))
+
+
 def _levels(trend: Trend) -> tuple[Levels, float | None]:
     """Return the levels in the trend's unit, and the rise at which a repair is due, None where unknown."""
     kept = [trend.points[k] for k in trend.rows]
     t, group, value, error = (
         np.array([getattr(own, name) for own in kept]) for name in ("day", "group", "level", "error")
     )
-    usual, pressure = float(np.mean(value[: trend.healthy])), float(np.median([own.pressure for own in kept]))
+    usual, pressure = float(np.mean(value[: _known(trend)])), float(np.median([own.pressure for own in kept]))
     prior = scatter_of(trend.basis or "ringing", usual)
     warmer, slope_sd = np.zeros(t.size), 0.0
     temperatures = [own.temperature for own in kept if own.temperature is not None]

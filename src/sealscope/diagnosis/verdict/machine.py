@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from sealscope.parameters import Rig, load_rig, rig_names
 from sealscope.parameters.rig import ASSUMED
+from sealscope.recordings.channels import flow_source
 from sealscope.recordings.recording import Recording
 
 #: Who stated the rig: the caller, the recording's own provenance, or nobody.
@@ -80,7 +81,7 @@ def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) 
 
 def measures_flow(units: Mapping[str, str]) -> bool:
     """Whether the flow to the cylinder is read by a meter in its unit, and neither angle nor speed of a pump is."""
-    return units.get("q_pump") == "m^3/s" and not {"theta", "omega"} & units.keys()
+    return flow_source(units) == "q_pump" and units["q_pump"] == "m^3/s"
 
 
 def healthy_leakage(rig: Rig) -> float:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import csv
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from sealscope.monitor.database.store import MonitorStore
 from sealscope.monitor.database.tables import FIGURES
-from sealscope.storage.atomic import atomic_write
+from sealscope.storage.csv_file import write_csv
 
 ALARM_COLUMNS = (
     *("id", "actuator", "level", "state", "mark", "reason", "marked_by", "marked_s", "comments", "raised_s", "onset_s"),
@@ -34,7 +33,7 @@ def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
         for _, event in batch:
             events[event["alarm"]["id"]].append(event)
     rows, labelled = [], defaultdict[str, list[tuple[float, float, dict[str, str]]]](list)
-    for alarm in reversed(store.alarms()):
+    for alarm in sorted(reversed(store.alarms()), key=lambda alarm: float(alarm["raised_s"])):
         own = events[alarm["id"]]
         judged = next((event for event in reversed(own) if event["event"] in _LABELS), None)
         onset, leak = alarm["onset_interval_s"] or (None, None), alarm["leak_interval_lpm"] or (None, None)
@@ -50,26 +49,20 @@ def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
             start, label = alarm["onset_s"] if onset[0] is None else onset[0], _LABELS[judged["event"]]
             labelled[alarm["actuator"]].append((start, judged["t"], {"label": label, "alarm": alarm["id"]}))
 
-    def estimates() -> Iterator[dict[str, Any]]:
-        for row in store.estimates():
-            known = [label for start, stop, label in labelled[row["actuator"]] if start <= row["t"] <= stop]
-            yield {**row, **(known[-1] if known else {})}
-
-    count = _write(folder / "alarms.csv", ALARM_COLUMNS, rows)
-    return count, _write(folder / "estimates.csv", ESTIMATE_COLUMNS, estimates())
-
-
-def _write(path: Path, columns: Sequence[str], rows: Iterable[dict[str, Any]]) -> int:
     count = 0
-    with atomic_write(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns, lineterminator="\n", extrasaction="ignore")
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({name: _cell(row.get(name)) for name in columns})
-            count += 1
-    return count
+
+    def estimates() -> Iterator[dict[str, Any]]:
+        nonlocal count
+        for count, row in enumerate(store.estimates(), 1):  # noqa: B007 (returned)
+            known = [label for start, stop, label in labelled[row["actuator"]] if start <= row["t"] <= stop]
+            yield _cells({**row, **(known[-1] if known else {})}, ESTIMATE_COLUMNS)
+
+    write_csv(folder / "alarms.csv", ALARM_COLUMNS, [_cells(row, ALARM_COLUMNS) for row in rows])
+    write_csv(folder / "estimates.csv", ESTIMATE_COLUMNS, estimates())
+    return len(rows), count
 
 
-def _cell(value: Any) -> Any:
-    """Return a cell that a spreadsheet takes for no formula: names and comments come from outside."""
-    return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r") else value
+def _cells(row: dict[str, Any], columns: Sequence[str]) -> dict[str, Any]:
+    """Return the cells of a row, which a spreadsheet takes for no formula: names and comments come from outside."""
+    cells, signs = {name: row.get(name) for name in columns}, ("=", "+", "-", "@", "\t", "\r")
+    return {name: f"'{own}" if isinstance(own, str) and own.startswith(signs) else own for name, own in cells.items()}

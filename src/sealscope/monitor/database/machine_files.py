@@ -9,16 +9,15 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from sealscope.diagnosis.commissioned.machine import JudgedAlarm
-from sealscope.diagnosis.commissioned.machine_file import LARGEST, MARKS, load_machine, write_machine
+from sealscope.diagnosis.commissioned.machine import JUDGEMENTS, JudgedAlarm
+from sealscope.diagnosis.commissioned.machine_file import LARGEST, load_machine, write_machine
 from sealscope.errors import SealscopeError
 from sealscope.monitor.alarms import Alarm
+from sealscope.recordings.formats.timebase import counts_from_1970
 from sealscope.recordings.joining import join
 from sealscope.recordings.recording import Recording
 from sealscope.storage.toml_file import read_toml
 
-#: Clocks of samples beyond it are seconds since 1970.
-_DATED = 1e8
 _writing = threading.Lock()
 
 
@@ -30,23 +29,24 @@ def pass_on(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording]) -> 
     another one, or `rig` no machine's file.
     """
     path = Path(rig)
-    if mark not in MARKS or path.suffix.lower() != ".toml":
+    if mark not in JUDGEMENTS or path.suffix.lower() != ".toml":
         return ""
     try:
         if "machine" not in read_toml(path, "a machine's file", rig, LARGEST):
             return ""
         with _writing:
-            shift = 0.0 if alarm.onset_s > _DATED else time.time() - alarm.updated_s
+            shift = 0.0 if counts_from_1970(alarm.onset_s) else time.time() - alarm.updated_s
             leak = None if mark == "invalid" else alarm.leak_lpm
             said = JudgedAlarm(alarm.id, mark, time.time(), alarm.onset_s + shift, leak, alarm.reason)
             machine, done = load_machine(path), "written down"
+            machine = replace(machine, alarms=(*machine.alarms, said))
             if mark == "invalid":
                 try:
                     machine = machine.with_healthy(_recording(samples, shift), file=alarm.id)
                     done = "taught as healthy"
                 except SealscopeError as error:
                     done = f"not taught: {error}"
-            write_machine(replace(machine, alarms=(*machine.alarms, said)), path)
+            write_machine(machine, path)
     except (SealscopeError, ValueError, OverflowError, OSError) as error:
         done = f"not written: {error}"
     return f"{path.name}: {done}"

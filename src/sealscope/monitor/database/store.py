@@ -168,6 +168,9 @@ class MonitorStore:
         if rows.actuators:
             before = tables.pending.delete().where(tables.pending.c.actuator == of)
             connection.execute(before, [{"of": name} for name in rows.actuators])
+        if rows.events and self.engine.dialect.name == "postgresql":
+            # events become known in the order of their numbers: an output that is past one never looks back
+            connection.execute(sa.text("lock table events in exclusive mode"))
         for new in (tables.estimates, tables.pending, tables.events):
             if values := getattr(rows, new.name):
                 connection.execute(new.insert(), values)
@@ -236,7 +239,7 @@ class MonitorStore:
         return {row.actuator: json.loads(row.summary) for row in self._rows(select(tables.summaries))}
 
     def alarms(self, *, open_only: bool = False, actuator: str | None = None) -> list[dict[str, Any]]:
-        """Return alarms as plain values, the latest first."""
+        """Return alarms as plain values, by actuator, the latest first, whatever its clock said."""
         of = tables.alarms.c
         query = select(of.alarm)
         if open_only:
@@ -244,7 +247,7 @@ class MonitorStore:
         if actuator is not None:
             query = query.where(of.actuator == actuator)
         values = [json.loads(text) for (text,) in self._rows(query)]
-        return sorted(values, key=lambda alarm: -float(alarm["raised_s"]))
+        return sorted(values, key=lambda alarm: (alarm["actuator"], -int(alarm["id"].rpartition("-")[2])))
 
     def events_since(self, number: int, most: int = 1000) -> list[tuple[int, dict[str, Any]]]:
         """Return events beyond a number with their own numbers, in their order."""
@@ -261,12 +264,13 @@ class MonitorStore:
     def course(self, actuator: str, most: int = 600, seconds: float | None = None) -> list[dict[str, Any]]:
         """Return the estimates of an actuator, means of successive ones where there are more than `most`.
 
-        `seconds`: only the last of them.
+        `seconds`: only the last of them, by the clock of the newest one, which may have been set back.
         """
         of = tables.estimates.c
         chosen = of.actuator == actuator
         if seconds is not None:
-            chosen &= of.t >= select(func.max(of.t)).where(chosen).scalar_subquery() - seconds
+            newest = select(of.t).where(chosen).order_by(of.number.desc()).limit(1).scalar_subquery()
+            chosen &= of.t.between(newest - seconds, newest)
         every = max(1, -(-self._value(select(func.count()).where(chosen)) // most))
         group = of.number - of.number % every
         query = select(*(func.avg(of[name]).label(name) for name in ("t", *tables.FIGURES)))

@@ -18,13 +18,12 @@ from typing import Any
 
 from sealscope.monitor import sparkplug as spb
 from sealscope.monitor.database.store import MonitorStore
-from sealscope.monitor.mqtt_client import KEEP_ALIVE_S, check_mqtt, check_running, client_of, published
+from sealscope.monitor.mqtt_client import MqttLink
 from sealscope.monitor.settings import BrokerSettings, SparkplugSettings, topic_part
+from sealscope.recordings.formats.timebase import counts_from_1970
 
 _log = logging.getLogger(__name__)
 _NAME, _BIRTHS = "sparkplug", "sparkplug bdSeq"
-#: How long a message is waited for [s].
-_SENT_S = 5.0
 
 
 class SparkplugNode:
@@ -43,15 +42,14 @@ class SparkplugNode:
         settings: SparkplugSettings,
         password: str | None = None,
     ) -> None:
-        check_mqtt()
         spb.payload_class()
         self._store, self._summaries, self._count = store, summaries, count
         self._settings, self._broker = settings, broker
-        self._client = client_of(broker, f"{broker.client_id}-{settings.group}-{settings.node}", password)
-        self._client.on_pre_connect = self._before_connection
+        name = f"{broker.client_id}-{settings.group}-{settings.node}"
+        self._link = MqttLink(broker, name, password, will=self._death)
+        self._client = self._link.client
         self._client.on_connect = self._connected
         self._client.on_message = self._message
-        self._online = False
         self._born = self._birth_number = 0  # bdSeq of the last birth, and of this connection
         self._seq = 255
         self._due = threading.Event()
@@ -61,18 +59,12 @@ class SparkplugNode:
     def pass_on(self) -> None:
         """Send what has happened; a monitor that does not send for all others is not connected."""
         if not self._store.sends:
-            self.close()
+            self._link.close()
             return
-        if not self._online:
+        if not self._link.is_open:
             self._born = self._store.position(_BIRTHS)
-            self._client.connect_async(self._broker.host, self._broker.port, KEEP_ALIVE_S, clean_start=True)
-            self._client.loop_start()
-            self._online = True
-        try:
-            check_running(self._client)
-        except RuntimeError:
-            self.close()
-            raise
+            self._link.open(clean_start=True)
+        self._link.check()
         if not self._client.is_connected():
             return
         if self._due.is_set():
@@ -82,6 +74,8 @@ class SparkplugNode:
             except BaseException:
                 self._due.set()
                 raise
+        if self._born != self._birth_number:  # connected a moment ago
+            return
         self._store.pass_on(_NAME, self._sent_event)
         if time.monotonic() >= self._next:
             self._next = time.monotonic() + self._settings.every_s
@@ -99,16 +93,7 @@ class SparkplugNode:
         try:
             self.pass_on()
         finally:
-            self.close()
-
-    def close(self) -> None:
-        """Say that the node ends, which the will does where it ends otherwise."""
-        if self._online:
-            self._online = False
-            if self._client.is_connected():
-                self._client.publish(self._topic("NDEATH"), self._death(), qos=1).wait_for_publish(_SENT_S)
-            self._client.disconnect()
-            self._client.loop_stop()
+            self._link.close()
 
     def _topic(self, kind: str, device: str | None = None) -> str:
         return spb.topic_of(self._settings.group, kind, self._settings.node, device)
@@ -116,13 +101,10 @@ class SparkplugNode:
     def _number(self) -> spb.SparkplugMetric:
         return spb.SparkplugMetric(spb.BIRTH_SEQUENCE, self._birth_number, spb.INT64)
 
-    def _death(self) -> bytes:
-        return spb.encoded(spb.SparkplugPayload(_clock(None), (self._number(),)))
-
-    def _before_connection(self, client: Any, userdata: Any) -> None:
-        """Set the will of the connection to come; its number is the one after that of the last birth."""
+    def _death(self) -> tuple[str, bytes]:
+        """Return the death of the connection to come; its number is the one after that of the last birth."""
         self._birth_number = (self._born + 1) % 256
-        client.will_set(self._topic("NDEATH"), self._death(), qos=1, retain=False)
+        return self._topic("NDEATH"), spb.encoded(spb.SparkplugPayload(_clock(None), (self._number(),)))
 
     def _connected(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
         if reason.is_failure:
@@ -173,7 +155,7 @@ class SparkplugNode:
         self._seq = (self._seq + 1) % 256
         topic = self._topic(kind, None if actuator is None else topic_part(actuator))
         payload = spb.SparkplugPayload(_clock(None), tuple(metrics), self._seq)
-        return published(self._client, topic, spb.encoded(payload), _SENT_S)
+        return self._link.published(topic, spb.encoded(payload))
 
 
 @cache
@@ -188,7 +170,7 @@ def _table(name: str) -> Mapping[str, Mapping[str, str]]:
 
 def _clock(t: float | None) -> int:
     """Return a clock of samples [s] in [ms]; where it does not count from 1970, the present."""
-    return round(1000.0 * (t if t is not None and 1e8 < t < 1e11 else time.time()))
+    return round(1000.0 * (t if t is not None and counts_from_1970(t) else time.time()))
 
 
 def _values(table: str, values: Mapping[str, Any]) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
-from sealscope.monitor.mqtt_client import KEEP_ALIVE_S, check_mqtt, check_running, client_of, published
+from sealscope.monitor.mqtt_client import MqttLink, check_mqtt
 from sealscope.monitor.settings import BrokerSettings, secret_of, topic_part
 from sealscope.monitor.sources.source_block import BlockReceiver, RefusedMessage, decoded
 from sealscope.monitor.sources.sparkplug_host import SparkplugHost
@@ -35,8 +35,8 @@ _SESSION_S, _IN_FLIGHT, _LARGEST = 30 * 86_400, 64, 16_000_000
 _ROOM, _ROOM_BYTES = 256, 64_000_000
 _ASSURED_ROOM, _ASSURED_BYTES = 2048, 192_000_000
 _NAME = "mqtt"
-#: How long a published alarm is waited for, and the decoder at the end [s].
-_SENT_S, _END_S = 2.0, 2.0
+#: How long the decoder is waited for at the end [s].
+_END_S = 2.0
 #: How often the states of the actuators are looked at [s].
 _STATES_S = 2.0
 #: What messages are counted under that find no room.
@@ -59,11 +59,13 @@ class _Connection:
         self._broker = service.supervisor.part(BROKER)
         self._names = {actuator.topic: actuator.name for actuator in service.settings.actuator if actuator.topic}
         name = settings.client_id if share is None else f"{settings.client_id}-{share.name}"  # a session of its own
-        self._client = client_of(settings, name, password)
+        will = None if settings.host_id is None else self._offline
+        self._link = MqttLink(settings, name, password, will, retain=True)
+        self._client = self._link.client
         self._host: SparkplugHost | None = None
         if any(actuator.sparkplug is not None for actuator in service.settings.actuator):
             self._host = SparkplugHost(service.settings.actuator, self._client.publish, service.count)
-        self._online = self._connection = 0
+        self._online = self._connection = 0  # when the connection was made [ms], and its number
         self._refusing = -1  # the connection whose further messages are left to the broker
         self._to_close: Any = None  # the line of that connection
         self._ended = threading.Event()
@@ -74,8 +76,6 @@ class _Connection:
         self._client.on_connect = self._connected
         self._client.on_message = self._message
         self._client.on_disconnect = self._lost
-        if settings.host_id is not None:
-            self._client.on_pre_connect = self._before_connection
 
     def run(self) -> None:
         """Hand messages over and pass alarms on until the service stops."""
@@ -86,24 +86,19 @@ class _Connection:
         properties.SessionExpiryInterval = _SESSION_S
         properties.ReceiveMaximum = _IN_FLIGHT
         properties.MaximumPacketSize = _LARGEST
-        place = self._settings.host, self._settings.port
-        self._client.connect_async(*place, KEEP_ALIVE_S, clean_start=False, properties=properties)
         decoding = self._service.supervisor.start("MQTT decoder", self._decode)
         alarms = self._service.supervisor.part("MQTT alarms")
-        self._client.loop_start()
+        self._link.open(clean_start=False, properties=properties)
         try:
             while not self._service.stopping.wait(0.2):
-                check_running(self._client)
+                self._link.check()
                 alarms.attempt(self._pass_on)
             self._states_due = 0.0
             alarms.attempt(self._pass_on)
         finally:
             self._ended.set()
             decoding.join(_END_S)
-            if self._settings.host_id is not None and self._client.is_connected():
-                self._say_state(online=False)
-            self._client.disconnect()
-            self._client.loop_stop()
+            self._link.close()
 
     def _connected(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
         self._connection += 1
@@ -113,23 +108,20 @@ class _Connection:
         self._broker.back()
         self._states.clear()
         if self._settings.host_id is not None:
-            self._say_state(online=True)
+            client.publish(*self._state(online=True), qos=1, retain=True)
         for topic in (*self._names, *(self._host.topics if self._host is not None else ())):
             client.subscribe(topic, qos=1)
         self._arrived.put((self._connection, None), 0, always=True)
 
-    def _before_connection(self, client: Any, userdata: Any) -> None:
-        """Set the will of a primary host of Sparkplug; it has the time of the connection to come."""
+    def _offline(self) -> tuple[str, str]:
+        """Return the will of a primary host of Sparkplug; it has the time of the connection to come."""
         self._online = round(1000.0 * time.time())
-        client.will_set(*self._state(online=False), qos=1, retain=True)
+        return self._state(online=False)
 
     def _state(self, *, online: bool) -> tuple[str, str]:
         """Return topic and payload of the state of a primary host."""
         state = json.dumps({"online": online, "timestamp": self._online})
         return f"{NAMESPACE}/STATE/{self._settings.host_id}", state
-
-    def _say_state(self, *, online: bool) -> None:
-        self._client.publish(*self._state(online=online), qos=1, retain=True)
 
     def _lost(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
         if not self._service.stopping.is_set() and self._refusing != self._connection:
@@ -211,4 +203,4 @@ class _Connection:
     def _published(self, actuator: str, what: str, message: str) -> bool:
         """Publish a retained message of an actuator; return whether the broker has it."""
         topic = f"{self._settings.alarms_topic}/{topic_part(actuator)}/{what}"
-        return published(self._client, topic, message, _SENT_S, qos=1, retain=True)
+        return self._link.published(topic, message, qos=1, retain=True)

@@ -93,6 +93,8 @@ class ValueGatherer:
                 self._count(LATE)
             else:
                 own.values[k] = value
+        while self._start is None and len(own.values) > self._ahead:  # another channel has never come
+            own.held = own.values.pop(next(iter(own.values)))
         last = first + len(values) - 1
         self._newest = last if self._newest is None else max(self._newest, last)
         own.heard, own.newest = self._now(), last if own.newest is None else max(last, own.newest)

@@ -16,7 +16,6 @@ import numpy as np
 from sealscope.compiled import contracted, law
 from sealscope.physics import rig
 from sealscope.physics.cylinder import pressure_rate
-from sealscope.physics.fluid import P_ATM
 from sealscope.physics.lanes import anywhere, select
 from sealscope.physics.rig import RigNumbers
 from sealscope.physics.state import (
@@ -30,6 +29,7 @@ from sealscope.physics.state import (
     moved,
     pressures_moved,
 )
+from sealscope.units import P_ATM
 
 #: Nodes of the step at which the inputs are needed.
 IMEX_NODES = (0.0, 1 / 2, 83 / 250, 31 / 50, 17 / 20, 1.0)

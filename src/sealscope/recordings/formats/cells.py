@@ -5,7 +5,9 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from itertools import repeat
 
 import numpy as np
 
@@ -68,7 +70,7 @@ def numbers(cells: Sequence[str], decimal: str, where: Callable[[int], str]) -> 
             raise ValueError
         values = np.fromiter(map(float, texts), np.float64, len(texts))
     except ValueError:
-        values = np.fromiter((_number(cell, decimal) for cell in cells), np.float64, len(cells))
+        values = np.fromiter(map(_number, cells, texts, repeat(decimal)), np.float64, len(cells))
     words = [index for index in np.flatnonzero(~np.isfinite(values)).tolist() if not is_missing(cells[index])]
     for index in words:
         if is_number(cells[index], decimal):
@@ -76,7 +78,10 @@ def numbers(cells: Sequence[str], decimal: str, where: Callable[[int], str]) -> 
     return values, words
 
 
-def _number(cell: str, decimal: str) -> float:
+def _number(cell: str, pointed: str, decimal: str) -> float:
+    """Return a cell as a double, NaN for a word; `pointed`: with a point for its decimal sign."""
+    with suppress(ValueError):
+        return np.nan if "_" in pointed else float(pointed)
     text = cell.strip().replace("\u2212", "-")
     if match := _GROUPED[decimal].fullmatch(text):
         text = text.replace(match["sign"], "")

@@ -18,10 +18,10 @@ from sealscope.errors import InputError
 from sealscope.recordings.channels import Array
 from sealscope.recordings.formats.columns import Wanted
 from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.headings.preamble import stated_rate
+from sealscope.recordings.formats.headings.preamble import entries, stated_rate
 from sealscope.recordings.formats.libraries import library
 from sealscope.recordings.formats.netcdf import refuse_elsewhere
-from sealscope.recordings.formats.structured.tree import number_of, series_in
+from sealscope.recordings.formats.structured.tree import entry_of, series_in
 from sealscope.recordings.formats.table import MAX_VALUES, RecordingFields, Series, table_of, uniform
 
 #: Group of the streams, by which such a file is known; what refers to them.
@@ -64,8 +64,8 @@ def read_matlab(path: Path, wanted: Wanted) -> RecordingFields:
                 raise InputError(f"{name} must have at most {MAX_VALUES} values, got the shape {shape}")
         held = matio.load_from_mat(path, add_table_attrs=True)
     values = {name: value for name, value in held.items() if not name.startswith("__")}
-    scalars = {name: repr(number) for name, value in values.items() if (number := number_of(value)) is not None}
-    return table_of(list(series_in(values)), wanted, "MATLAB", rate=stated_rate(scalars), size=size)
+    about = entries((name, entry_of(value)) for name, value in values.items())
+    return table_of(list(series_in(values)), wanted, "MATLAB", about, stated_rate(about), size=size)
 
 
 def _refuse_elsewhere(file: Any) -> None:

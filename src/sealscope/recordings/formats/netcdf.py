@@ -17,6 +17,7 @@ from sealscope.recordings.channels import LONG_NAMES, Array
 from sealscope.recordings.formats.columns import Wanted
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.preamble import entries, stated_rate
+from sealscope.recordings.formats.structured.tree import entry_of
 from sealscope.recordings.formats.table import (
     FORMAT_VERSION,
     RecordingFields,
@@ -57,10 +58,10 @@ def read_netcdf(path: Path, wanted: Wanted) -> RecordingFields:
                 if data.dtype[field].kind in "fiub"
             ]
         own = _description(file) if OWN in file.attrs else None
-        pairs = () if own else file.attrs.items()
-        about = entries((name, text) for name, value in pairs if (text := _text(value)) is not None)
+        said = {} if own else {name: value for name, value in file.attrs.items() if not name.startswith("_")}
+        about = entries((name, entry_of(_text(value) or value)) for name, value in said.items())
         kind = "NetCDF" if "_NCProperties" in file.attrs else "HDF5"
-        return table_of(series, wanted, kind, rate=stated_rate(about), own=own, size=size)
+        return table_of(series, wanted, kind, about, stated_rate(about), own=own, size=size)
 
 
 def _field(data: Any, name: str, field: str) -> NDArray[Any]:

@@ -15,6 +15,7 @@ from sealscope.errors import InputError
 from sealscope.recordings.channels import Array
 from sealscope.recordings.formats.columns import Wanted
 from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.preamble import entries, stated_rate
 from sealscope.recordings.formats.libraries import library
 from sealscope.recordings.formats.table import RecordingFields, Series, check_texts, parse_description, table_of
 
@@ -28,7 +29,9 @@ def read_parquet(path: Path, wanted: Wanted) -> RecordingFields:
         feather = opened.read(6) == b"ARROW1"
     if feather:
         table = library("pyarrow.feather", "Feather", "pyarrow").read_table(path)
-        return table_of(_series(table.schema, table.column, len(table)), wanted, "Feather")
+        about = _about(table.schema)
+        series = _series(table.schema, table.column, len(table))
+        return table_of(series, wanted, "Feather", about, stated_rate(about))
     parquet = library("pyarrow.parquet", "Parquet", "pyarrow")
     with parquet.ParquetFile(path) as file:
         schema, rows = file.schema_arrow, file.metadata.num_rows
@@ -40,8 +43,15 @@ def read_parquet(path: Path, wanted: Wanted) -> RecordingFields:
             return file.read(columns=[name]).column(name)
 
     own = (schema.metadata or {}).get(_OWN)
-    description = parse_description(own) if own else None
-    return table_of(_series(schema, column, rows), wanted, "Parquet", own=description, size=path.stat().st_size)
+    description, about = parse_description(own) if own else None, _about(schema)
+    series, size = _series(schema, column, rows), path.stat().st_size
+    return table_of(series, wanted, "Parquet", about, stated_rate(about), own=description, size=size)
+
+
+def _about(schema: Any) -> dict[str, str]:
+    """Return the entries that a table has beside its columns, without those that libraries write for themselves."""
+    pairs = ((name.decode(errors="replace"), text) for name, text in (schema.metadata or {}).items())
+    return entries((name, text.decode(errors="replace")) for name, text in pairs if text[:1] not in b"{")
 
 
 def _series(schema: Any, column: Callable[[int], Any], rows: int) -> list[Series]:

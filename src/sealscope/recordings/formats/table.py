@@ -30,7 +30,7 @@ from sealscope.recordings.formats.headings.preamble import exported_from
 from sealscope.recordings.formats.headings.proposal import is_time, unit_of_time
 from sealscope.recordings.formats.headings.split_time import joined_time
 from sealscope.recordings.formats.headings.words import WORDS
-from sealscope.recordings.formats.timebase import falling, nominal_rate, stamps, time_base
+from sealscope.recordings.formats.timebase import LogTime, falling, nominal_rate, stamps, time_base
 from sealscope.units import to_si
 
 #: Most values that one file may hold in the columns used: 2 GiB of doubles, 16 hours of 9 channels at 500 Hz.
@@ -158,8 +158,12 @@ def converted(
     notes: Sequence[str] = (),
     about: Mapping[str, str] | None = None,
     own: Mapping[str, Any] | None = None,
+    log: LogTime | None = None,
 ) -> RecordingFields:
-    """Convert the columns (n,) of a table, doubles or the time as datetime64, to the fields of a recording."""
+    """Convert the columns (n,) of a table, doubles or the time as datetime64, to the fields of a recording.
+
+    `log`: what the parts before this one tell of the time, where it is one of a log.
+    """
     label, start, about = choice.time_label, dict[str, Any](), about or {}
     count = len(next(iter(columns.values())))
     if count == 0:
@@ -191,7 +195,7 @@ def converted(
     elif own is not None and not wanted.infers_rate:
         t, rate = time, own["rate"]
     else:
-        t, rate, start, more = time_base(time, label.unit, label.whole, choice.rate)
+        t, rate, start, more = time_base(time, label.unit, label.whole, choice.rate, log)
         notes += more
         if not start and (begin := exported_from(about)) is not None:
             start = {"start": str(begin)}

@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -58,7 +59,15 @@ from sealscope.recordings.formats.text_layout import (
     encoding_of,
     layout_of,
 )
-from sealscope.recordings.formats.timebase import is_stamp, stamps
+from sealscope.recordings.formats.timebase import (
+    LogTime,
+    day_before_month,
+    either_dates,
+    falling,
+    is_stamp,
+    stamps,
+    stated_order,
+)
 
 #: Bytes that are read at a time, so many times more by pyarrow, and bytes of the longest line.
 _CHUNK, _FAST, _LONGEST_LINE = 2**19, 4, 2**23
@@ -84,7 +93,7 @@ def read_text(path: Path, wanted: Wanted) -> RecordingFields:
 def read_text_parts(path: Path, wanted: Wanted, every: float) -> Iterator[RecordingFields]:
     """Yield the wanted columns of a text log in parts of `every` seconds at its first rate, in bounded memory.
 
-    A log with a time for each channel and a long table are one part.
+    A log with a time for each channel, one that begins with its last sample and a long table are one part.
     """
     layout = look_at(path)
     own = None if layout.own is None else parse_description(layout.own)
@@ -103,19 +112,23 @@ def read_text_parts(path: Path, wanted: Wanted, every: float) -> Iterator[Record
             return
     log = _Log(path, layout, choice.columns, choice.date)
 
-    def part(blocks: list[_Block], more: Sequence[str] = ()) -> RecordingFields:
+    def part(blocks: list[_Block], time: LogTime, more: Sequence[str] = ()) -> RecordingFields:
         columns, notes = log.joined(blocks)
-        return converted(choice, columns, layout.kind, wanted, [*layout.notes, *notes, *more], layout.about, own)
+        notes = [*layout.notes, *notes, *more]
+        return converted(choice, columns, layout.kind, wanted, notes, layout.about, own, time)
 
-    blocks = log.blocks()
+    blocks, size, time = log.blocks(), inf, LogTime()
     first = next(blocks, None)
-    size = inf if first is None or every == inf else max(1, round(every * part([first[:]]).rate))
+    backwards = first is not None and choice.time is not None and falling(first.columns[choice.time])
+    if first is not None and every < inf and not backwards:
+        size = max(1, round(every * part([first[:]], time).rate))
+        time = LogTime(time.head, time.rate, time.resolution)
     before: list[_Block] = []
     for blocks_of_part in _cut([] if first is None else chain([first], blocks), size):
         if before:
-            yield part(before)
+            yield part(before, time)
         before = blocks_of_part
-    yield part(before, log.remarks_and_headings())
+    yield part(before, time, log.remarks_and_headings())
 
 
 def _several_clocks(path: Path, layout: Layout, times: Sequence[int], wanted: Wanted) -> RecordingFields:
@@ -211,12 +224,15 @@ class _Log:
         numeric = not layout.cell_units and "texts" not in kinds.values()
         self.fast = plain and numeric and path.stat().st_size >= _LARGE and find_spec("pyarrow") is not None
         self.stamped: bool | None = None
+        self.day_first: bool | None = None
+        self.order = ""
         self.dated = False
-        self.nulls, self.width = ["", "NaN"], 0
+        self.worded = Counter[int]()
+        self.nulls, self.width, self.usual = ["", "NaN"], 0, 0
 
     def blocks(self) -> Iterator[_Block]:
         """Yield the rows in blocks that are read one after the other."""
-        layout, usual, first = self.layout, 0, True
+        layout, first = self.layout, True
         with self.path.open("rb") as file:
             for number, block, end, cut in _blocks(
                 file, layout.encoding, self.place, lambda: _CHUNK * (_FAST if self.fast and self.width else 1)
@@ -225,24 +241,28 @@ class _Log:
                     plain = self._plain(number, block, end)
                     self.fast, first = plain is not None or not first, False
                     if plain is not None:
-                        self.stamped, usual = False, self.width
+                        self.stamped, self.usual = False, self.width
                         self._count(len(plain))
                         yield plain
                         continue
-                lines = _lines(block[:end], layout)
-                kept = self._samples(lines, max(0, layout.first_row + 1 - number))
-                if not kept:
-                    continue
-                where: Sequence[int] = [number + i for i in kept]
-                rows = self._cells([lines[i] for i in kept], where, cut)
-                if cut and len(rows[-1]) < usual and _HALF_A_NUMBER.fullmatch(rows[-1][-1]):
-                    # a last line without an end was not written whole: half a number and what follows it are missing
-                    rows[-1] = [*rows[-1][:-1], *[""] * (self.least - len(rows[-1]) + 1)]
-                usual = len(rows[-1])
-                rows, where = self._checked(rows, where)
+                rows, lines = self._rows(number, block[:end], cut)
                 if rows:
                     self._count(len(rows))
-                    yield self._read(rows, where, cut)
+                    yield self._read(rows, lines, cut)
+
+    def _rows(self, number: int, block: bytes, cut: bool) -> tuple[list[list[str]], Sequence[int]]:
+        """Return the cells of the samples in a block from line `number` on, and the numbers of their lines."""
+        lines = _lines(block, self.layout)
+        kept = self._samples(lines, max(0, self.layout.first_row + 1 - number))
+        if not kept:
+            return [], []
+        where = [number + i for i in kept]
+        rows = self._cells([lines[i] for i in kept], where, cut)
+        if cut and len(rows[-1]) < self.usual and _HALF_A_NUMBER.fullmatch(rows[-1][-1]):
+            # a last line without an end was not written whole: half a number and what follows it are missing
+            rows[-1] = [*rows[-1][:-1], *[""] * (self.least - len(rows[-1]) + 1)]
+        self.usual = len(rows[-1])
+        return self._checked(rows, where)
 
     def _count(self, rows: int) -> None:
         self.total += rows
@@ -349,9 +369,7 @@ class _Log:
                 check_texts(self.total, max(map(len, cells)), self.layout.labels[column].whole)
                 block.columns[column] = np.array(cells, dtype=object)
             elif kind == "time" and self._is_stamped(cells, rows):
-                if self.dated and self.date is not None:
-                    days = [row[self.date].strip() for row in rows]
-                    cells = [f"{day} {cell.strip()}" if cell.strip() else "" for day, cell in zip(days, cells)]  # noqa: B905
+                cells = self._moments(rows, column)
                 block.columns[column], words = self._dates(cells, where)
             else:
                 block.columns[column], words = numbers(cells, self.layout.decimal, where)
@@ -360,17 +378,26 @@ class _Log:
                     continue
             if words:
                 block.words[column] = np.array(words)
+                self.worded[column] += len(words)
                 block.first[column] = f"{cells[words[0]].strip()[:40]!r} {where(words[0])}"
         return block
 
     def _is_stamped(self, cells: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
         """Return whether the time holds stamps, by its first cell; it may be a time of the day beside a date."""
-        if self.stamped is None:
-            index = next((i for i, cell in enumerate(cells) if not is_missing(cell)), 0)
+        index = next((i for i, cell in enumerate(cells) if not is_missing(cell)), None)
+        if self.stamped is None and index is not None:
             self.stamped = not is_number(cells[index], self.layout.decimal) and is_stamp(cells[index])
             day = rows[index][self.date] if self.date is not None and self.date < len(rows[index]) else ""
             self.dated = self.stamped and ":" in cells[index][:3] and is_stamp(day) and ":" not in day
-        return self.stamped
+        return bool(self.stamped)
+
+    def _moments(self, rows: Sequence[Sequence[str]], column: int) -> list[str]:
+        """Return the cells of a column of stamps, with the date of its own column before a time of the day."""
+        if not self.dated or self.date is None:
+            return [row[column] for row in rows]
+        days = [row[self.date].strip() if self.date < len(row) else "" for row in rows]
+        times = [row[column].strip() for row in rows]
+        return [f"{day} {time}" if day and time else "" for day, time in zip(days, times, strict=True)]
 
     def _place_of(self, index: int, lines: Sequence[int], column: int) -> str:
         return f"(line {lines[index]}, column {self.layout.labels[column].whole}, {self.place})"
@@ -378,8 +405,10 @@ class _Log:
     def _dates(self, cells: list[str], where: Callable[[int], str]) -> tuple[NDArray[np.datetime64], list[int]]:
         """Return cells as moments (n,), missing ones and words as NaT, and the indices of the words."""
         texts = ["" if cell.strip().lower() in MISSING else cell for cell in cells]
+        if self.day_first is None and either_dates(texts):
+            self.day_first = self._day_before_month()
         with suppress(ValueError):
-            return stamps(texts), []
+            return stamps(texts, bool(self.day_first)), []
         words = [
             index
             for index, text in enumerate(texts)
@@ -388,10 +417,27 @@ class _Log:
         for index in words:
             texts[index] = ""
         try:
-            return stamps(texts), words
+            return stamps(texts, bool(self.day_first)), words
         except ValueError as error:
             bad = int(error.args[0])
             raise InputError(f"{_STAMP_RULE}, got {cells[bad]!r} {where(bad)}") from None
+
+    def _day_before_month(self) -> bool:
+        """Return whether the day is before the month in all dates of the log, read up to the first that tells."""
+        log = _Log(self.path, self.layout, self.kinds, self.date)
+        columns = [column for column, kind in self.kinds.items() if kind == "time"]
+        dates: list[dict[str, None]] = [{} for _ in columns]
+        with suppress(InputError), self.path.open("rb") as file:  # what is wrong with a row is said where it is read
+            for number, block, end, cut in _blocks(file, self.layout.encoding, self.place, lambda: _CHUNK):
+                rows, _ = log._rows(number, block[:end], cut)
+                for column, own in zip(columns, dates, strict=True):
+                    own.update(either_dates(self._moments(rows, column)))
+                if any(stated_order(own) is not None for own in dates):
+                    break
+        order = day_before_month(dates)
+        if all(stated_order(own) is None for own in dates):
+            self.order = f"dates read as {'day, month' if order else 'month, day'}: none has a number over 12"
+        return order
 
     def joined(self, blocks: list[_Block]) -> tuple[dict[int, NDArray[Any]], list[str]]:
         """Return the columns of blocks, which let go of them, and lines for the history; refuse many words."""
@@ -403,17 +449,21 @@ class _Log:
         }
         for column, at in words.items():  # each column's blocks are let go before the next is joined
             first = next((own.first[column] for own in blocks if len(own.words.get(column, ()))), "")
-            if len(at) > MOST_WORDS * starts[-1]:
+            if at and self.worded[column] > MOST_WORDS * self.total:
                 stamped = self.stamped and self.kinds[column] == "time"
                 raise InputError(f"{_STAMP_RULE if stamped else 'a sample must be a number'}, got {first}")
             if at:
                 many = f"{counted(len(at), 'cell')} without a number read as missing"
                 notes.append(f"column {labels[column].whole}: {many}, first {first}")
-            cells = np.concatenate([own.columns.pop(column) for own in blocks]) if blocks else np.empty(0)
+            parts = [own.columns.pop(column) for own in blocks] or [np.empty(0)]
+            if self.stamped and self.kinds[column] == "time":  # blocks before the first stamp have no moments
+                parts = [np.full(part.shape, "NaT", "M8[ns]") if part.dtype.kind == "f" else part for part in parts]
+            cells = np.concatenate(parts)
             # the rows of a summary, where a word stands in place of the time
             cells = np.delete(cells, words[last]) if words[last] and self.kinds[last] == "time" else cells
             cells.setflags(write=False)  # made here: a recording takes it as it is
             columns[column] = cells
+        notes += [self.order] if self.order else []
         if self.dated and self.date is not None:
             notes.append(f"date and time joined from columns {labels[self.date].whole} and {labels[last].whole}")
         return columns, notes

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import date
 from typing import Any
 
 import numpy as np
@@ -14,7 +16,8 @@ from sealscope.recordings.channels import Array
 from sealscope.recordings.formats.headings.words import WORDS
 from sealscope.units import to_si
 
-#: How dates are written; what `first` and `second` are follows from all stamps of a column.
+_EITHER = r"(?P<first>\d{1,2})(?P<stroke>[/-])(?P<second>\d{1,2})(?P=stroke)(?P<year>\d{4}|\d{2})"
+#: How dates are written; what `first` and `second` are follows from all dates of a column (`day_before_month`).
 _DATES = (
     r"(?P<year>\d{4})[-/.](?P<month>\d{1,2})[-/.](?P<day>\d{1,2})",
     r"(?P<plain>(?P<year>(?:19|20)\d{2})(?P<month>\d{2})(?P<day>\d{2}))(?=[T\s]|\Z)",
@@ -23,9 +26,11 @@ _DATES = (
     r"(?P<day>\d{1,2})\.(?P<month>\d{1,2})\.(?P<year>\d{4}|\d{2})",
     r"(?P<day>\d{1,2})[-. /]{1,2}(?P<month>[^\W\d_]{3,9})[-. /]{1,2}(?P<year>\d{4}|\d{2})",
     r"(?P<month>[^\W\d_]{3,9})[. ]{1,2}(?P<day>\d{1,2}),? (?P<year>\d{4})",
-    r"(?P<first>\d{1,2})(?P<stroke>[/-])(?P<second>\d{1,2})(?P=stroke)(?P<year>\d{4}|\d{2})",
+    _EITHER,
     "",
 )
+_EITHER_DATE = re.compile(rf"\s*(?P<date>{_EITHER})")
+_LAST_MONTH = 12
 #: A number, which is no stamp but a date of eight digits.
 _PLAIN = re.compile(r"[+-]?\d*(?:[.,]\d*)?")
 _CLOCK = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,:]\d{1,9})?|[.,]\d{1,9})?|\d{6}(?:[.,]\d{1,9})?"
@@ -55,9 +60,24 @@ _LARGEST_STEP, _LARGEST_STEP_OF_DAYS = 2e-6, 1.2e-5
 _OFFSET_OF_DATENUM = 693_960
 #: Seconds since 1904 begin here, in 2008: those since 1970 would be in 2074.
 _SINCE_1904, _FROM_1904_TO_1970 = 3.28e9, 2_082_844_800.0
-_EARLIEST_EPOCH = 1e8  # [s]: March 1973, and no recording lasts three years
+_EARLIEST_EPOCH, _LATEST_EPOCH = 1e8, 1e11  # [s]: March 1973, and no recording lasts three years; the year 5138
 #: Times (n,) [s], what is known of the moment 0, and lines for the history.
 _Seconds = tuple[Array, dict[str, Any], list[str]]
+
+
+@dataclass
+class LogTime:
+    """What the parts of a log that were read before tell of its time.
+
+    `head`: their first times, without a unit; `rate`: of the samples [Hz]; `resolution`: of times that these share [s];
+    `last`: the last time, as the file has it, and where it is, `end` [s].
+    """
+
+    head: Array | None = None
+    rate: float | None = None
+    resolution: float | None = None
+    last: Any = None
+    end: float = 0.0
 
 
 def _parsed_stamp(text: str) -> dict[str, str | None] | None:
@@ -82,17 +102,17 @@ def is_stamp(text: str) -> bool:
     return _parsed_stamp(text) is not None
 
 
-def stamps(cells: Sequence[str]) -> NDArray[np.datetime64]:
+def stamps(cells: Sequence[str], day_first: bool | None = None) -> NDArray[np.datetime64]:
     """Read stamps (ISO, day.month.year, month/day/year) and times of a day as datetime64[ns]; an empty cell is NaT.
 
-    Dates with strokes begin with the month, but where the first number of any of them is over 12; dates with hyphens
-    begin with the day, but where the second number is over 12. Raises ValueError with the index of the first cell that
-    is no stamp.
+    `day_first`: the order of dates such as 05/06/2024 and 05-06-2024, by default what these cells tell
+    (`day_before_month`). Raises ValueError with the index of the first cell that is no stamp.
     """
-    parsed = [_parsed_stamp(cell) for cell in cells]
-    day_first = any(int(parts.get("first") or 0) > 12 for parts in parsed if parts is not None)
+    if day_first is None:
+        day_first = day_before_month([either_dates(cells)])
     plain: list[str] = []
-    for index, (cell, parts) in enumerate(zip(cells, parsed, strict=True)):
+    for index, cell in enumerate(cells):
+        parts = _parsed_stamp(cell)
         if parts is None:
             if cell.strip():
                 raise ValueError(index)
@@ -100,7 +120,7 @@ def stamps(cells: Sequence[str]) -> NDArray[np.datetime64]:
             continue
         hour, colon, rest = _clock(parts["clock"] or "00:00").partition(":")
         if half := parts["half"]:  # 12 AM is midnight, 12 PM is noon
-            hour = str(int(hour) % 12 + (12 if half.lower() == "pm" else 0)) if 1 <= int(hour) <= 12 else "99"
+            hour = str(int(hour) % 12 + (12 if half[0] in "pP" else 0)) if 1 <= int(hour) <= 12 else "99"
         plain.append(f"{_date_of(parts, day_first)}T{hour:0>2}{colon}{rest}")
     try:
         return np.array(plain, dtype="datetime64[ns]")
@@ -108,11 +128,63 @@ def stamps(cells: Sequence[str]) -> NDArray[np.datetime64]:
         raise ValueError(next(index for index, text in enumerate(plain) if not _is_moment(text))) from None
 
 
+def either_dates(cells: Iterable[str]) -> dict[str, None]:
+    """Return the dates of stamps that begin with the day or the month, each once, as they follow each other."""
+    return {match["date"]: None for cell in cells if (match := _EITHER_DATE.match(cell))}
+
+
+def stated_order(dates: Iterable[str]) -> bool | None:
+    """Return whether the day is before the month in the first of the `either_dates` that tells; None where none does.
+
+    It has one number over 12.
+    """
+    over = ((first > _LAST_MONTH, second > _LAST_MONTH) for first, second, _ in map(_numbers, dates))
+    return next((first for first, second in over if first != second), None)
+
+
+def day_before_month(columns: Collection[Iterable[str]]) -> bool:
+    """Return whether the day stands before the month in the `either_dates` of columns that follow one rule.
+
+    By their `stated_order`; else in the order in which no column goes back; else in which they span less time; else
+    before a hyphen and not before a stroke.
+    """
+    stated = next((order for order in map(stated_order, columns) if order is not None), None)
+    if stated is not None:
+        return stated
+    hyphen = any("-" in text for column in columns for text in column)
+    ranks = {}
+    for day_first in (hyphen, not hyphen):
+        days = [[_day(text, day_first) for text in column] for column in columns]
+        ends = [day for own in days for day in own if day]
+        ranks[day_first] = any(own != sorted(own) for own in days), max(ends, default=0) - min(ends, default=0)
+    return min(ranks, key=ranks.__getitem__)
+
+
+def _day(either: str, day_first: bool) -> int:
+    """Return the number of a day, 0 for one that no calendar has."""
+    first, second, year = _numbers(either)
+    try:
+        return date(year, *((second, first) if day_first else (first, second))).toordinal()
+    except ValueError:
+        return 0
+
+
+def _numbers(either: str) -> tuple[int, int, int]:
+    first, second, year = re.split("[/-]", either)
+    return int(first), int(second), int(year) + (2000 if len(year) == 2 else 0)
+
+
 def _is_moment(text: str) -> bool:
     try:
-        return bool(np.datetime64(text, "ns")) or True
+        np.datetime64(text, "ns")
     except ValueError:
         return False
+    return True
+
+
+def counts_from_1970(clock: float) -> bool:
+    """Return whether a clock [s] is that of a date, as opposed to one that counts from the start of a machine."""
+    return _EARLIEST_EPOCH < clock < _LATEST_EPOCH
 
 
 def seconds_of(stamp: str) -> float | None:
@@ -139,10 +211,8 @@ def _date_of(parts: Mapping[str, str | None], day_first: bool) -> str:
     if days := parts.get("days"):
         return str(np.datetime64(_NO_DATE) + int(days))
     year, month, day = (parts.get(name) for name in ("year", "month", "day"))
-    first, second = parts.get("first"), parts.get("second")
-    if first and second:
-        day_first = day_first or (parts["stroke"] == "-" and int(second) <= 12)
-        month, day = (second, first) if day_first else (first, second)
+    if "first" in parts:
+        month, day = (parts["first"], parts["second"])[:: -1 if day_first else 1]
     return f"{'20' if len(year) == 2 else ''}{year}-{month:0>2}-{day:0>2}" if year else _NO_DATE
 
 
@@ -176,15 +246,18 @@ def falling(times: NDArray[Any]) -> bool:
     return len(times) > 1 and bool(np.all(times[1:] < times[:-1]))
 
 
-def _from_stamps(values: NDArray[np.datetime64], name: str) -> _Seconds:
+def _from_stamps(values: NDArray[np.datetime64], name: str, log: LogTime) -> _Seconds:
     nanoseconds = values.astype("datetime64[ns]")
     known = ~np.isnat(nanoseconds)
     if not known.any():
         raise InputError("time must have a stamp in some row, got none")
+    undated = bool((nanoseconds[known] < np.datetime64(_NO_DATE, "ns") + np.timedelta64(1, "D")).all())
+    goes_on = undated and log.last is not None
+    if goes_on:
+        nanoseconds, known = np.append(log.last, nanoseconds), np.append(True, known)
     start = nanoseconds[known][0]
     t = (nanoseconds - start).astype(np.int64).astype(np.float64) / 1e9
     t[~known] = np.nan
-    undated = bool((nanoseconds[known] < np.datetime64(_NO_DATE, "ns") + np.timedelta64(1, "D")).all())
     hour = int((nanoseconds[known] - nanoseconds[known].astype("datetime64[D]")).min() / np.timedelta64(1, "h"))
     steps = {
         -_DAY: "has no date: begins again with the next day",
@@ -195,35 +268,33 @@ def _from_stamps(values: NDArray[np.datetime64], name: str) -> _Seconds:
         steps = dict.fromkeys((-_HOUR, _HOUR), changed) if hour < _LATEST_CHANGE else {}
     notes = []
     for step, what in steps.items():
-        if (wrapped := _unwrapped(t, step)) is not None:
+        if (wrapped := _unwrapped(t, step, once=not undated)) is not None:
             t = wrapped
             notes.append(f"column {name} {what}")
-    return t, {} if undated else {"start": str(start)}, notes
+    return t[1:] + log.end if goes_on else t, {} if undated else {"start": str(start)}, notes
 
 
-def _unwrapped(t: Array, step: float) -> Array | None:
-    """Return times (n,) without a single jump by `step` [s], to a few usual intervals; None where there is no such."""
+def _unwrapped(t: Array, step: float, once: bool) -> Array | None:
+    """Return times (n,) without jumps by `step` [s], to a few usual intervals; None without, or if not just `once`."""
     steps = np.diff(t)
     forward = steps[np.isfinite(steps) & (steps > 0)]
     if not forward.size:
         return None
     usual = float(np.median(forward))
     jumps = np.flatnonzero(np.abs(steps - step - usual) <= _NEAR * usual)
-    if len(jumps) != 1 or usual * _NEAR >= 0.1 * abs(step):
+    if not jumps.size or (once and jumps.size > 1) or usual * _NEAR >= 0.1 * abs(step):
         return None
-    result = t.copy()
-    result[jumps[0] + 1 :] -= step
-    return result
+    return t - step * np.searchsorted(jumps + 1, np.arange(t.size), side="right")
 
 
-def _from_numbers(values: Array, unit: str | None, name: str) -> _Seconds:
+def _from_numbers(values: Array, unit: str | None, name: str, log: LogTime) -> _Seconds:
     """Read numbers in a unit, or without: seconds, a time since 1970 in the unit that their size tells, or days."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         raise InputError("time must have a number in some row, got none")
     first = float(finite[0])
     if unit is None:
-        return _without_unit(values, finite, name)
+        return _without_unit(values, finite, name, log)
     if since := _SINCE.fullmatch(unit.strip()):
         word = _LONG_UNITS.get(since["unit"].lower(), since["unit"].lower())
         seconds = to_si(values - first, word, "s", name="time")
@@ -239,18 +310,22 @@ def _from_numbers(values: Array, unit: str | None, name: str) -> _Seconds:
     return seconds, {}, []
 
 
-def _without_unit(values: Array, finite: Array, name: str) -> _Seconds:
-    first = float(finite[0])
-    if (days := _days_since(finite)) is not None:
-        origin, what = days
-        begin = {} if origin is None else {"start": str(origin + np.timedelta64(round(first * _DAY * 1e6), "us"))}
-        return (values - first) * _DAY, begin, [f"column {name} read as {what}"]
-    if np.all(np.diff(finite) == 1) and finite.size == values.size and abs(first) < _EARLIEST_EPOCH:
+def _without_unit(values: Array, finite: Array, name: str, log: LogTime) -> _Seconds:
+    first, begins = float(finite[0]), log.head is None
+    log.head = head = finite if log.head is None else log.head
+    if (days := _days_since(head)) is not None:
+        origin, note = days[0], f"column {name} read as {days[1]}"
+        if origin is None:  # it has no start, and goes on
+            return (values - (first if log.last is None else log.last)) * _DAY + log.end, {}, [note]
+        begin = {"start": str(origin + np.timedelta64(round(first * _DAY * 1e6), "us"))}
+        return (values - first) * _DAY, begin, [note]
+    counted = begins and finite.size == values.size and np.all(np.diff(finite) == 1)
+    if counted and abs(first) < _EARLIEST_EPOCH:
         raise InputError(
             f"time must be in seconds, got a count of rows {first:g}, {first + 1:g}, ... in column {name}: "
             f"give the rate, or the unit of its column (t={name} ms)"
         )
-    unit = next((unit for least, unit in _EPOCH if abs(first) >= least), None)
+    unit = next((unit for least, unit in _EPOCH if abs(head[0]) >= least), None)
     if unit is None:
         return values, {}, [f"column {name} has no unit: taken as s"]
     epoch, year = to_si(first, unit, "s"), 1970
@@ -277,43 +352,57 @@ def _days_since(values: Array) -> tuple[np.datetime64 | None, str] | None:
 
 
 def time_base(
-    values: NDArray[Any], unit: str | None, name: str, stated_rate: float | None = None
+    values: NDArray[Any], unit: str | None, name: str, stated_rate: float | None = None, log: LogTime | None = None
 ) -> tuple[Array, float, dict[str, Any], list[str]]:
     """Convert a time column's `values` (n,), numbers in `unit` or datetime64, to seconds and a rate.
 
     Returns the times (n,) [s], the rate [Hz], what is known of the moment 0, and lines for the history. Stamps and
     epoch times are based at their first sample; other times are left where they are. The `stated_rate` of a file [Hz]
-    places samples that share their stamps. Raises InputError.
+    places samples that share their stamps. The values may go on from those of `log`, which then has theirs, too. Raises
+    InputError.
     """
+    log = LogTime() if log is None else log
     if values.dtype.kind == "M":
-        t, start, notes = _from_stamps(values, name)
+        t, start, notes = _from_stamps(values, name, log)
     else:
-        t, start, notes = _from_numbers(np.asarray(values, dtype=np.float64), unit, name)
+        t, start, notes = _from_numbers(np.asarray(values, dtype=np.float64), unit, name, log)
+    known = np.flatnonzero(np.isfinite(t))
+    if known.size:
+        log.last, log.end = values[known[-1]], float(t[known[-1]])
     with np.errstate(invalid="ignore", over="ignore"):  # infinite times are findings, not warnings
         if stated_rate is not None and t.size > 1 and 2 * np.count_nonzero(np.diff(t)) < t.size - 1:
             notes.append(f"column {name}: samples share their stamps, taken at {stated_rate:g} Hz, as the file says")
             return t[0] + np.arange(t.size) / stated_rate, stated_rate, start, notes
-        resolved = _finer(t)
+        resolved = _finer(t, log)
         if resolved is not None:
-            resolution, t = resolved
-            notes.append(f"column {name} in steps of {resolution:g} s: samples in between taken as uniform")
-        return t, nominal_rate(t), start, notes
+            log.resolution, t = resolved
+            notes.append(f"column {name} in steps of {log.resolution:g} s: samples in between taken as uniform")
+        log.rate = nominal_rate(t) if log.rate is None else log.rate
+        return t, log.rate, start, notes
 
 
-def _finer(t: Array) -> tuple[float, Array] | None:
-    """Return the resolution [s] of times (n,) that samples share as their distances ask for, and uniform times."""
+def _finer(t: Array, log: LogTime) -> tuple[float, Array] | None:
+    """Return the resolution [s] of times (n,) that samples share as their distances ask for, and uniform times.
+
+    A part too short to tell, and without a gap, is taken as those before it.
+    """
     steps = np.diff(t)
-    if t.size < _FEWEST_SHARED or 2 * np.count_nonzero(steps) > steps.size:
-        return None
     changes = np.flatnonzero(steps)
-    if not np.isfinite(t).all() or (steps < 0).any() or changes.size < 3:
+    if not np.isfinite(t).all() or (steps < 0).any():
         return None
-    resolution = float(steps[changes].min())
-    counts = np.diff(changes) / np.round(steps[changes][1:] / resolution)
-    usual = float(np.diff(changes).sum() / np.round(steps[changes][1:] / resolution).sum())
-    if usual < 2.0 or np.abs(counts - usual).max() > 1.0:
+    if t.size >= _FEWEST_SHARED and changes.size >= 3:
+        if 2 * changes.size > steps.size:
+            return None
+        resolution = float(steps[changes].min())
+        many = np.round(steps[changes][1:] / resolution)
+        counts, usual = np.diff(changes) / many, float(np.diff(changes).sum() / many.sum())
+        if usual < 2.0 or np.abs(counts - usual).max() > 1.0:
+            return None
+        rate = _shortest(usual / resolution, 1.0 / float(np.diff(changes).sum()))
+    elif log.resolution is not None and log.rate is not None and steps.max(initial=0.0) < 1.5 * log.resolution:
+        resolution, rate = log.resolution, log.rate
+    else:
         return None
-    rate = _shortest(usual / resolution, 1.0 / float(np.diff(changes).sum()))
     # a stamp says when its first sample was taken, to a sample
-    begin = float(np.median(t[changes + 1] - (changes + 1) / rate))
+    begin = float(np.median(t[changes + 1] - (changes + 1) / rate)) if changes.size else float(t[0])
     return resolution, begin + np.arange(t.size) / rate

@@ -119,9 +119,11 @@ def assumed(trend: Trend) -> str:
         if trend.unit == "L/min":
             machine = f"L/min rest on {machine_text(trend.machine)}. "
     basis = "" if trend.basis is None else say(f"trend_basis.{trend.basis}")
-    known = "taken out" if any(point.temperature is not None for point in trend.points) else "not known"
+    known = [point.temperature is not None for point in trend.points if point.value is not None]
+    oil = "taken out" if all(known) and trend.basis != "ringing" else "not taken out"
+    oil = oil if any(known) else "not known"
     first = "The first recording is" if trend.healthy == 1 else f"The first {trend.healthy} recordings are"
-    return f"{basis}{machine}The oil's temperature is {known}. {first} taken to be of a healthy machine."
+    return f"{basis}{machine}The oil's temperature is {oil}. {first} taken to be of a healthy machine."
 
 
 def limit_note(trend: Trend) -> str:

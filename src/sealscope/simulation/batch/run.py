@@ -45,8 +45,6 @@ if TYPE_CHECKING:
 
 #: Slope [1/s] of an abrupt opening.
 ABRUPT = 1e15
-#: What the pressure sensors of a batch cannot have.
-_ABSENT = ("stuck_rate", "drop_rate", "lag", "hum_harmonics")
 
 
 @dataclass(frozen=True)

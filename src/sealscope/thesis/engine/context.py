@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import copyreg
 import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 
@@ -59,13 +56,6 @@ def simulated_run(experiment: Experiment, prove: bool) -> SimulatedRun:
     moved = {} if proof is None else {change.name: change.difference for change in proof.differences}
     resolved = None if proof is None else proof.resolved
     return SimulatedRun(simulated.recording, truth.t, truth.outputs, truth.mean_leak_lpm, resolved, moved)
-
-
-def _view(values: dict[str, Any]) -> MappingProxyType[str, Any]:
-    return MappingProxyType(values)
-
-
-copyreg.pickle(MappingProxyType, lambda view: (_view, (dict(view),)))  # a recording's channels
 
 
 @dataclass(frozen=True)

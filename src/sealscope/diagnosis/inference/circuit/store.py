@@ -18,9 +18,10 @@ import numpy as np
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.balance import whole_samples
 from sealscope.diagnosis.inference.onset import FEWEST, Information, StepTest, step_test
-from sealscope.diagnosis.inference.terms import ATMOSPHERE, Signals
+from sealscope.diagnosis.inference.terms import Signals
 from sealscope.recordings.cycle import cycle_of, fundamental
 from sealscope.recordings.recording import Array, Recording
+from sealscope.units import P_ATM
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -75,7 +76,7 @@ def lost_oil(signals: Signals, rig: Rig, cycle: float | None, begin: float) -> d
     if len(ends) <= FEWEST:
         return {}
     idle = np.where(signals.carried_by_A > 0.0, signals["p_B"], signals["p_A"])
-    compliance = rig.makeup.V_gas / (rig.makeup.n_gas * (rig.fluid.p_charge + ATMOSPHERE))
+    compliance = rig.makeup.V_gas / (rig.makeup.n_gas * (rig.fluid.p_charge + P_ATM))
     given = -compliance * idle
     if "x" in signals:
         given = given - (rig.cylinder.A_A - rig.cylinder.A_B) * signals["x"]

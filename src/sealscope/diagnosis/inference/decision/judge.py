@@ -170,7 +170,7 @@ def _with_figures(
         bound_lpm=bound * size.scale / LITRE_PER_MINUTE if stated else None,
         course=_leak_course(balance, evidence) if size.stated else None,
     )
-    return replace(evidence, reason=_reason(balance, evidence, bound, judging.name))
+    return replace(evidence, reason=_reason(balance, evidence, bound, questions, judging.name))
 
 
 def _findable(balance: RecordedBalance, questions: Sequence[Question]) -> float | None:
@@ -222,11 +222,13 @@ def _level_text(total: TotalLeakage | None) -> str:
     )
 
 
-def _reason(balance: RecordedBalance, evidence: Evidence, bound: float, question: str) -> str:
+def _reason(
+    balance: RecordedBalance, evidence: Evidence, bound: float, possible: Sequence[Question], question: str
+) -> str:
     """Return why, in one line."""
     share = f"{100.0 * bound / balance.mean_flow:.2g} % of the pump's flow" if balance.mean_flow > 0.0 else "any size"
     limit = f"{evidence.bound_lpm:.2g} L/min" if evidence.bound_lpm is not None else share
-    text = bound_text(evidence.verdict, limit)
+    text = bound_text(evidence.verdict, limit, possible)
     if evidence.verdict == "leak":
         text = {
             WITHIN: "leakage steps up within the recording, beyond the drift of this machine",

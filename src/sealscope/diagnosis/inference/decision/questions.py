@@ -55,8 +55,9 @@ def bounds_enough(bound: float, flow: float) -> bool:
     return flow > 0.0 and bound <= beliefs("inference")["worth"]["share"] * flow
 
 
-def bound_text(verdict: Verdict, limit: str) -> str:
-    """Return in words what a 95 % bound says."""
+def bound_text(verdict: Verdict, limit: str, possible: Sequence[Question]) -> str:
+    """Return in words what a 95 % bound says; against a baseline it is that of the mean over the recording."""
+    limit += " on average" if any(own.name == AGAINST for own in possible) else ""
     return f"no leak above {limit} (95 %)" if verdict == "no leak" else f"a leak of up to {limit} would not show (95 %)"
 
 

@@ -93,15 +93,29 @@ def hypotheses(
             if name in (LEAK, ORIFICE, PUMP):
                 beside -= cost
             elif name == SCALE:
-                beside -= _unlikely(best)
+                beside -= _unlikely("scale", best.fitted[0])
+            elif cause == "external leak":
+                beside -= _unlikely("outside", best.fitted[0] * _mean_increment(recorded, columns[0], name), above=True)
             stepped.append(StepHypothesis(name, cause, best, beside))
     return tuple(sorted(stepped, key=lambda own: -own.score))
 
 
-def _unlikely(scale: StepTest) -> float:
-    """Return minus twice the logarithm of what is believed of a step of the scale, over that of the likeliest one."""
-    size, spread = (beliefs("inference")["scale"][name] for name in ("size", "spread"))
-    return float(np.log(max(abs(scale.fitted[0]), np.finfo(float).tiny) / size) / spread) ** 2
+def _unlikely(table: str, step: float, above: bool = False) -> float:
+    """Return minus twice the logarithm of what is believed of a step's size, over that of the likeliest one.
+
+    `above`: smaller ones are as likely.
+    """
+    size, spread = (beliefs("inference")[table][name] for name in ("size", "spread"))
+    away = float(np.log(max(abs(step), np.finfo(float).tiny) / size)) / spread
+    return float(max(away, 0.0) ** 2 if above else away**2)
+
+
+def _mean_increment(blocks: Blocks, columns: Columns, name: str) -> float:
+    """Return the root mean square of a term's increments over the rows, beside that of time: a mean pressure [Pa]."""
+    if columns.bias is None:
+        return float(np.mean(blocks.driving()))
+    energy = np.einsum("keii->i", blocks.gram)
+    return float(np.sqrt(energy[columns.names.index(name)] / energy[columns.bias]))
 
 
 def _agree(test: StepTest, stored: StepTest) -> float:

@@ -137,7 +137,7 @@ def _with_figures(
     limit = f"{lpm:.2g} L/min" if own.stated else f"{100.0 * flow / own.pump:.2g} % of the pump's flow"
     begins = "steps up within the recording, beyond the drift of this machine"
     above = "is above that of the healthy recordings by more than they scatter"
-    reason = bound_text(evidence.verdict, limit)
+    reason = bound_text(evidence.verdict, limit, possible)
     if evidence.verdict == "leak":
         reason = f"the conductance past piston or pump {begins if judging.name == WITHIN else above}"
     elif evidence.verdict == "cannot tell":

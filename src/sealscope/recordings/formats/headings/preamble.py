@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from sealscope.errors import InputError
+from sealscope.errors import InputError, printable
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.words import WORDS
 from sealscope.units import parse_unit, to_si
@@ -93,8 +93,7 @@ def of_lines(lines: Sequence[str], delimiter: str) -> dict[str, str]:
 
 
 def _line(text: str, longest: int) -> str:
-    printable = "".join(sign if sign.isprintable() else " " for sign in text[: 4 * longest])
-    return " ".join(printable.split()).strip("\"'")[:longest]
+    return " ".join(printable(text[: 4 * longest], instead=" ").split()).strip("\"'")[:longest]
 
 
 def stated_oil_temperature(provenance: Mapping[str, object]) -> float | None:

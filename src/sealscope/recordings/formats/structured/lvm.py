@@ -18,7 +18,7 @@ from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.preamble import entries
 from sealscope.recordings.formats.table import Clock, RecordingFields, Series, check_size, table_of
 from sealscope.recordings.formats.text_layout import SNIFF, encoding_of
-from sealscope.recordings.formats.timebase import stamps
+from sealscope.recordings.formats.timebase import day_before_month, either_dates, stamps
 
 #: What ends each header of the format.
 _END = "***End_of_Header***"
@@ -43,12 +43,12 @@ class _Packet:
         except ValueError:
             return np.nan
 
-    def moment(self, index: int) -> np.datetime64 | None:
+    def moment(self, index: int, day_first: bool) -> np.datetime64 | None:
         """Return when a channel's first sample was taken; None where the header does not say."""
         day, time = self.entry("date", index), self.entry("time", index).replace(",", ".")
         seconds, _, fraction = time.partition(".")
         try:
-            return stamps([f"{day} {seconds}.{fraction[:9] or '0'}"])[0] if day else None
+            return stamps([f"{day} {seconds}.{fraction[:9] or '0'}"], day_first)[0] if day else None
         except ValueError:
             return None
 
@@ -123,7 +123,8 @@ def _series(packets: Sequence[_Packet], x_columns: str) -> list[Series]:
         raise InputError(f"a LabVIEW measurement file must have a column X_Value, got {', '.join(names)}")
     same = [packet for packet in packets if packet.names == names]
     check_size(sum(len(packet.rows) for packet in same), len(names))
-    begins = _begins(same)
+    day_first = day_before_month([either_dates(day for packet in same for day in packet.head.get("date", []))])
+    begins = _begins(same, day_first)
     multiple, series = x_columns == "multi", []
     for index, column in enumerate(column for column in range(len(names)) if column not in times):
         time = max((before for before in times if before < column), default=times[0]) if multiple else times[0]
@@ -142,14 +143,15 @@ def _series(packets: Sequence[_Packet], x_columns: str) -> list[Series]:
             seconds.append(begin + own_times)
         joined, t = np.concatenate(values), np.concatenate(seconds)
         label = Label.parse(names[column], first.entry("y_unit_label", index) or None)
-        clock = Clock(time, partial(lambda *given: given, t, first.moment(index)))
+        clock = Clock(time, partial(lambda *given: given, t, first.moment(index, day_first)))
         series.append(Series("", label, t.size, partial(np.asarray, joined), clock))
     return series
 
 
-def _begins(packets: Sequence[_Packet]) -> list[float]:
+def _begins(packets: Sequence[_Packet], day_first: bool) -> list[float]:
     """Return what is added to the times of each packet [s], where its own do not go on and the moments are known."""
-    moments, firsts = [packet.moment(0) for packet in packets], [packet.number("x0", 0) for packet in packets]
+    moments = [packet.moment(0, day_first) for packet in packets]
+    firsts = [packet.number("x0", 0) for packet in packets]
     known = [moment for moment in moments if moment is not None]
     if len(known) < len(packets) or all(after > before for before, after in pairwise(firsts)):
         return [0.0] * len(packets)

@@ -199,3 +199,9 @@ def number_of(value: Any) -> float | None:
     """Return the only number that a value holds; None where it holds none or several."""
     flat = np.asarray(value).reshape(-1) if value is not None else np.empty(0)
     return float(flat[0]) if flat.size == 1 and flat.dtype.kind in "fiu" and np.isfinite(flat[0]) else None
+
+
+def entry_of(value: Any) -> str:
+    """Return the only text or number that a value holds as an entry about a recording; empty where it holds neither."""
+    number = number_of(value)
+    return _text(value) if number is None else f"{number:.12g}"

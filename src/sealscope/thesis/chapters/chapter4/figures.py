@@ -31,7 +31,7 @@ from sealscope.thesis.engine.context import Context, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, Figure, FigureCurve, Number, Panel, Role, ThesisTable
 from sealscope.thesis.engine.texts import note, texts_of
-from sealscope.units import LITRE_PER_MINUTE
+from sealscope.units import LITRE_PER_MINUTE, P_ATM
 
 #: Unit and factor from SI of what the figures show.
 OUTPUTS: dict[str, tuple[str, float]] = {
@@ -41,7 +41,7 @@ OUTPUTS: dict[str, tuple[str, float]] = {
     **dict.fromkeys(PRESSURES, ("MPa", 1e-6)),
     **dict.fromkeys(("Q_A", "Q_B"), ("L/min", 1.0 / LITRE_PER_MINUTE)),
 }
-_VACUUM = -0.101325
+_VACUUM = -1e-6 * P_ATM
 #: Two curves nearer than this share of their range (rms) lie on each other: one is drawn as so many marks.
 _ALIKE, _MARKS = 0.005, 80
 _CLOSING_ROLES: dict[float, Role] = {25.0: "25 %", 50.0: "50 %", 75.0: "75 %"}
