@@ -11,9 +11,10 @@ from scipy.stats import t as student
 
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.rms_change.blocks import DUTY, QUANTITIES, RmsBlocks
+from sealscope.diagnosis.rms_change.blocks import DUTY, RmsBlocks
 from sealscope.diagnosis.rms_change.detector import RmsChange, within
 from sealscope.diagnosis.rms_change.ringing import beyond_noise, rises
+from sealscope.signals.details import QUANTITIES
 from sealscope.simulation.bench.machines import draw
 from sealscope.simulation.commands import parse_command
 from sealscope.simulation.courses import parse_force

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from html.parser import HTMLParser
+
+from sealscope.reporting.picture import Picture
 
 VOID = {"meta", "link", "br", "img", "hr", "input"}
 
@@ -53,3 +56,15 @@ class Reader(HTMLParser):
             self.values[self.current] += data
         if self.open[-1:] == ["caption"] and data.strip():
             self.tables[-1] = True
+
+
+def places(picture: Picture, style: str) -> list[tuple[float, float]]:
+    """Where the shapes of a style stand in a picture, in values of its axes: each `M` and the end of each upright."""
+    (start, stop), (low, high) = picture.x_ends, picture.y_ends
+    found = []
+    for shape in picture.shapes:
+        if shape.style == style:
+            for x, y, end in re.findall(r"[ML](-?[\d.]+) (-?[\d.]+)(?:V(-?[\d.]+))?", shape.path):
+                day = start + float(x) / picture.width * (stop - start)
+                found += [(day, high - float(at) / picture.height * (high - low)) for at in (y, end) if at]
+    return found

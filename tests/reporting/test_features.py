@@ -22,8 +22,8 @@ def test_details_and_windows_of_a_whole_recording_are_those_of_the_signals_room(
     result, note = chamber_details(recording, "p_A")
     assert note == ""
     whole = details(recording["p_A"])
-    inside = whole.inside(3, 4)
-    assert np.array_equal(result.values["d3d4"][inside], whole.product(3, 4)[inside])
+    inside = whole.inside()
+    assert np.array_equal(result.values["d3d4"][inside], whole.product()[inside])
     assert np.isnan(result.values["d4"][0]) and np.isnan(result.values["d4"][-1])
     windows = windowed_rms(whole)
     assert np.array_equal(result.window_rms["d3"], windows.rms[2])

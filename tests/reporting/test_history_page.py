@@ -10,7 +10,9 @@ import pytest
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
 from sealscope.reporting.printing import BROWSERS
-from sealscope.reporting.trend.history import Judged, history_chart, render_history_page, write_history_page
+from sealscope.reporting.trend.history import Judged, history_pictures, render_history_page, write_history_page
+
+from .pages import places
 
 DAY = 86400.0
 HOSTILE = "<!--<script><img src=x onerror=alert(2)>.csv"
@@ -59,26 +61,29 @@ def test_a_hostile_name_is_text(history):
 
 
 def test_figures_stand_at_their_levels_and_days(history):
-    chart = history_chart(history)
-    (bound,), (early, late), (absent,) = chart["bounds"], chart["points"], chart["absent"]
-    assert (bound["level"], early["level"], late["level"], chart["limit"]) == pytest.approx((2e-3, 4.21e-3, 8e-3, 6e-3))
-    assert (late["low"], late["high"]) == pytest.approx((7e-3, 9e-3))
-    assert [day - bound["day"] for day in (absent, early["day"], late["day"])] == pytest.approx([1.0, 2.0, 3.0])
+    picture = history_pictures(history)["wide"]
+    (bound,), (early, late), (absent,), (limit,) = (
+        places(picture, style) for style in ("bound", "point", "absent", "limit")
+    )
+    assert [bound[1], early[1], late[1], limit[1]] == pytest.approx([2e-3, 4.21e-3, 8e-3, 6e-3], abs=3e-6)
+    whiskers = [level for _, level in places(picture, "whisker")]
+    assert whiskers == pytest.approx([3.1e-3, 5.7e-3, 7e-3, 9e-3], abs=3e-6)
+    assert [day - bound[0] for day, _ in (absent, early, late)] == pytest.approx([1.0, 2.0, 3.0], abs=1e-3)
 
 
 def test_without_dates_recordings_stand_in_order(history):
     undated = [own._replace(start_s=None) for own in history]
-    ticks = history_chart(undated)["pictures"][0]["x_ticks"]
-    assert [label for _, label in ticks if label] == ["1", "2", "3", "4"]
+    days = [label.text for label in history_pictures(undated)["wide"].labels if label.x >= 0.0]
+    assert [text for text in days if text] == ["1", "2", "3", "4"]
     assert "4 of 4 recordings state no date" in render_history_page(undated, "press 4")
 
 
 def test_a_single_huge_bound_presses_no_other_flat(history, make_diagnosis):
     wide = make_diagnosis(verdict="cannot tell", bound_lpm=40.0, leak_lpm=None, leak_interval_lpm=None)
-    chart = history_chart([*history, Judged(wide, 1.7e9 + 9 * DAY, history[0].read)])
-    assert len(chart["beyond"]) == 1
-    point, scale = chart["points"][0], chart["pictures"][0]["scale"]
-    assert scale.y(point["low"]) - scale.y(point["high"]) > 20.0
+    picture = history_pictures([*history, Judged(wide, 1.7e9 + 9 * DAY, history[0].read)])["wide"]
+    assert len(places(picture, "beyond")) == 1
+    low, high, *_ = (float(picture.y(level)) for _, level in places(picture, "whisker"))
+    assert low - high > 20.0
 
 
 def test_wrong_calls_are_refused(history, tmp_path):

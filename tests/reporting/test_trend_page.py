@@ -12,11 +12,11 @@ from sealscope.diagnosis.trend.reading import LeakReading
 from sealscope.diagnosis.trend.trend import Trend
 from sealscope.diagnosis.trend.trend import trend as trend_of
 from sealscope.errors import InputError
-from sealscope.reporting.trend.page import chart_of, render_trend_page, write_trend_page
+from sealscope.reporting.trend.page import render_trend_page, trend_pictures, write_trend_page
 from sealscope.reporting.trend.text import trend_text
 
 from ..diagnosis.test_trend import life
-from .pages import Reader
+from .pages import Reader, places
 
 
 def test_the_page_is_whole_and_shows_what_happened(trend: Trend) -> None:
@@ -37,7 +37,7 @@ def test_the_page_is_whole_and_shows_what_happened(trend: Trend) -> None:
     assert "alarm" in key and "fell back" in key and "not before" in page  # nothing grows since the repair
     wide = page[page.index('class="trend wide"') : page.index('class="trend narrow"')]
     assert wide.count('class="point other"') == 3 and wide.count('class="absent"') == 1
-    assert wide.count("<circle") == 39 and wide.count('class="course"') == len(trend.episodes) == 2
+    assert wide.count('class="point') == 39 and wide.count('class="course"') == len(trend.episodes) == 2
 
 
 def test_the_oil_is_taken_out_where_every_recording_states_it() -> None:
@@ -52,15 +52,15 @@ def test_the_oil_is_taken_out_where_every_recording_states_it() -> None:
 
 
 def test_the_chart_stands_within_its_frame(trend: Trend) -> None:
-    chart = chart_of(trend)
-    assert chart is not None and [picture["size"] for picture in chart["pictures"]] == ["wide", "narrow"]
-    for scale in (picture["scale"] for picture in chart["pictures"]):
-        for point in chart["points"]:
-            assert 0.0 <= scale.x(point["day"]) <= scale.width
-            assert 0.0 <= scale.y(point["high"]) <= scale.y(point["level"]) <= scale.y(point["low"]) <= scale.height
-        for days, levels in chart["course"]:
-            for at, end in ((scale.x(days), scale.width), (scale.y(levels), scale.height)):
-                assert np.all((at >= 0.0) & (at <= end))
+    pictures = trend_pictures(trend)
+    assert pictures is not None and list(pictures) == ["wide", "narrow"]
+    for picture in pictures.values():
+        for style in ("point", "point other", "point apart", "whisker", "course"):
+            days, levels = np.transpose(places(picture, style))
+            assert np.all((days >= trend.points[0].day - 0.1) & (days <= trend.points[-1].day + 0.1))
+            assert np.all((levels >= picture.y_ends[0]) & (levels <= picture.y_ends[1]))
+        lows, highs = (np.array(places(picture, "whisker"))[k::2, 1] for k in (0, 1))
+        assert lows.size == 39 and np.all(lows < highs)
 
 
 def test_without_a_level_there_is_a_page_without_a_chart(tmp_path: Path) -> None:
@@ -87,7 +87,7 @@ def test_another_kind_of_file_is_refused(trend: Trend, tmp_path: Path) -> None:
 
 def test_a_session_has_ticks_of_minutes(trend: Trend) -> None:
     points = tuple(replace(own, day=own.day / 1440.0) for own in trend.points)
-    chart = chart_of(replace(trend, points=points))
-    assert chart is not None
-    ticks = chart["pictures"][0]["x_ticks"]
-    assert len(ticks) >= 3 and all(":" in label for _, label in ticks)
+    pictures = trend_pictures(replace(trend, points=points))
+    assert pictures is not None
+    times = [label.text for label in pictures["wide"].labels if ":" in label.text]
+    assert len(times) >= 3

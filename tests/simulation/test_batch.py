@@ -14,7 +14,8 @@ from sealscope.compiled import kernel
 from sealscope.errors import InputError, MissingExtra, SimulationFailed
 from sealscope.parameters import load_rig
 from sealscope.physics.lanes import WIDTH, load, store
-from sealscope.simulation.batch.batch import DETAILS, simulate_batch
+from sealscope.signals.details import QUANTITIES
+from sealscope.simulation.batch.batch import simulate_batch
 from sealscope.simulation.batch.noise import half_turn_sine, keys, logarithm, normals
 from sealscope.simulation.bench.machines import draw
 from sealscope.simulation.experiment import Experiment
@@ -268,7 +269,7 @@ def test_the_changes_are_those_of_the_thesis_s_statistic(check_rig, rms_of):
     one = Experiment.of(rig=check_rig(**QUIET), leak="G = 3e-12 from 10 s", duration=20.0, step=5e-4)
     batch = simulate_batch([one])
     expected = rms_of(simulate_with_truth(one).recording, [0.0, 10.0, 20.0])
-    changes = np.array([[batch.changes(channel, detail)[0] for detail in DETAILS] for channel in NAMES])
+    changes = np.array([[batch.changes(channel, detail)[0] for detail in QUANTITIES] for channel in NAMES])
     np.testing.assert_allclose(changes, 100.0 * (expected[:, 1] / expected[:, 0] - 1.0), atol=1e-3)
     assert batch.changes("p_A", "d3")[0] < -5.0
 

@@ -106,15 +106,10 @@ def test_no_leak_and_a_leak_of_nothing_have_no_onset():
             "0.01 L/min orifice growing from 60 s to 120 s",
             Leak("orifice", mean=0.01 * LITRE_PER_MINUTE, opening=growing(60.0, 120.0)),
         ),
-<<<<<<< HEAD
-        ("G = 6.1e-13 from 90 s", Leak("laminar", coefficient=6.1e-13, opening=From(90.0))),
-        ("C=2e-10", Leak("orifice", coefficient=2e-10, opening=From(0.0))),
-        ("g = 6.1e-13 Laminar From 90 S", Leak("laminar", coefficient=6.1e-13, opening=From(90.0))),
-        ("4.2 mL/min Orifice", Leak("orifice", mean=4.2e-3 * LITRE_PER_MINUTE, opening=From(0.0))),
-=======
         ("G = 6.1e-13 from 90 s", Leak("laminar", coefficient=6.1e-13, opening=from_time(90.0))),
         ("C=2e-10", Leak("orifice", coefficient=2e-10, opening=from_time(0.0))),
->>>>>>> hsim
+        ("g = 6.1e-13 Laminar From 90 S", Leak("laminar", coefficient=6.1e-13, opening=from_time(90.0))),
+        ("4.2 mL/min Orifice", Leak("orifice", mean=4.2e-3 * LITRE_PER_MINUTE, opening=from_time(0.0))),
     ],
 )
 def test_leaks_are_read_from_words(text, leak):

@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 
 from sealscope.recordings.chambers import CHAMBERS
+from sealscope.signals.details import QUANTITIES
 from sealscope.simulation.experiment import Experiment
 from sealscope.thesis.chapters.appendix_c_runs import COLUMNS, row_of
 from sealscope.thesis.engine.context import SimulatedRun, simulated_run
 from sealscope.thesis.engine.items import Item, collect
 from sealscope.thesis.engine.products import Claim, Figure, Product, ThesisTable
-from sealscope.thesis.sheet import APPENDIX_C, FILES, QUANTITIES, Condition, DataSheet, read_sheet
+from sealscope.thesis.sheet import APPENDIX_C, FILES, Condition, DataSheet, read_sheet
 
 #: The folder of the measured sheet beside this checkout.
 FOLDER = Path(__file__).resolve().parents[3] / "shared" / "data"

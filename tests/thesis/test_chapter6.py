@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
@@ -11,13 +9,6 @@ from sealscope.thesis.chapters import chapter6
 from sealscope.thesis.engine.products import Figure, ThesisTable
 
 from .conftest import ITEMS, Kept
-
-
-def test_an_amplitude_is_found_beside_a_drift():
-    t = np.arange(4000) / 500.0
-    values = 3.0 * np.sin(2 * math.pi * 0.5 * t + 0.4) + 7.0 - 2.0 * t
-    result = chapter6.amplitude_at(t, values, 0.5)
-    assert abs(result) == pytest.approx(3.0, rel=1e-9)
 
 
 def test_a_leak_has_its_size_under_the_load():

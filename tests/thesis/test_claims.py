@@ -8,13 +8,14 @@ from dataclasses import replace
 import pytest
 
 from sealscope.recordings.chambers import CHAMBERS
+from sealscope.signals.details import QUANTITIES
 from sealscope.thesis.chapters.chapter5 import TESTS, ShownMeasures
 from sealscope.thesis.claims import detection as claims
 from sealscope.thesis.claims import rig as claims_rig
 from sealscope.thesis.claims import sheet as claims_sheet
 from sealscope.thesis.claims.evidence import NO_SHEET, ClaimEvidence, correlated
 from sealscope.thesis.engine.products import Claim, Product
-from sealscope.thesis.sheet import QUANTITIES, DataSheet
+from sealscope.thesis.sheet import DataSheet
 
 from .conftest import ITEMS, Kept, made_sheet, needs_sheet, table_with
 

@@ -7,7 +7,7 @@ import pytest
 
 from sealscope.parameters import load_rig
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.signals.details import details
+from sealscope.signals.details import QUANTITIES, details
 from sealscope.thesis.identification import (
     Hypothesis,
     fit_table,
@@ -20,7 +20,6 @@ from sealscope.thesis.identification import (
 from sealscope.thesis.sheet import (
     APPENDIX_C,
     BENCH_RIG,
-    QUANTITIES,
     Condition,
     DataSheet,
     experiment_values,

@@ -15,12 +15,12 @@ from functools import partial, wraps
 from inspect import Parameter
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from textwrap import fill
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from typer import Argument, Context, Option, echo
 
 from sealscope.errors import InputError, SealscopeError, UnreadableFile, printable
+from sealscope.paragraphs import paragraph
 from sealscope.simulation.arguments import Arguments
 
 if TYPE_CHECKING:
@@ -340,8 +340,7 @@ def say(text: str) -> None:
 
 def say_wrapped(text: str, head: str = "") -> None:
     """Print a paragraph on standard output, beside `head`; its lines are as wide as words allow, 80 columns."""
-    indent = " " * (len(head) or 2)
-    say(fill(text, 80, initial_indent=head, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False))
+    say(paragraph(text, head, len(head) or 2))
 
 
 def complain(message: object) -> None:

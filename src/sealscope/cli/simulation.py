@@ -7,13 +7,13 @@ import json
 import sys
 from pathlib import Path
 from shutil import get_terminal_size
-from textwrap import fill, wrap
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from typer import Context, Option, echo
 
 from sealscope.cli import options as opt
 from sealscope.errors import InputError
+from sealscope.paragraphs import paragraph
 
 if TYPE_CHECKING:
     from sealscope.simulation.experiment import Experiment
@@ -90,14 +90,14 @@ def parameters(
     else:
         width = min(get_terminal_size((80, 24)).columns, 120)
         wide = max(len(row["name"]) for row in rows) + 2
-        lines = [*wrap(f"{loaded.name}: {loaded.title}", width), ""]
+        lines = [paragraph(f"{loaded.name}: {loaded.title}", width=width), ""]
         for row in rows:
             value = f"{row['value']:.6g}" if isinstance(row["value"], float) else str(row["value"])
             line = f"{row['name']:<{wide}}{value} {row['unit'] if row['unit'] != '1' else ''}".rstrip()
             whole = f"{line}  {row['meaning']}"
             texts = [row["source"]] if len(whole) <= width else [row["meaning"], row["source"]]
             lines.append(whole if len(whole) <= width else line)
-            lines += [fill(text, width, initial_indent="    ", subsequent_indent="    ") for text in texts if text]
+            lines += [paragraph(text, "    ", width=width) for text in texts if text]
         opt.say("\n".join(lines))
 
 

@@ -12,11 +12,13 @@ import numpy as np
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.errors import InputError
 from sealscope.recordings.recording import COUNTS, Array, Recording
-from sealscope.reporting.features import NAMES, PRODUCT, ChamberDetails
-from sealscope.reporting.picture import Scale
+from sealscope.reporting.features import ChamberDetails
+from sealscope.reporting.picture import Picture, ticks
 from sealscope.reporting.series import DrawnTimes, coded, coded_times, ordered_time, time_base
+from sealscope.signals.details import QUANTITIES
 from sealscope.units import to_si
 
+PRODUCT = QUANTITIES[-1]
 SAMPLES = "samples"
 #: points of a series drawn by the script, and in the still picture
 POINTS, STILL_POINTS = 16_000, 800
@@ -141,7 +143,10 @@ _CHANNELS = (
 def rms_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
     """Return the charts of the windowed RMS: d1..d4 of each chamber, then d3d4 of each."""
     charts = []
-    for names, of, key, height in ((NAMES[:-1], "the details", "", 230), ((PRODUCT,), label_of(PRODUCT), "-d3d4", 150)):
+    for names, of, key, height in (
+        (QUANTITIES[:-1], "the details", "", 230),
+        ((PRODUCT,), label_of(PRODUCT), "-d3d4", 150),
+    ):
         for chamber in chambers:
             if not chamber.window_t.size:
                 continue
@@ -193,7 +198,7 @@ def _limits(values: Array, low: Array, high: Array) -> tuple[float, float]:
 def detail_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
     """Return the charts of the details themselves, one each, the chambers side by side."""
     charts = []
-    for d in NAMES:
+    for d in QUANTITIES:
         for chamber in chambers:
             unit, size = detail_unit(chamber.unit, d, pressure_unit)
             style = "b" if chamber.channel == "p_B" else "a"
@@ -203,17 +208,19 @@ def detail_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Ch
     return charts
 
 
+#: What stands on every chart: its style, when it begins and when it ends [s], None for an instant.
+Moment = tuple[str, float, float | None]
+
+
 class DrawnCharts(NamedTuple):
     """All charts as a page shows them.
 
-    `data`: for the script (plain JSON values); `still`: by chart key, for the template; `events`: what is marked on
-    each; `base`: times at which the channels are drawn; `span`: their ends [s]; `fine`: ends of the stretch whose
-    samples are drawn one by one [s].
+    `data`: for the script (plain JSON values); `still`: by chart key, for the template; `base`: times at which the
+    channels are drawn; `span`: their ends [s]; `fine`: ends of the stretch whose samples are drawn one by one [s].
     """
 
     data: dict[str, Any]
-    still: dict[str, dict[str, Any]]
-    events: list[dict[str, Any]]
+    still: dict[str, Picture]
     base: DrawnTimes
     span: tuple[float, float]
     fine: tuple[float, float]
@@ -240,6 +247,9 @@ def draw(
         axes[COURSE] = diagnosis.course.t
     onset, interval = _onset_within(diagnosis, span)
     low, high = interval or (None, None)
+    moments: list[Moment] = [] if interval is None else [("band", *interval)]
+    moments += [] if onset is None else [("mark", onset, None)]
+    moments += [(f"mark {'known' if mark.known else 'other'}", mark.t, None) for mark in marks]
     coded_charts, still = [], {}
     for chart in charts:
         lines = [_drawable(line.values) for line in chart.lines]
@@ -250,7 +260,7 @@ def draw(
         series = [{"label": line.label, "style": line.style, **coded(values)} for line, values in named]
         shown = {name: getattr(chart, name) for name in ("key", "title", "unit", "height", "band", "limits", "level")}
         coded_charts.append({**shown, "axis": chart.base, "series": series})
-        still[chart.key] = still_chart(chart, t, points, span)
+        still[chart.key] = still_chart(chart, t, points, span, moments)
     data = {
         "span": span,
         "axes": {name: coded_times(t) for name, t in axes.items() if any(chart.base == name for chart in charts)},
@@ -258,11 +268,8 @@ def draw(
         "marks": [{"t": mark.t, "label": mark.label, "known": mark.known} for mark in marks],
         "charts": coded_charts,
     }
-    events = [{"t": low, "width": high - low, "kind": ""}] if low is not None and high is not None else []
-    events += [] if onset is None else [{"t": onset, "width": None, "kind": ""}]
-    events += [{"t": mark.t, "width": None, "kind": "known" if mark.known else "other"} for mark in marks]
     t = ordered_time(recording.t, recording.rate)[0]
-    return DrawnCharts(data, still, events, base, span, (float(t[base.fine.start]), float(t[base.fine.stop - 1])))
+    return DrawnCharts(data, still, base, span, (float(t[base.fine.start]), float(t[base.fine.stop - 1])))
 
 
 def _drawable(values: Array) -> Array:
@@ -281,8 +288,10 @@ def _onset_within(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[floa
     return float(onset), (low, high)
 
 
-def still_chart(chart: Chart, t: Array, lines: list[Array], span: tuple[float, float]) -> dict[str, Any]:
-    """Return scale, paths and ticks of the still picture, in a box 860 wide and `chart.height` high."""
+def still_chart(
+    chart: Chart, t: Array, lines: list[Array], span: tuple[float, float], moments: Sequence[Moment] = ()
+) -> Picture:
+    """Return the still picture of a chart, in a frame 860 wide and `chart.height` high."""
     lines = [_drawable(line) for line in lines]
     stacked = np.concatenate(lines)
     finite = stacked[np.isfinite(stacked)]
@@ -294,12 +303,20 @@ def still_chart(chart: Chart, t: Array, lines: list[Array], span: tuple[float, f
     margin = 0.04 * (high - low)
     low, high = chart.limits or (low - margin, high + margin)
     lines = [np.clip(line, low, high) for line in lines]
-    scale = Scale(860.0, float(chart.height), (span[0], span[1] if span[1] > span[0] else span[0] + 1), (low, high))
-    drawn = zip(chart.lines[: 1 if chart.band else None], lines, strict=False)
-    return {
-        "scale": scale,
-        "paths": [{"label": own.label, "style": own.style, "d": scale.path(t, line, 0)} for own, line in drawn],
-        "band": scale.band(t, *lines[1:3]) if chart.band else "",
-        "level": None if chart.level is None or chart.level > high else float(scale.y(chart.level)),
-        **scale.ticks(8, 4),
-    }
+    ends = (span[0], span[1] if span[1] > span[0] else span[0] + 1)
+    picture = Picture(860.0, float(chart.height), ends, (low, high), margins=(0.0, 0.0, 0.0, 20.0))
+    picture.frame(4)
+    for value in ticks(*ends, 8):
+        picture.below(value, f"{value:g} s")
+    for style, begin, end in moments:
+        if end is None:
+            picture.mark(style, begin)
+        else:
+            picture.box(style, begin, end)
+    if chart.band:
+        picture.area("interval", t, *lines[1:3])
+    if chart.level is not None and chart.level <= high:
+        picture.level("level", chart.level)
+    for own, line in zip(chart.lines[: 1 if chart.band else None], lines, strict=False):
+        picture.line(f"line {own.style}", t, line, own.label, digits=0)
+    return picture

@@ -11,13 +11,9 @@ from sealscope.errors import InputError
 from sealscope.recordings.quality import uniform_segments
 from sealscope.recordings.recording import Array, Recording
 from sealscope.reporting.series import ordered_time
-from sealscope.signals.details import details, shortest
-from sealscope.signals.windows import rms, windowed_rms
+from sealscope.signals.details import QUANTITIES, details, shortest
+from sealscope.signals.windows import WINDOW_SIZE, WINDOW_STEP, rms, windowed_rms
 
-LEVELS = 4
-PRODUCT = "d3d4"
-NAMES = (*(f"d{level}" for level in range(1, LEVELS + 1)), PRODUCT)
-WINDOW, STEP = 1000, 500
 HALF_WINDOWS = 10
 
 
@@ -61,7 +57,7 @@ def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails 
         return None, f"{channel} is not in this recording."
     n, series = len(recording), recording[channel]
     t = ordered_time(recording.t, recording.rate)[0]
-    needed = shortest(levels=LEVELS)
+    needed = shortest()
     parts = uniform_segments(recording, [channel])
     usable = [part for part in parts if part.stop - part.start >= needed]
     if not usable:
@@ -70,34 +66,33 @@ def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails 
             None,
             f"No details of {channel}: they need {needed} samples without a fault, the most there are is {longest}.",
         )
-    values = {name: np.full(n, np.nan) for name in NAMES}
+    values = {name: np.full(n, np.nan) for name in QUANTITIES}
     windows: list[tuple[Array, Array]] = []  # centres (w,), RMS (details, w) of each stretch
     for part in usable:
         try:
-            transformed = details(series[part], levels=LEVELS)
-            product, inside = transformed.product(3, 4), transformed.inside()
-            ends, levels = windowed_rms(transformed, WINDOW, STEP)
-            products = windowed_rms(product[inside], WINDOW, STEP).rms
+            transformed = details(series[part])
+            rows, inside = transformed.quantities(), transformed.inside()
+            ends, levels = windowed_rms(rows[:, inside], first=inside.start)
         except InputError as error:  # such as pressures of 1e300, whose squares overflow
             return None, f"No details of {channel}: {error}."
-        placed = [(name, transformed[level], transformed.inside(level)) for level, name in enumerate(NAMES[:LEVELS], 1)]
-        for name, own, where in (*placed, (PRODUCT, product, transformed.inside(3, 4))):
-            values[name][part.start + where.start : part.start + where.stop] = own[where]
+        for name, own, level in zip(QUANTITIES, rows, (1, 2, 3, 4, 4), strict=True):
+            where = transformed.inside(level)
+            values[name][part][where] = own[where]
         if ends.size:
-            centres = t[part.start] + (ends - WINDOW / 2) / recording.rate
+            centres = t[part.start] + (ends - WINDOW_SIZE / 2) / recording.rate
             if windows:  # a point without a value parts two stretches
-                windows.append((centres[:1], np.full((len(NAMES), 1), np.nan)))
-            windows.append((centres, np.vstack([*levels, products])))
+                windows.append((centres[:1], np.full((len(QUANTITIES), 1), np.nan)))
+            windows.append((centres, levels))
     notes = []
     left_out = n - sum(part.stop - part.start for part in usable)
     if left_out:
         pieces = f"{len(usable)} stretch{'es' if len(usable) > 1 else ''}"
         notes.append(f"{channel}: the details are of {pieces} without a fault; {left_out} of {n} samples are left out.")
     if not windows:
-        notes.append(f"{channel} has no stretch long enough for an RMS window of {WINDOW} samples.")
-        windows.append((np.empty(0), np.empty((len(NAMES), 0))))
-    window_t, rows = (np.concatenate(parts, axis=-1) for parts in zip(*windows, strict=True))
-    window_rms = dict(zip(NAMES, rows, strict=True))
+        notes.append(f"{channel} has no stretch long enough for an RMS window of {WINDOW_SIZE} samples.")
+        windows.append((np.empty(0), np.empty((len(QUANTITIES), 0))))
+    window_t, levels = (np.concatenate(parts, axis=-1) for parts in zip(*windows, strict=True))
+    window_rms = dict(zip(QUANTITIES, levels, strict=True))
     return ChamberDetails(channel, recording.units[channel], values, window_t, window_rms), " ".join(notes)
 
 
@@ -122,7 +117,7 @@ def parts_to_compare(diagnosis: Diagnosis, recording: Recording) -> Parts:
         if low < high:
             text = f"Before {low:.1f} s and after {high:.1f} s; what lies in the onset's interval is left out."
         return Parts(low, high, ("Before", "After"), text)
-    if len(recording) < 2 * (WINDOW + (HALF_WINDOWS - 1) * STEP):
+    if len(recording) < 2 * (WINDOW_SIZE + (HALF_WINDOWS - 1) * WINDOW_STEP):
         text = "No onset was found, and the recording is too short to be parted."
         return Parts(np.inf, np.inf, ("Whole", "Later"), text)
     middle = float(t[0] + t[-1]) / 2

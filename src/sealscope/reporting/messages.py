@@ -8,18 +8,17 @@ from functools import cache
 from importlib import resources
 from math import floor, isfinite, isnan, log10
 from pathlib import PurePath
-from textwrap import fill, shorten
+from textwrap import shorten
 from typing import Any
 
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LEAKS, LEAST_SPECIFIC
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.errors import printable
+from sealscope.paragraphs import WIDTH, paragraphs
 from sealscope.recordings.formats.columns import counted, listed
 
 ABSENT = "–"
-#: Width of a line in a terminal.
-WIDTH = 80
 
 
 @cache
@@ -365,14 +364,8 @@ def _figures(diagnosis: Diagnosis) -> list[tuple[str, str | None]]:
 
 def _lines(diagnosis: Diagnosis, rows: list[tuple[str, str | None]], width: int) -> str:
     """Return a line with the verdict, and a paragraph for each row that has a text."""
-    blank = " " * 12
-    texts = [
-        fill(printable(text), width, initial_indent=f"  {label:<10}", subsequent_indent=blank, break_on_hyphens=False)
-        for label, text in rows
-        if text
-    ]
     first = say("terminal.diagnosis", file=printable(diagnosis.file), summary=diagnosis.summary)
-    return "\n".join((first, *texts))
+    return "\n".join((first, *paragraphs(rows, 12, width)))
 
 
 def flow(diagnosis: Diagnosis) -> str:

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from textwrap import fill
 
 import numpy as np
 
+from sealscope.paragraphs import WIDTH, paragraph
 from sealscope.recordings.channels import LONG_NAMES, Array
 from sealscope.recordings.formats.headings.preamble import remarks_of
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
 from sealscope.reporting.charts import shown_unit
-from sealscope.reporting.messages import WIDTH
 
 _BARS = "▁▂▃▄▅▆▇█"
 #: Width of a curve in characters.
@@ -46,19 +45,17 @@ def overview_text(name: str, recording: Recording, findings: Sequence[Finding]) 
     start = f", from {provenance['start']}" if "start" in provenance else ""
     kind = f"{provenance['format']}; " if "format" in provenance else ""
     seconds = len(recording) / recording.rate
-    lines = [_wrapped(f"{name}: {kind}{len(recording)} samples at {recording.rate:g} Hz, {seconds:g} s{start}", "  ")]
+    lines = [
+        paragraph(f"{name}: {kind}{len(recording)} samples at {recording.rate:g} Hz, {seconds:g} s{start}", indent=2)
+    ]
     for channel, values in recording.channels.items():
         unit, size = shown_unit(recording.units[channel], "bar")
         known = values[np.isfinite(values)] / size
         ends = f"{known.min():.4g} to {known.max():.4g} {unit}" if known.size else "no values"
         line = f"  {channel:<7}{LONG_NAMES[channel]:<24}{ends:<28}"
         lines.append(line + curve(values, max(CURVE // 2, WIDTH - len(line))))
-    texts = [f"  {name}: {value}" for name, value in remarks_of(provenance).items()]
-    texts += [f"  not used: {', '.join(recording.unused)}"] if recording.unused else []
-    texts += [f"  note: {line}" for line in recording.history]
-    texts += [f"  {finding.severity}: {finding.text}" for finding in findings] or ["  no defect of the data"]
-    return "\n".join((*lines, *(_wrapped(text, "    ") for text in texts)))
-
-
-def _wrapped(text: str, indent: str) -> str:
-    return fill(text, WIDTH, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+    texts = [f"{name}: {value}" for name, value in remarks_of(provenance).items()]
+    texts += [f"not used: {', '.join(recording.unused)}"] if recording.unused else []
+    texts += [f"note: {line}" for line in recording.history]
+    texts += [f"{finding.severity}: {finding.text}" for finding in findings] or ["no defect of the data"]
+    return "\n".join((*lines, *(paragraph(text, "  ", 4) for text in texts)))

@@ -20,6 +20,7 @@ from sealscope.reporting import charts, features, messages, printing, template
 from sealscope.reporting.charts import Mark
 from sealscope.reporting.particulars import particulars_of
 from sealscope.reporting.schematic import circuit_of, columns_of, schematic
+from sealscope.signals.windows import WINDOW_SIZE, WINDOW_STEP
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -178,8 +179,8 @@ def render_page(
         marks=all_marks,
         groups={group: [own for own in shown if own.group == group] for group in charts.GROUPS},
         drawn=drawn,
-        window=features.WINDOW,
-        step=features.STEP,
+        window=WINDOW_SIZE,
+        step=WINDOW_STEP,
         notes=[note for _, note in details if note],
         schematic=Markup(schematic(recording, diagnosis, circuit)),
         rig=known_rig,

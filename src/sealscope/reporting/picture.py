@@ -1,23 +1,71 @@
-"""Where values stand in a picture: paths, bands and ticks of every chart that is drawn as SVG."""
+"""A chart as SVG: shapes and labels in a frame, given in the values of its axes."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
 from sealscope.recordings.recording import Array
 
+#: Symbols by the first word of their style, as paths from where they stand.
+SYMBOLS = {
+    "point": "m-3 0a3 3 0 1 0 6 0a3 3 0 1 0-6 0z",
+    "bound": "m-4 0a4 4 0 1 0 8 0a4 4 0 1 0-8 0zm4 4v12m-3.5-4l3.5 4l3.5-4",
+    "beyond": "m0-4l5 9h-10z",
+    "absent": "m-3-3l6 6m0-6l-6 6",
+}
+#: Least extent of a box, so that it can be seen.
+_LEAST = 2.0
 
-class Scale(NamedTuple):
-    """Places in a box of `width` x `height`, from the ends of both axes; those of a logarithmic x are in decades."""
+
+class SvgPath(NamedTuple):
+    """A part of a picture: its style's name in the style sheet, its path, and what it says where it is pointed at."""
+
+    style: str
+    path: str
+    title: str = ""
+
+
+class SvgText(NamedTuple):
+    """A text at a place of the picture; `turned`: it reads upwards."""
+
+    x: float
+    y: float
+    text: str
+    anchor: str = "middle"
+    turned: bool = False
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture with a frame of `width` x `height`; `shapes` are drawn in their order, then the `labels`.
+
+    `x_ends`, `y_ends`: ends of the axes, those of a logarithmic x (`log`) in decades; `margins`: left of the frame,
+    above, right and below.
+    """
 
     width: float
     height: float
     x_ends: tuple[float, float]
     y_ends: tuple[float, float]
     log: bool = False
+    margins: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    shapes: list[SvgPath] = field(default_factory=list)
+    labels: list[SvgText] = field(default_factory=list)
+
+    @property
+    def view_box(self) -> str:
+        """What of the plane is shown, as SVG names it."""
+        left, top, right, bottom = self.margins
+        return f"{-left:g} {-top:g} {left + self.width + right:g} {top + self.height + bottom:g}"
+
+    @property
+    def styles(self) -> set[str]:
+        """The styles of its shapes."""
+        return {shape.style for shape in self.shapes}
 
     def x(self, values: Array | float) -> Array:
         """Return how far from the left values stand."""
@@ -30,26 +78,61 @@ class Scale(NamedTuple):
         low, high = self.y_ends
         return np.asarray(self.height * (high - np.asarray(values)) / (high - low))
 
-    def path(self, x: Array, y: Array, digits: int = 1) -> str:
-        """Return the line through points (n,), broken where y is missing."""
+    def draw(self, style: str, path: str, title: str = "") -> None:
+        """Draw a path in units of the picture."""
+        self.shapes.append(SvgPath(style, path, title))
+
+    def line(self, style: str, x: Array, y: Array, title: str = "", digits: int = 1) -> None:
+        """Draw the line through points (n,), broken where y is missing; places with so many decimals."""
+        self.draw(style, self._path(x, y, digits), title)
+
+    def _path(self, x: Array, y: Array, digits: int = 1) -> str:
         drawn = np.isfinite(y)
         begins = drawn & ~np.append(False, drawn[:-1])
         points = zip(begins[drawn], self.x(x[drawn]), self.y(y[drawn]), strict=True)
         return "".join(f"{'M' if first else 'L'}{a:.{digits}f} {b:.{digits}f}" for first, a, b in points)
 
-    def band(self, x: Array, low: Array, high: Array) -> str:
-        """Return the area between two lines (n,) where both are known."""
+    def area(self, style: str, x: Array, low: Array, high: Array) -> None:
+        """Draw the area between two lines (n,) where both are known."""
         there = np.isfinite(low) & np.isfinite(high)
-        around = np.append(x[there], x[there][::-1]), np.append(high[there], low[there][::-1])
-        return self.path(*around) + "Z" if there.any() else ""
+        if there.any():
+            around = np.append(x[there], x[there][::-1]), np.append(high[there], low[there][::-1])
+            self.draw(style, self._path(*around) + "z")
 
-    def ticks(self, across: int, up: int) -> dict[str, list[tuple[float, str]]]:
-        """Return places and texts of ticks on both axes, about so many of them."""
-        at_x = log_ticks(*self.x_ends) if self.log else ticks(*self.x_ends, across)
-        return {
-            "x_ticks": [(round(float(self.x(value)), 2), f"{value:g}") for value in at_x],
-            "y_ticks": [(round(float(self.y(value)), 2), f"{value:g}") for value in ticks(*self.y_ends, up)],
-        }
+    def box(self, style: str, begin: float, end: float, low: float | None = None, high: float | None = None) -> None:
+        """Draw a box from `begin` to `end`, from `low` to `high` or over the whole height."""
+        left, top = float(self.x(begin)), 0.0 if high is None else float(self.y(high))
+        bottom = self.height if low is None else float(self.y(low))
+        right, bottom = max(float(self.x(end)), left + _LEAST), max(bottom, top + _LEAST)
+        self.draw(style, f"M{left:.1f} {top:.1f}H{right:.1f}V{bottom:.1f}H{left:.1f}z")
+
+    def mark(self, style: str, x: float) -> None:
+        """Draw an upright line over the whole height."""
+        self.draw(style, f"M{self.x(x):.1f} 0V{self.height:g}")
+
+    def level(self, style: str, y: float) -> None:
+        """Draw a line over the whole width."""
+        self.draw(style, f"M0 {self.y(y):.1f}H{self.width:g}")
+
+    def symbol(self, style: str, x: float, down: float, title: str = "") -> None:
+        """Draw one of the `SYMBOLS`, `down` units of the picture below its top."""
+        self.draw(style, f"M{self.x(x):.1f} {down:.1f}{SYMBOLS[style.split(maxsplit=1)[0]]}", title)
+
+    def point(self, style: str, x: float, y: float, ends: tuple[float, float], title: str = "") -> None:
+        """Draw a point and its interval."""
+        self.draw("whisker", f"M{self.x(x):.1f} {self.y(ends[0]):.1f}V{self.y(ends[1]):.1f}")
+        self.symbol(style, x, float(self.y(y)), title)
+
+    def frame(self, about: int) -> None:
+        """Draw the frame, and about so many levels with their values."""
+        for value in ticks(*self.y_ends, about):
+            self.level("grid", value)
+            self.labels.append(SvgText(-6.0, float(self.y(value)) + 4.0, f"{value:g}", "end"))
+        self.draw("frame", f"M0 0H{self.width:g}V{self.height:g}H0z")
+
+    def below(self, x: float, text: str, anchor: str = "middle") -> None:
+        """Write a text under the frame."""
+        self.labels.append(SvgText(float(self.x(x)), self.height + 16.0, text, anchor))
 
 
 def ticks(low: float, high: float, about: int) -> list[float]:

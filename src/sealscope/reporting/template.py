@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sealscope.errors import InputError
+from sealscope.reporting.picture import SYMBOLS
 from sealscope.reporting.printing import print_page
 from sealscope.storage.atomic import atomic_write
 
@@ -36,7 +37,7 @@ def _environment() -> jinja2.Environment:
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
     )
-    environment.globals |= {"packaged": packaged, "version": _version()}
+    environment.globals |= {"packaged": packaged, "symbols": SYMBOLS, "version": _version()}
     environment.filters |= {"script_hash": _script_hash, "script_json": _script_json}
     return environment
 

@@ -23,6 +23,8 @@ from numpy.typing import ArrayLike
 from sealscope.errors import InputError
 from sealscope.signals.filters import Array, IntArray, checked_levels, discrete_wavelet, finite_array, reach
 
+#: What is measured of a chamber's pressure: its details to level 4, and the sample product of the third and the fourth.
+QUANTITIES = ("d1", "d2", "d3", "d4", "d3d4")
 Transform = Literal["stationary", "decimated", "reconstructed"]
 Edge = Literal["symmetric", "periodic", "reflect", "constant", "zero", "smooth", "antisymmetric", "antireflect"]
 
@@ -39,38 +41,30 @@ class Details:
     values: Array
     approximation: Array
     edges: IntArray
-    wavelet: str
-    transform: Transform
-    edge: Edge
 
     @property
     def levels(self) -> int:
         """The number of levels."""
         return int(self.values.shape[0])
 
-    def __len__(self) -> int:
-        """Return the number of samples of the signal, and of each level."""
-        return int(self.values.shape[1])
-
-    def _row(self, level: int) -> int:
-        if isinstance(level, bool) or not isinstance(level, (int, np.integer)) or not 1 <= level <= self.levels:
-            raise InputError(f"level must be a whole number from 1 to {self.levels}, got {level!r}")
-        return int(level) - 1
-
     def __getitem__(self, level: int) -> Array:
         """d_level, (n,), edges included."""
-        row: Array = self.values[self._row(level)]
-        return row
+        if not 1 <= level <= self.levels:
+            raise InputError(f"level must be 1 to {self.levels}, got {level!r}")
+        return np.asarray(self.values[level - 1])
 
-    def product(self, first: int = 3, second: int = 4) -> Array:
-        """Return the sample product d_first * d_second, (n,) [unit^2], edges included; the thesis's d3d4 by default."""
-        return self[first] * self[second]
+    def product(self) -> Array:
+        """Return the sample product d_3 d_4, (n,) [unit^2], edges included: the thesis's d3d4."""
+        return self[3] * self[4]
 
-    def inside(self, *levels: int) -> slice:
-        """Return the samples at which none of the named levels (default: all of them) touches the padding."""
-        rows = [self._row(level) for level in levels] or list(range(self.levels))
-        before, after = self.edges[rows].max(axis=0)
-        return slice(int(before), len(self) - int(after))
+    def quantities(self) -> Array:
+        """Return d1..d4 [unit] and d3d4 [unit^2] of details to level 4, (5, n), edges included (`QUANTITIES`)."""
+        return np.vstack([self.values, self.product()])
+
+    def inside(self, level: int | None = None) -> slice:
+        """Return the samples at which a level, by default the deepest and so any, does not touch the padding."""
+        before, after = self.edges[(level or self.levels) - 1]
+        return slice(int(before), self.values.shape[1] - int(after))
 
 
 def edge_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "stationary") -> IntArray:
@@ -128,7 +122,20 @@ def details(
         )
     compute = {"stationary": _stationary, "decimated": _decimated, "reconstructed": _reconstructed}[transform]
     values, approximation = compute(x, discrete_wavelet(wavelet), levels, edge)
-    return Details(values, approximation, edge_samples(wavelet, levels, transform), wavelet, transform, edge)
+    return Details(values, approximation, edge_samples(wavelet, levels, transform))
+
+
+def mean_squares(transformed: Details, bounds: ArrayLike) -> Array:
+    """Return the mean squares of the `QUANTITIES` between consecutive samples `bounds`, (len(bounds) - 1, 5)."""
+    return segment_means(np.square(transformed.quantities()), bounds).T
+
+
+def segment_means(values: Array, bounds: ArrayLike) -> Array:
+    """Return the means of rows (r, n) between consecutive samples `bounds`, (r, len(bounds) - 1)."""
+    at = np.asarray(bounds)
+    sums = np.add.reduceat(values, at[:-1], axis=1)
+    sums[:, -1] = values[:, at[-2] : at[-1]].sum(axis=1)
+    return np.asarray(sums / np.diff(at))
 
 
 def _one_of(value: object, choices: Any, name: str) -> None:

@@ -139,13 +139,8 @@ def parse_leak(text: str) -> Leak | None:
         peak = float(np.max(flow, initial=0.0))
         if not (np.all(np.isfinite(flow)) and peak > 0 and flow.min() >= 0):
             raise InputError(f"q_leak of a leak table must be finite, >= 0 and somewhere > 0 ({stripped[6:].strip()})")
-<<<<<<< HEAD
-        return Leak("laminar", mean=peak, opening=Tabulated(table.t, flow / peak))
-    match = re.fullmatch(_LEAK, plain_text(text, "leak"), re.IGNORECASE)
-=======
         return Leak("laminar", mean=peak, opening=tabulated(table.t, flow / peak))
-    match = re.fullmatch(_LEAK, plain_text(text, "leak"))
->>>>>>> hsim
+    match = re.fullmatch(_LEAK, plain_text(text, "leak"), re.IGNORECASE)
     if not match:
         raise InputError(
             "leak must be like '0.0042 L/min from 90 s', '0.01 L/min orifice growing from 60 s to 120 s', "

@@ -231,7 +231,7 @@ def powers(outputs: Mapping[str, Array], rig: Rig) -> dict[str, Array]:
 
 def compare(experiment: Experiment, coarse: Trajectory, fine: Trajectory) -> tuple[Difference, ...]:
     """Return the differences between two trajectories: rms of each channel, and change of each detail's RMS."""
-    from sealscope.signals.details import details
+    from sealscope.signals.details import QUANTITIES, details, mean_squares
     from sealscope.signals.windows import rms
 
     n, factor = round(experiment.duration * experiment.rate), oversampling(experiment)
@@ -246,14 +246,14 @@ def compare(experiment: Experiment, coarse: Trajectory, fine: Trajectory) -> tup
         for name, unit in units.items()
     ]
     for name in CHAMBERS:
-        ours, theirs = (details(decimate(run[name], factor, n)) for run in (coarse, fine))
-        sensor = getattr(experiment.rig.sensors, name)
-        noise = math.hypot(sensor.noise, experiment.rig.sensors.common_noise)
-        for level in range(1, ours.levels + 1):
-            a, b = rms(ours[level][ours.inside(level)]), rms(theirs[level][theirs.inside(level)])
-            recorded = math.hypot(b, noise)
-            change = abs(math.hypot(a, noise) - recorded)
-            differences.append(Difference(f"RMS of d{level} of {name}", change, "Pa", DETAIL_TOLERANCE * recorded))
+        noise = getattr(experiment.rig.sensors, name).noise ** 2 + experiment.rig.sensors.common_noise**2
+        transformed = [details(decimate(run[name], factor, n)) for run in (coarse, fine)]
+        inside = transformed[0].inside()
+        ours, theirs = (np.sqrt(mean_squares(own, [inside.start, inside.stop])[0] + noise) for own in transformed)
+        for quantity, a, b in zip(QUANTITIES[:4], ours, theirs, strict=False):
+            differences.append(
+                Difference(f"RMS of {quantity} of {name}", float(abs(a - b)), "Pa", float(DETAIL_TOLERANCE * b))
+            )
     return tuple(differences)
 
 

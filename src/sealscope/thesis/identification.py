@@ -19,7 +19,7 @@ from sealscope.campaigns.cases.bound import noise_covariance
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
-from sealscope.signals.details import details
+from sealscope.signals.details import QUANTITIES, details, mean_squares
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.instruments import decimate
 from sealscope.simulation.integrate import oversampling, sized_run
@@ -27,7 +27,7 @@ from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, ThesisTable
 from sealscope.thesis.engine.texts import note, texts_of
-from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, QUANTITIES, Condition, DataSheet, experiment_values, groups
+from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, Condition, DataSheet, experiment_values, groups
 from sealscope.units import PSI
 
 #: Part of a run that is used [s]: after the start-up, two of the slowest command's cycles (2 pi seconds each).
@@ -52,14 +52,9 @@ def noise_free_squares(
     experiment = Experiment.of(rig=rig, command=condition.command, set=values, leak=leak, duration=padded, x_0=x_0)
     _, path = sized_run(experiment)
     factor, rate = oversampling(experiment), experiment.rate
-    part = slice(round(SETTLING * rate), round((SETTLING + USED) * rate))
-    result = np.empty((len(CHAMBERS), len(QUANTITIES)))
-    for row, chamber in enumerate(CHAMBERS):
-        sampled = decimate(path[chamber], factor, round(padded * rate)) / PSI
-        squares = np.square(details(sampled).values[:, part])
-        result[row, :4] = squares.mean(axis=1)
-        result[row, 4] = np.mean(squares[2] * squares[3])
-    return result
+    bounds = [round(SETTLING * rate), round((SETTLING + USED) * rate)]
+    sampled = (decimate(path[chamber], factor, round(padded * rate)) / PSI for chamber in CHAMBERS)
+    return np.concatenate([mean_squares(details(pressure), bounds) for pressure in sampled])
 
 
 def log_rms(squares: Array, sigma: float) -> Array:

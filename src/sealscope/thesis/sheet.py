@@ -18,12 +18,12 @@ from pathlib import Path
 import numpy as np
 
 from sealscope.errors import InputError, UnreadableFile
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
+from sealscope.signals.details import QUANTITIES
 
-#: Columns of the sheet: RMS of the details of a chamber's pressure and of the product of the third and the fourth.
-QUANTITIES = ("d1", "d2", "d3", "d4", "d3d4")
 #: Chamber and quantity of each column.
-COLUMNS = tuple(product(("p_A", "p_B"), QUANTITIES))
+COLUMNS = tuple(product(CHAMBERS, QUANTITIES))
 #: Units of the columns. The sheet names none; it is taken to be in psi.
 UNITS = {name: "psi^2" if name == "d3d4" else "psi" for name in QUANTITIES}
 #: The packaged rig that stands for the bench of Appendix C: fitted to its leak-free columns.

@@ -13,10 +13,9 @@ from types import MappingProxyType
 
 import numpy as np
 
-from sealscope.diagnosis.rms_change.blocks import QUANTITIES, mean_squares
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
-from sealscope.signals.details import details, edge_samples
+from sealscope.signals.details import QUANTITIES, details, edge_samples, mean_squares
 from sealscope.signals.filters import IntArray
 
 #: What is left out at the beginning of a recording: this long, but no more than this share of the first part, so that
@@ -61,8 +60,7 @@ class Sides:
         squares = {}
         for chamber in CHAMBERS if np.diff(bounds).min() > 0 else ():
             if chamber in recording:
-                transformed = details(recording[chamber])
-                squares[chamber] = np.array([mean_squares(transformed, side)[0] for side in bounds])
+                squares[chamber] = mean_squares(details(recording[chamber]), bounds.ravel())[::2]
         return cls.of_squares(squares, bounds)
 
     @classmethod

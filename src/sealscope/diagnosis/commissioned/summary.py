@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from textwrap import fill
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -17,6 +16,7 @@ from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.inference.terms import equations
 from sealscope.diagnosis.inspection import Inspection
 from sealscope.diagnosis.verdict.machine import unstated
+from sealscope.paragraphs import paragraphs
 from sealscope.recordings.oil import oil_temperature
 from sealscope.recordings.recording import Array, Recording
 from sealscope.units import BAR, LITRE_PER_MINUTE, P_ATM, from_si
@@ -96,11 +96,7 @@ class Summary:
             needs = "speed or angle of the pump, flow or command, and two recordings"
             rows.append(("smallest leak", f"not known, that needs {needs}; the ringing alone judges"))
         rows += [("check", problem) for problem in self.problems]
-        return "\n".join(
-            fill(f"  {name:<14}{text}", 80, subsequent_indent=" " * 16, break_on_hyphens=False)
-            for name, text in rows
-            if text
-        )
+        return "\n".join(paragraphs(rows, 16))
 
 
 def _stated(rig: Rig | None) -> str:

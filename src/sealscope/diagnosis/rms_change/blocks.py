@@ -19,11 +19,9 @@ from sealscope.recordings.gaps import touched
 from sealscope.recordings.motion import ROUNDING
 from sealscope.recordings.quality import mostly_clipped
 from sealscope.recordings.recording import Array, Recording
-from sealscope.signals.details import Details, details
+from sealscope.signals.details import QUANTITIES, Details, details, mean_squares, segment_means
 from sealscope.signals.filters import IntArray
 
-#: The quantities of one chamber, in the order of the columns of `RmsBlocks.log_rms`.
-QUANTITIES = ("d1", "d2", "d3", "d4", "d3d4")
 #: Quantities that make the verdict; d1 holds noise alone, d3d4 follows from d3 and d4.
 JUDGED = ("d2", "d3", "d4")
 #: What is known of a block's duty, in the order of the columns of `RmsBlocks.duty`.
@@ -32,7 +30,7 @@ DUTY = ("command", "rate", "load", "direction")
 
 @dataclass(frozen=True)
 class RmsBlocks:
-    """Log RMS of every quantity in every block.
+    """Log RMS of every quantity (`QUANTITIES`) in every block.
 
     `edges` (n + 1,): where each block begins and the last ends [s]; `log_rms` (n, 5 per chamber), `duty` (n, 4): log
     RMS of the command, of its rate of change, and of the pressure difference, and the mean of the latter over its RMS;
@@ -84,18 +82,6 @@ def judged_chambers(recording: Recording) -> tuple[str, ...]:
     return tuple(name for name in chambers if not mostly_clipped(recording[name])) or chambers
 
 
-def mean_squares(transformed: Details, bounds: IntArray) -> Array:
-    """Return the mean squares of d1..d4 and d3d4 between consecutive sample bounds: (len(bounds) - 1, 5)."""
-    return _means(np.vstack([transformed.values**2, transformed.product()[None, :] ** 2]), bounds).T
-
-
-def _means(values: Array, bounds: IntArray) -> Array:
-    """Return the means of rows (r, n) between consecutive sample bounds."""
-    sums = np.add.reduceat(values, bounds[:-1], axis=1)
-    sums[:, -1] = values[:, bounds[-2] : bounds[-1]].sum(axis=1)
-    return np.asarray(sums / np.diff(bounds))
-
-
 def whole(recording: Recording) -> tuple[Array, Array]:
     """Return the log RMS (5 per judged chamber,) and the duty (4,) of the whole recording but its edges."""
     transformed = [details(recording[chamber]) for chamber in judged_chambers(recording)]
@@ -118,8 +104,8 @@ def _columns(recording: Recording, transformed: list[Details], bounds: IntArray)
     )
     with np.errstate(divide="ignore", over="ignore"):
         energies = np.concatenate([mean_squares(own, bounds) for own in transformed], axis=1)
-        log_rms, duty = 0.5 * np.log(energies), 0.5 * np.log(_means(squares, bounds) + rest)
-    return log_rms, np.vstack([duty, _means(load[None], bounds) / np.exp(duty[-1:])]).T
+        log_rms, duty = 0.5 * np.log(energies), 0.5 * np.log(segment_means(squares, bounds) + rest)
+    return log_rms, np.vstack([duty, segment_means(load[None], bounds) / np.exp(duty[-1:])]).T
 
 
 def cut(recording: Recording) -> RmsBlocks:

@@ -17,8 +17,9 @@ import numpy as np
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Information
 from sealscope.diagnosis.inference.scatter import Among, Rise, sessions_of
-from sealscope.diagnosis.rms_change.blocks import DUTY, QUANTITIES, RmsBlocks
+from sealscope.diagnosis.rms_change.blocks import DUTY, RmsBlocks
 from sealscope.recordings.recording import Array
+from sealscope.signals.details import QUANTITIES
 
 
 def beyond_noise(log_rms: Array, known: Array) -> tuple[Array, Array]:

@@ -17,7 +17,7 @@ from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.inference.pressures.detector import PressureResponse
 from sealscope.diagnosis.inspection import inspected
-from sealscope.diagnosis.rms_change.blocks import JUDGED, QUANTITIES, whole
+from sealscope.diagnosis.rms_change.blocks import JUDGED, whole
 from sealscope.diagnosis.trend.wear import DayToDay
 from sealscope.diagnosis.verdict.machine import AssumedMachine, assumed_rig
 from sealscope.errors import InputError
@@ -28,6 +28,7 @@ from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.oil import oil_temperature
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
+from sealscope.signals.details import QUANTITIES
 from sealscope.storage.folders import by_numbers
 from sealscope.units import DAY
 

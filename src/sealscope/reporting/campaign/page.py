@@ -17,13 +17,13 @@ from sealscope.campaigns.plans.detectors import DIAGNOSE, plan_detector
 from sealscope.campaigns.plans.model import HeldOutPlan, RecordedPlan, SimulatedPlan
 from sealscope.campaigns.results import CampaignResult
 from sealscope.diagnosis.registry import detectors
-from sealscope.evaluation.binomial import Proportion
 from sealscope.evaluation.roc import Area
+from sealscope.paragraphs import paragraph
 from sealscope.recordings.channels import Array
 from sealscope.reporting import template
 from sealscope.reporting.campaign.tables import cause_tables, page_tables, percent
 from sealscope.reporting.messages import say
-from sealscope.reporting.picture import Scale
+from sealscope.reporting.picture import Picture, SvgText, log_ticks, ticks
 
 PAGE = "report.html"
 #: More sizes than this are shown together: a column for each could not be read.
@@ -117,7 +117,7 @@ def campaign_text(result: CampaignResult) -> str:
     for first, *others in (heads, *rows):
         right = (text.rjust(width) for text, width in zip(others, widths[1:], strict=True))
         lines.append("  ".join([first.ljust(widths[0]), *right]).rstrip())
-    return "\n".join([result.plan.title, *lines, *_notes(result)])
+    return "\n".join([result.plan.title, *lines, *(paragraph(note) for note in _notes(result))])
 
 
 def _notes(result: CampaignResult) -> list[str]:
@@ -295,9 +295,16 @@ def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:
         curves = [("hits and misses", grid, pod.curve.detection(grid), pod.curve.detection_band(grid))]
         known = ((pod.curve.a90, "a90"), (pod.curve.a90_95, "a90/95"))
         marks = [(size, label) for size, label in known if math.isfinite(size) and size <= grid[-1]]
-    scale = Scale(WIDTH, HEIGHT, (math.log10(ends[0]) - 0.02, math.log10(ends[1]) + 0.02), (0.0, 1.0), log=True)
-    points = [(at.size, at.proportion) for at in pod.sizes] if len(pod.sizes) <= _MOST_POINTS else []
-    return _plot(scale, f"Detection over leak size, {pod.detector}", f"leak [{unit}]", curves, points, marks)
+    x_ends = (math.log10(ends[0]) - 0.02, math.log10(ends[1]) + 0.02)
+    picture = Picture(WIDTH, HEIGHT, x_ends, (0.0, 1.0), log=True)
+    _draw_curves(picture, f"leak [{unit}]", curves)
+    for at in pod.sizes if len(pod.sizes) <= _MOST_POINTS else ():
+        own = at.proportion
+        picture.point("point", at.size, own.value, (own.high, own.low))
+    for k, (size, label) in enumerate(marks, 1):
+        picture.mark("mark", size)
+        picture.labels.append(SvgText(float(picture.x(size)) - 4.0, 14.0 * k, label, "end"))
+    return {"title": f"Detection over leak size, {pod.detector}", "picture": picture}
 
 
 def _roc_plot(rocs: Sequence[SizeRoc], unit: str) -> dict[str, Any] | None:
@@ -309,23 +316,26 @@ def _roc_plot(rocs: Sequence[SizeRoc], unit: str) -> dict[str, Any] | None:
         for roc in rocs
         for own in [roc.curve]
     ]
-    scale = Scale(WIDTH, HEIGHT, (0.0, 1.0), (0.0, 1.0))
-    return _plot(scale, f"Detection over false alarms, {rocs[0].detector}", "false alarms", curves)
+    picture = Picture(WIDTH, HEIGHT, (0.0, 1.0), (0.0, 1.0))
+    _draw_curves(picture, "false alarms", curves)
+    return {"title": f"Detection over false alarms, {rocs[0].detector}", "picture": picture}
 
 
-def _plot(
-    scale: Scale,
-    title: str,
-    x_label: str,
-    curves: Sequence[tuple[str, Array, Array, tuple[Array, Array] | None]],
-    points: Sequence[tuple[float, Proportion]] = (),
-    marks: Sequence[tuple[float, str]] = (),
-) -> dict[str, Any]:
-    """Return what the template draws; of long curves (label, x, y, ends of the band) some points."""
-    paths, bands = [], []
+def _draw_curves(
+    picture: Picture, x_label: str, curves: Sequence[tuple[str, Array, Array, tuple[Array, Array] | None]]
+) -> None:
+    """Draw curves (label, x, y, ends of the band), of long ones some points, with the frame and its axes."""
+    thinned = []
     for label, x, y, ends in curves:
         kept = np.unique(np.linspace(0, x.size - 1, min(x.size, _MOST_DRAWN)).round().astype(np.int64))
-        paths.append((label, scale.path(x[kept], y[kept], 2)))
-        bands += [] if ends is None else [scale.band(x[kept], ends[0][kept], ends[1][kept])]
-    drawn = {"title": title, "x_label": x_label, "scale": scale, "paths": paths, "bands": bands}
-    return {**drawn, "points": points, "marks": marks, **scale.ticks(5, 5)}
+        thinned.append((label, x[kept], y[kept]))
+        if ends is not None:
+            picture.area("band", x[kept], ends[0][kept], ends[1][kept])
+    for value in log_ticks(*picture.x_ends) if picture.log else ticks(*picture.x_ends, 5):
+        picture.mark("grid", value)
+        picture.below(value, f"{value:g}")
+    picture.frame(5)
+    for k, (label, x, y) in enumerate(thinned):
+        picture.line(f"path s{k % 6}", x, y, label, digits=2)
+    picture.labels.append(SvgText(WIDTH / 2, HEIGHT + 32.0, x_label))
+    picture.labels.append(SvgText(-34.0, HEIGHT / 2, "detected", turned=True))

@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,7 +14,8 @@ from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
 from sealscope.reporting import charts, messages, template
-from sealscope.reporting.trend.page import level_chart
+from sealscope.reporting.picture import Picture
+from sealscope.reporting.trend.page import level_pictures
 from sealscope.reporting.trend.text import stamp
 from sealscope.units import DAY
 
@@ -61,7 +62,7 @@ def render_history_page(judged: Sequence[Judged], title: str, left_out: int = 0)
         rows=rows[::-1],
         undated=sum(own.start_s is None for own in ordered),
         left_out=left_out,
-        levels=history_chart(ordered),
+        levels=history_pictures(ordered),
         charts=shown,
         drawn=drawn,
         files=files,
@@ -69,8 +70,8 @@ def render_history_page(judged: Sequence[Judged], title: str, left_out: int = 0)
     )
 
 
-def history_chart(ordered: Sequence[Judged]) -> dict[str, Any] | None:
-    """Return what the template draws of recordings in their order.
+def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
+    """Return the pictures of recordings in their order.
 
     Days of their dates, numbers from 1 where a date is not known. None where no recording states a figure or a bound.
     """
@@ -85,22 +86,25 @@ def history_chart(ordered: Sequence[Judged]) -> dict[str, Any] | None:
     near = [value for lpm, _, high in known for value in (lpm, high) if value <= far and value < math.inf]
     near += [] if limit is None or limit > far else [limit]
     top = 1.08 * max(near, default=0.0) or 1.0
-    drawn: dict[str, list[Any]] = {"points": [], "bounds": [], "beyond": []}
-    for own, day, level in zip(ordered, days, levels, strict=True):
-        if level is None:
-            continue
-        lpm, low, high = level
-        title = f"{Path(own.diagnosis.file).name}: {messages.flow(own.diagnosis)}"
-        kind = "beyond" if lpm > top else "bounds" if low is None else "points"
-        drawn[kind].append(
-            {"day": day, "level": lpm, "low": low, "high": min(high, top), "kind": "first", "title": title}
-        )
 
     def moment(day: float) -> str:
         return stamp(day * DAY, days[-1] - days[0]) if dated else f"{day:g}" if day.is_integer() else ""
 
-    absent = [day for day, level in zip(days, levels, strict=True) if level is None]
-    return level_chart((days[0], days[-1]), (0.0, top), limit, moment, absent=absent, **drawn)
+    def draw(picture: Picture) -> None:
+        for own, day, level in zip(ordered, days, levels, strict=True):
+            if level is None:
+                picture.symbol("absent", day, picture.height - 4.0)
+                continue
+            lpm, low, high = level
+            title = f"{Path(own.diagnosis.file).name}: {messages.flow(own.diagnosis)}"
+            if lpm > top:
+                picture.symbol("beyond", day, 6.0, title)
+            elif low is None:
+                picture.symbol("bound", day, float(picture.y(lpm)), title)
+            else:
+                picture.point("point", day, lpm, (low, min(high, top)), title)
+
+    return level_pictures((days[0], days[-1]), (0.0, top), limit, moment, draw)
 
 
 def _level(diagnosis: Diagnosis) -> _Level | None:

@@ -7,20 +7,19 @@ import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sealscope.diagnosis.trend.trend import Trend
 from sealscope.diagnosis.trend.wear import Episode
 from sealscope.reporting import messages, template
-from sealscope.reporting.picture import Scale
+from sealscope.reporting.picture import Picture
 from sealscope.reporting.trend import text
 from sealscope.units import DAYS_PER_MONTH
 
-#: Sizes of the picture: for a screen, and for a telephone; the margins round its frame.
+#: Sizes of the picture: for a screen, and for a telephone; the margins left of its frame, above, right and below.
 SIZES = {"wide": (900.0, 320.0), "narrow": (420.0, 300.0)}
-_LEFT, _RIGHT, _TOP, _BOTTOM = 58.0, 12.0, 14.0, 26.0
+_MARGINS = (58.0, 14.0, 12.0, 26.0)
 #: Distances between two ticks: minutes, hours, days; in days.
 _STEPS = (*(m / 1440 for m in (1, 5, 15, 60, 180, 360)), 1, 2, 7, 14, 30, 61, 91, 182, 365, 730, 1826)
 
@@ -39,78 +38,66 @@ def render_trend_page(trend: Trend, *, title: str = "") -> str:
         figures=text.figures(trend),
         title=title or "Trend of a machine",
         n=messages.number,
-        chart=chart_of(trend),
+        chart=trend_pictures(trend),
     )
 
 
-def level_chart(
+def level_pictures(
     days: tuple[float, float],
     levels: tuple[float, float],
     limit: float | None,
     moment: Callable[[float], str],
-    **shown: list[Any],
-) -> dict[str, Any]:
-    """Return levels over days as the template draws them: what is shown, and the picture of each of `SIZES`.
+    draw: Callable[[Picture], None],
+) -> dict[str, Picture]:
+    """Return levels over days as pictures by the names of their `SIZES`.
 
     `days`: of the first and the last recording, with a tick at the first; `levels`: ends of the axis; `limit`: drawn
-    where it is on the axis; `moment`: a day in words; `shown`: points, bands and the like, in days and levels.
+    where it is on the axis; `moment`: a day in words; `draw` draws the rest into each picture.
     """
     margin = 0.02 * (days[1] - days[0]) or 0.5
     first, last = days[0] - margin, days[1] + margin
-    pictures = []
+    left, top, right, bottom = _MARGINS
+    pictures = {}
     for size, (width, height) in SIZES.items():
-        scale = Scale(width - _LEFT - _RIGHT, height - _TOP - _BOTTOM, (first, last), levels)
+        picture = Picture(width - left - right, height - top - bottom, (first, last), levels, margins=_MARGINS)
         step = next((step for step in _STEPS if (last - first) / step <= width / 110.0), _STEPS[-1])
-        ticks_of_days = np.arange(days[0], last, step).tolist()
-        pictures.append(
-            {
-                "size": size,
-                "width": width,
-                "height": height,
-                "left": _LEFT,
-                "top": _TOP,
-                "scale": scale,
-                "x_ticks": [(float(scale.x(day)), moment(day)) for day in ticks_of_days],
-                "y_ticks": scale.ticks(1, 4)["y_ticks"],
-            }
-        )
-    nothing = {name: () for name in ("points", "course", "bands", "marks", "bounds", "beyond", "absent")}
-    return {"pictures": pictures, "limit": None if limit is None or limit > levels[1] else limit, **nothing, **shown}
+        picture.frame(4)
+        for day in np.arange(days[0], last, step).tolist():
+            picture.below(day, moment(day), "middle" if picture.x(day) + 22.0 <= picture.width else "end")
+        if limit is not None and limit <= levels[1]:
+            picture.level("limit", limit)
+        draw(picture)
+        pictures[size] = picture
+    return pictures
 
 
-def chart_of(trend: Trend) -> dict[str, Any] | None:
-    """Return what the template draws of a trend; None where no recording states a level."""
-    known = [point for point in trend.points if point.value is not None]
-    if not known or trend.wear is None:
+def trend_pictures(trend: Trend) -> dict[str, Picture] | None:
+    """Return the pictures of a trend; None where no recording states a level."""
+    if trend.wear is None or all(point.value is None for point in trend.points):
         return None
-    points = [
-        {
-            "day": point.day,
-            "level": point.value,
-            "low": point.low or 0.0,
-            "high": point.high or 0.0,
-            "kind": "apart" if point.note else "first" if point.group == 0 else "other",
-            "title": f"{point.file}: {point.value:.3g} {trend.unit}",
-        }
-        for point in known
-    ]
+    ends, moment = (trend.points[0].day, trend.points[-1].day), partial(text.moment, trend)
+    return level_pictures(ends, _levels(trend), trend.limit, moment, partial(_draw, trend))
+
+
+def _draw(trend: Trend, picture: Picture) -> None:
+    """Draw the healthy band, the recordings, the course, alarms and repairs."""
     days = [trend.points[row].day for row in trend.rows]
-    bands = [
-        (days[own.begin], days[min(own.end, len(days) - 1)], own.wear.healthy.low, own.wear.healthy.high)
-        for own in trend.episodes
-    ]
-    marks = [(days[own.alarm], "") for own in trend.episodes if own.alarm is not None]
-    return level_chart(
-        (trend.points[0].day, trend.points[-1].day),
-        _levels(trend),
-        trend.limit,
-        partial(text.moment, trend),
-        points=points,
-        course=[np.transpose(_course(days, own)) for own in trend.episodes],
-        bands=bands,
-        marks=[*marks, *((point.day, "other") for point in trend.repairs)],
-        absent=[point.day for point in trend.points if point.value is None],
-    )
+    for own in trend.episodes:
+        healthy = own.wear.healthy
+        picture.box("healthy", days[own.begin], days[min(own.end, len(days) - 1)], healthy.low, healthy.high)
+        if own.alarm is not None:
+            picture.mark("mark", days[own.alarm])
+    for point in trend.repairs:
+        picture.mark("mark other", point.day)
+    for point in trend.points:
+        if point.value is None:
+            picture.symbol("absent", point.day, picture.height - 4.0)
+            continue
+        style = "point apart" if point.note else "point" if point.group == 0 else "point other"
+        title = f"{point.file}: {point.value:.3g} {trend.unit}"
+        picture.point(style, point.day, point.value, (point.low or 0.0, point.high or 0.0), title)
+    for own in trend.episodes:
+        picture.line("course", *np.transpose(_course(days, own)))
 
 
 def _levels(trend: Trend) -> tuple[float, float]:

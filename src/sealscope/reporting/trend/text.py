@@ -5,13 +5,13 @@ from __future__ import annotations
 import csv
 import io
 import math
-from textwrap import fill
 
 import numpy as np
 
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Interval
 from sealscope.diagnosis.trend.trend import Trend
+from sealscope.paragraphs import paragraph, paragraphs
 from sealscope.recordings.formats.columns import counted
 from sealscope.reporting.messages import machine_text, number, say
 from sealscope.units import DAY, DAYS_PER_YEAR
@@ -158,8 +158,7 @@ def trend_text(trend: Trend, *, whole: bool = False) -> str:
         rows += [("data", findings[0] + more)] if findings else []
         rows += [("reason", trend.reason)] if trend.verdict == "cannot tell" else []
     rows.append(("next", trend.next_check))
-    lines = [fill(text, 80, initial_indent=f"  {name:<8}", subsequent_indent=10 * " ") for name, text in rows if text]
-    return "\n".join([fill(headline(trend), 80, subsequent_indent="  "), *lines])
+    return "\n".join([paragraph(headline(trend), indent=2), *paragraphs(rows, 10)])
 
 
 def trend_csv(trend: Trend) -> str:

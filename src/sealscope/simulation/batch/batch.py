@@ -17,6 +17,7 @@ from sealscope.calls import checked_call
 from sealscope.errors import InputError, MissingExtra
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
+from sealscope.signals.details import QUANTITIES
 from sealscope.simulation.batch.run import LaneSet, SetRun, sets_of, with_sizes
 from sealscope.simulation.experiment import LONGEST_STEP, PRESSURE_TOLERANCE, Experiment
 from sealscope.simulation.integrate import FINEST, FIRST_WINDOW, trajectory
@@ -32,15 +33,11 @@ Progress = Callable[[float], None]
 _SCOUTS, _SCOUTED = 4, 2.0 * FIRST_WINDOW
 
 
-#: The details of which a batch keeps the RMS: db8's d1 .. d4 [Pa], and the product d3 d4 [Pa^2].
-DETAILS = ("d1", "d2", "d3", "d4", "d3d4")
-
-
 @dataclass(frozen=True, repr=False)
 class Batch:
     """Result of `simulate_batch`: RMS of the details in segments, and the leaks as they were.
 
-    `rms`: (runs, 2, segments, 5), by chamber (`CHAMBERS`: p_A, p_B), segment and detail (`DETAILS`: d1, d2, d3, d4
+    `rms`: (runs, 2, segments, 5), by chamber (`CHAMBERS`: p_A, p_B), segment and detail (`QUANTITIES`: d1, d2, d3, d4
     [Pa], d3d4 [Pa^2]); `bounds`: (segments + 1,) [s]; `mean_leak_lpm`: (runs,) mean abs(Q) while open [L/min];
     `coefficients`: (runs,) leaks' G [m^3/(s Pa)] or C [m^3/(s Pa^0.5)]; `steps`: (runs,) [s].
     """
@@ -61,7 +58,7 @@ class Batch:
     @checked_call
     def rms_of(self, channel: str, detail: str) -> Array:
         """RMS of one detail of one channel in each segment, (runs, segments): ``batch.rms_of("p_A", "d3")``."""
-        return np.asarray(self.rms[:, _place(channel, CHAMBERS, "channel"), :, _place(detail, DETAILS, "detail")])
+        return np.asarray(self.rms[:, _place(channel, CHAMBERS, "channel"), :, _place(detail, QUANTITIES, "detail")])
 
     @checked_call
     def changes(self, channel: str, detail: str, *, before: int = 0, after: int = -1) -> Array:
@@ -94,7 +91,7 @@ class Batch:
         columns: dict[str, Any] = {"run": run, "segment": segment}
         columns |= {"start [s]": self.bounds[segment], "stop [s]": self.bounds[segment + 1]}
         for channel in CHAMBERS:
-            for detail in DETAILS:
+            for detail in QUANTITIES:
                 unit = "Pa^2" if detail == "d3d4" else "Pa"
                 columns[f"{detail} of {channel} [{unit}]"] = self.rms_of(channel, detail).ravel()
         columns["mean_leak [L/min]"] = self.mean_leak_lpm[run]

@@ -7,11 +7,12 @@ import numpy as np
 from sealscope.evaluation.binomial import clopper_pearson
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
+from sealscope.signals.details import QUANTITIES
 from sealscope.thesis.chapters.appendix_c_runs import simulated_sheet
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, Figure, FigureCurve, Number, Panel, Role, ThesisTable
-from sealscope.thesis.sheet import APPENDIX_C, COLUMNS, QUANTITIES, UNITS, DataSheet, mean_leaks
+from sealscope.thesis.sheet import APPENDIX_C, COLUMNS, UNITS, DataSheet, mean_leaks
 
 
 def _difference(pairs: Array) -> Array:

@@ -11,16 +11,22 @@ from numpy.typing import NDArray
 
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
-from sealscope.signals.filters import reach
+from sealscope.signals.details import QUANTITIES, details
 from sealscope.signals.windows import WINDOW_SIZE, rms, windowed_rms
 from sealscope.simulation.experiment import Experiment
-from sealscope.thesis.chapters.appendix_c_runs import SETTLING, detail_rms, detail_series, pressure_range
+from sealscope.thesis.chapters.appendix_c_runs import (
+    SETTLING,
+    detail_rms,
+    leak_test,
+    pressure_range,
+)
 from sealscope.thesis.engine.context import Context, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Figure, FigureCurve, Number, Panel, Role
 from sealscope.thesis.engine.texts import note, texts_of
-from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, QUANTITIES, UNITS, Condition, experiment_values
-from sealscope.units import LITRE_PER_MINUTE
+from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, UNITS, Condition
+from sealscope.thesis.sines import sine_fit
+from sealscope.units import LITRE_PER_MINUTE, PSI
 
 Mask = NDArray[np.bool_]
 Drawn = tuple[list[Panel], list[Number]]
@@ -77,24 +83,17 @@ TESTS: dict[str, ShownTest] = {row[0]: ShownTest(*row) for row in texts_of("case
 
 def spec_of(test: ShownTest) -> Experiment:
     """Return the run of a test: its command and throttles on the identified rig, its mean leak from half time."""
-    condition = test.condition
-    return Experiment.of(
-        command=condition.command,
-        duration=2 * test.half,
-        leak=f"{condition.mean_leak_lpm:g} L/min from {test.half:g} s",
-        rig=BENCH_RIG,
-        set=experiment_values(condition),
-        seed=condition.number,
-    )
+    return leak_test(test.condition, test.half, test.condition.number)
 
 
 @dataclass(frozen=True, eq=False)
 class FigureView:
-    """The panels and numbers of one view of a test, from its run over a stretch of time [s]."""
+    """The panels and numbers of a test over a stretch of time [s], those of details of one chamber."""
 
     run: SimulatedRun
     test: ShownTest
     span: tuple[float, float]
+    chamber: str
 
     @property
     def recording(self) -> Recording:
@@ -129,7 +128,7 @@ class FigureView:
         t, half = self.recording.t, self.test.half
         return ((t >= SETTLING) & (t < half), _WHEN[0]), (t >= half, _WHEN[1])
 
-    def inputs(self, chamber: str) -> Drawn:
+    def inputs(self) -> Drawn:
         """Draw command, motor speed and displacement."""
         recording = self.recording
         rpm, x = recording["omega"] / _RPM, recording["x"] * 1e3
@@ -141,11 +140,11 @@ class FigureView:
         numbers = []
         for part, when in self._halves():
             speed = float(np.sqrt(np.mean(rpm[part] ** 2)))
-            drift = mean_slope(recording.t[part], x[part], self.test.omega)
+            drift = sine_fit(recording.t[part], x[part], self.test.omega).slope
             numbers += [Number(f"RMS of speed {when}", speed, "rpm"), Number(f"drift of x {when}", drift, "mm/s")]
         return panels, numbers
 
-    def leak(self, chamber: str) -> Drawn:
+    def leak(self) -> Drawn:
         """Draw leak flow and chamber pressures."""
         recording = self.recording
         flow = self._curve(recording["q_leak"] / LITRE_PER_MINUTE, "flow meter, A to B positive", "leak")
@@ -162,25 +161,25 @@ class FigureView:
                 numbers.append(Number(f"5 to 95 % range of {c} {when}", float(high - low), "MPa"))
         return panels, numbers
 
-    def details(self, chamber: str) -> Drawn:
-        """Draw d1 to d4 and d3d4 of a chamber's pressure."""
-        series = detail_series(self.recording, chamber)
-        panels = [self._panel(f"{name} [{UNITS[name]}]", *self._split(values)) for name, values in series.items()]
-        return panels, self._changes(chamber, QUANTITIES)
+    def details(self) -> Drawn:
+        """Draw d1 to d4 and d3d4 of the chamber's pressure."""
+        series = zip(QUANTITIES, details(self.recording[self.chamber] / PSI).quantities(), strict=True)
+        panels = [self._panel(f"{name} [{UNITS[name]}]", *self._split(values)) for name, values in series]
+        return panels, self._changes(QUANTITIES)
 
-    def windowed_rms(self, chamber: str) -> Drawn:
+    def windowed_rms(self) -> Drawn:
         """Draw the windowed RMS of d3, d4 and d3d4 of a chamber's pressure, and the RMS of each part."""
-        t, curves = windowed(self.recording, chamber)
-        rms = detail_rms(self.recording, self.test.parts)[chamber]
+        t, curves = windowed(self.recording, self.chamber)
+        rms = detail_rms(self.recording, self.test.parts)[self.chamber]
         panels = []
-        for name, values in curves.items():
+        for name in _WINDOWED:
             levels = FigureCurve(np.ravel(self.test.parts), np.repeat(rms[name], 2), "RMS of each part", "reference")
-            panels.append(self._panel(f"RMS of {name} [{UNITS[name]}]", *self._split(values, t), levels))
-        return panels, self._changes(chamber, _WINDOWED)
+            panels.append(self._panel(f"RMS of {name} [{UNITS[name]}]", *self._split(curves[name], t), levels))
+        return panels, self._changes(_WINDOWED)
 
-    def _changes(self, chamber: str, names: tuple[str, ...]) -> list[Number]:
+    def _changes(self, names: tuple[str, ...]) -> list[Number]:
         numbers = []
-        for name, (before, after) in detail_rms(self.recording, self.test.parts)[chamber].items():
+        for name, (before, after) in detail_rms(self.recording, self.test.parts)[self.chamber].items():
             if name in names:
                 rms = zip(_WHEN, (before, after), strict=True)
                 numbers += [Number(f"RMS of {name} {when}", value, UNITS[name]) for when, value in rms]
@@ -189,7 +188,7 @@ class FigureView:
 
 
 #: View -> what it shows, and what draws it.
-_VIEWS: dict[str, tuple[str, Callable[[FigureView, str], Drawn]]] = {
+_VIEWS: dict[str, tuple[str, Callable[[FigureView], Drawn]]] = {
     "input": ("command, motor speed and piston displacement", FigureView.inputs),
     "leak": ("leak flow and chamber pressures", FigureView.leak),
     "details": ("wavelet details d1 to d4 and d3d4", FigureView.details),
@@ -214,27 +213,19 @@ def views() -> Iterator[tuple[str, str, dict[str, object]]]:
 
 def figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw one of Figs. 5.1 to 5.89, by the item's test, view, chamber and stretch of time."""
-    test = TESTS[item.inputs["test"]]
-    view = FigureView(context.run(spec_of(test)), test, (item.inputs["from_s"], item.inputs["to_s"]))
-    panels, numbers = _VIEWS[item.inputs["view"]][1](view, item.inputs["chamber"])
+    test, span = TESTS[item.inputs["test"]], (item.inputs["from_s"], item.inputs["to_s"])
+    view = FigureView(context.run(spec_of(test)), test, span, item.inputs["chamber"])
+    panels, numbers = _VIEWS[item.inputs["view"]][1](view)
     return (item.figure(panels, numbers, view.run.resolved, view.notes()),)
 
 
-def mean_slope(t: Array, y: Array, omega: float) -> float:
-    """Return the slope of `y` over `t` beside a sine of `omega` [rad/s], by least squares on 1, t, sin and cos."""
-    t_0 = t - t.mean()
-    basis = np.column_stack([np.ones_like(t), t_0, np.sin(omega * t), np.cos(omega * t)])
-    return float(np.linalg.lstsq(basis, y, rcond=None)[0][1])
-
-
 def windowed(recording: Recording, chamber: str) -> tuple[Array, dict[str, Array]]:
-    """Return the centres [s] of the windows of 1000 samples, 500 apart, and the RMS of d3, d4, d3d4 in each."""
-    before, after = (int(samples) for samples in reach("db8", 4)[-1])
-    series = detail_series(recording, chamber)
-    inside = slice(before, len(recording) - after)
-    windows_of = {name: windowed_rms(series[name][inside], first=before) for name in _WINDOWED}
-    centres = (windows_of["d3"].ends - WINDOW_SIZE / 2) / recording.rate
-    return np.asarray(centres, dtype=np.float64), {name: windows.rms for name, windows in windows_of.items()}
+    """Return the centres [s] of the windows of 1000 samples, 500 apart, and the RMS of d1..d4, d3d4 in each."""
+    transformed = details(recording[chamber] / PSI)
+    inside = transformed.inside()
+    ends, rows = windowed_rms(transformed.quantities()[:, inside], first=inside.start)
+    centres = np.asarray((ends - WINDOW_SIZE / 2) / recording.rate, dtype=np.float64)
+    return centres, dict(zip(QUANTITIES, rows, strict=True))
 
 
 @dataclass(frozen=True)
@@ -287,7 +278,7 @@ def measure_test(context: Context, test: ShownTest, leak: bool = True) -> ShownM
         centres, curves = windowed(recording, chamber)
         settled = centres >= SETTLING
         steps[chamber] = best_step(centres[settled], curves["d3"][settled])
-    before, after = (mean_slope(t[part], run.outputs["x"][part], test.omega) * 1e3 for part in parts)
+    before, after = (sine_fit(t[part], run.outputs["x"][part], test.omega).slope * 1e3 for part in parts)
     return ShownMeasures(
         test=test,
         rms=detail_rms(recording, test.parts),

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sealscope.control import FaultTolerant, controller_named
 from sealscope.parameters import Rig, load_rig
@@ -19,6 +20,7 @@ from sealscope.thesis.engine.context import Context, first_table
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, Claim, Figure, FigureCurve, Panel, Role, ThesisTable
 from sealscope.thesis.engine.texts import judged, note
+from sealscope.thesis.sines import sine_fit
 from sealscope.units import LITRE_PER_MINUTE
 
 RIG = "thesis-closed-loop"
@@ -67,11 +69,9 @@ def _rig(name: str = RIG) -> Rig:
     return load_rig(name)
 
 
-def amplitude_at(t: Array, values: Array, f: float) -> complex:
-    """Return the complex amplitude of a signal at f [Hz], by least squares with a constant and a slope beside."""
-    X = np.stack([np.cos(2 * np.pi * f * t), np.sin(2 * np.pi * f * t), np.ones(t.size), t - t.mean()], axis=1)
-    a = np.linalg.lstsq(X, values, rcond=None)[0]
-    return complex(a[0], -a[1])
+def _swing(run: Trajectory, late: NDArray[np.bool_], f: float) -> float:
+    """Return the amplitude [m] of the piston at f [Hz] over some samples."""
+    return float(np.abs(sine_fit(run.t[late], run["x"][late], 2 * math.pi * f).amplitudes[0]))
 
 
 def drawn(run: Trajectory) -> Array:
@@ -118,19 +118,16 @@ class ControlledRig:
         """Return |F/x| [N/mm] in hold at `STIFF_AT`."""
         run = self.run("position 0 mm sin(t)", 16.0, f"{STIFF_FORCE} N sin({2 * math.pi * STIFF_AT!r}t)")
         late = run.t >= 8.0
-        return STIFF_FORCE / (1e3 * abs(amplitude_at(run.t[late], run["x"][late], STIFF_AT)))
+        return STIFF_FORCE / (1e3 * _swing(run, late, STIFF_AT))
 
     def bandwidth(self) -> float:
         """Return the frequency [Hz] from which on small targets are missed by -3 dB of themselves or more."""
         terms = [f"{1e3 * SMALL_SPEED / (2 * math.pi * f):.6f} mm sin({2 * math.pi * f!r}t)" for f in SMALL_AT]
         run = self.run(f"position {' + '.join(terms)}", 14.0)
         late = run.t >= 8.0
-        X = [np.ones(int(late.sum()))]
-        for f in SMALL_AT:
-            X += [np.cos(2 * np.pi * f * run.t[late]), np.sin(2 * np.pi * f * run.t[late])]
-        a = np.linalg.lstsq(np.stack(X, axis=1), run["x"][late], rcond=None)[0]
-        target = SMALL_SPEED / (2 * np.pi * np.array(SMALL_AT))
-        missed = np.hypot(a[1::2], target - a[2::2]) / target
+        omegas = 2 * np.pi * np.array(SMALL_AT)
+        target = -1j * SMALL_SPEED / omegas
+        missed = np.abs(sine_fit(run.t[late], run["x"][late], *omegas).amplitudes / target - 1.0)
         beyond = np.flatnonzero(missed > math.sqrt(0.5))
         if beyond.size == 0 or beyond[0] == 0:
             return math.inf if beyond.size == 0 else SMALL_AT[0]
@@ -204,7 +201,7 @@ def open_loop_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
         opened = ControlledRig("", lpm).run(f"{u} sin({OMEGA!r}t + {0.5 * math.pi!r})", 3.0 * CYCLE)
         still = drift(opened, 1) if lpm == 0.0 else still
         late = opened.t >= CYCLE
-        size = 1e3 * abs(amplitude_at(opened.t[late], opened["x"][late], 1 / CYCLE))
+        size = 1e3 * _swing(opened, late, 1 / CYCLE)
         closed = [drift(ControlledRig(name, lpm).run(DUTY, 4.0 * CYCLE), 2) for name in ("pi", "fault-tolerant")]
         rows.append((lpm, size, drift(opened, 1), drift(opened, 1) - still, *closed))
     return (item.table(rows, note("open-loop", rig=RIG, load=LOAD, u=u)),)

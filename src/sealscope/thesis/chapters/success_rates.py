@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.inference.onset import BELOW_95, WITHIN_95
 from sealscope.evaluation.binomial import clopper_pearson, holm, sign_test
 from sealscope.thesis.chapters.appendix_c_runs import simulated_sheet
 from sealscope.thesis.engine.context import Context
@@ -20,8 +21,6 @@ from sealscope.thesis.sheet import COLUMNS, DataSheet
 DIRECTION: Mapping[str, int] = {"p_A": -1, "p_B": 1}
 #: False-alarm probability at which the rules with a threshold are set.
 FALSE_ALARMS = 0.05
-#: Normal quantiles that are passed with probability FALSE_ALARMS, to one side and to either.
-_ONE_SIDED, _EITHER_SIDE = 1.6448536269514722, 1.959963984540054
 
 Fires = NDArray[np.bool_]
 
@@ -120,7 +119,7 @@ def d1_threshold(sheet: DataSheet, chamber: str, either_side: bool = False) -> f
     it, so its changes between the halves are those of a leak-free rig. The other details can only scatter more.
     """
     change = sheet.log_change(chamber, "d1")
-    return float((_EITHER_SIDE if either_side else _ONE_SIDED) * np.sqrt(np.mean(change**2)))
+    return float((WITHIN_95 if either_side else BELOW_95) * np.sqrt(np.mean(change**2)))
 
 
 def drift_threshold(drift: DataSheet, chamber: str, detail: str) -> float:

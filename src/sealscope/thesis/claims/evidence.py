@@ -13,6 +13,7 @@ import numpy as np
 
 from sealscope.campaigns.held_out.classifiers import MeasuredSamples, held_out_scores
 from sealscope.campaigns.plans.model import LogisticClassifier
+from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.evaluation.binomial import clopper_pearson
 from sealscope.evaluation.roc import auc
 from sealscope.recordings.chambers import CHAMBERS
@@ -120,7 +121,7 @@ def correlated(r: float, n: int, controls: int = 0) -> bool:
 
     By Fisher's z: ``|artanh r| sqrt(n - 3 - controls) > 1.96``. Source: Fisher, Metron 3 (1924) 329-332.
     """
-    return bool(abs(np.arctanh(np.clip(r, -0.999999, 0.999999))) * np.sqrt(n - 3 - controls) > 1.959964)
+    return bool(abs(np.arctanh(np.clip(r, -0.999999, 0.999999))) * np.sqrt(n - 3 - controls) > WITHIN_95)
 
 
 def condition_columns() -> Array:

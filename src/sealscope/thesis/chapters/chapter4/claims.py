@@ -16,7 +16,7 @@ import numpy as np
 
 from sealscope.physics.rig import throttle_coefficients
 from sealscope.recordings.chambers import CHAMBERS, PRESSURES
-from sealscope.recordings.recording import Array
+from sealscope.signals.windows import rms
 from sealscope.simulation.commands import Sine, parse_command
 from sealscope.thesis.chapters.chapter4 import cases
 from sealscope.thesis.chapters.chapter4.cases import (
@@ -35,20 +35,13 @@ from sealscope.thesis.engine.context import Context, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, Claim, ThesisTable
 from sealscope.thesis.engine.texts import judged, note
+from sealscope.thesis.sines import sine_fit
 
 #: Share of the drift without orifices that a change of drift must reach to count.
 DRIFT_SHARE = 0.01
 _T = TypeVar("_T")
 #: Numbers of several commands or closings, by name.
 Rows = list[dict[str, float]]
-
-
-def sine_fit(t: Array, values: Array, omega: float) -> tuple[float, float]:
-    """Fit a sine of frequency `omega` [rad/s]; return its amplitude and what is left over it (rms, relative)."""
-    basis = np.stack([np.sin(omega * t), np.cos(omega * t), np.ones_like(t)], axis=1)
-    fitted = np.linalg.lstsq(basis, values, rcond=None)[0]
-    amplitude = float(np.hypot(fitted[0], fitted[1]))
-    return amplitude, float(np.sqrt(np.mean((values - basis @ fitted) ** 2)) / (amplitude / math.sqrt(2.0)))
 
 
 def ringing(run: SimulatedRun, window: float = 0.05, after: float = 0.3) -> float:
@@ -73,7 +66,9 @@ def _without_orifices(context: Context) -> Iterator[Claim]:
     for name, run in runs.items():
         command = parse_command(name)
         assert isinstance(command, Sine)
-        amplitude, rest = sine_fit(run.t[cases.steady(run)], steady_output(run, "omega"), command.omega)
+        fit = sine_fit(run.t[cases.steady(run)], steady_output(run, "omega"), command.omega)
+        amplitude = float(np.abs(fit.amplitudes[0]))
+        rest = rms(fit.left) / (amplitude / math.sqrt(2.0))
         share = amplitude / (command.amplitude * thesis_rig().motor.omega_per_volt)
         fits.append(f"{name}: {rest * 100:.2f} % beside the sine, {share * 100:.0f} % of the commanded speed")
         tests.append(rest < 0.05)

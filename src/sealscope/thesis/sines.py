@@ -1,0 +1,27 @@
+"""Sines of known frequencies in a signal, by least squares."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sealscope.recordings.recording import Array
+
+
+class SineFit(NamedTuple):
+    """Complex `amplitudes` (k,) of the sines, `slope` [unit/s] beside them, and what is `left` of the signal (n,)."""
+
+    amplitudes: NDArray[np.complex128]
+    slope: float
+    left: Array
+
+
+def sine_fit(t: Array, values: Array, *omegas: float) -> SineFit:
+    """Fit ``values = c + slope t + sum Re(a_k exp(i omega_k t)) + left`` by least squares; omega_k [rad/s]."""
+    phases = np.outer(t, omegas)
+    basis = np.column_stack([np.ones(t.size), t - t.mean(), np.cos(phases), np.sin(phases)])
+    fitted = np.linalg.lstsq(basis, values, rcond=None)[0]
+    cosines, sines = np.split(fitted[2:], 2)
+    return SineFit(cosines - 1j * sines, float(fitted[1]), values - basis @ fitted)
