@@ -104,10 +104,10 @@ class LiveBalance:
     def __init__(self, rig: Rig, names: Sequence[str], litres: bool | None = None) -> None:
         self._balances = live_equations(rig, names)
         if not self._balances:
-            needed = "x, u, p_A, p_B, p_1 and p_2" if _valved(rig) else "x, p_A, p_B and theta, omega or u"
+            needed = "x, u, p_A, p_B, p_1 and p_2" if _valved(rig) else "x, p_A, p_B and theta or omega"
             raise InputError(f"a live balance must have {needed}, got {', '.join(names) or 'nothing'}")
         read = {"x", "p_A", "p_B", *(name for each in self._balances for term in each.terms for name in term.needs)}
-        read |= {next(name for name in ("theta", "omega", "u") if name in names)}
+        read |= {next((name for name in ("theta", "omega") if name in names), "x")}
         self.names = tuple(name for name in names if name in read)
         self.size_error, self.cause = size_error(rig), "piston leak" if _valved(rig) else "piston or pump leak"
         self.litres = self.states_flow(rig) if litres is None else litres
@@ -253,6 +253,6 @@ def size_error(rig: Rig) -> float:
 
 def live_equations(rig: Rig, names: Sequence[str]) -> list[Equation]:
     """Return a machine's balances with the terms that have a column: none has what is zero or lies beside the leak."""
-    balances = equations(rig, frozenset(names))
+    balances = [own for own in equations(rig, frozenset(names)) if not own.by_command]
     nuisances = [tuple(term for term in own.terms if term.nuisance and term.name != "pump leak") for own in balances]
     return [own._replace(terms=terms) for own, terms in zip(balances, nuisances, strict=True)]
