@@ -320,6 +320,7 @@ SERVER = '[opcua]\nurl = "opc.tcp://localhost:4840"\n'
         (NODES.format("x", "rate = 50.0"), r"\[opcua\].* 'press 3'"),
         (NODES.format("x", "") + SERVER, r"\[opcua\] and its rate"),
         (NODES.format("valve", "rate = 50.0") + SERVER, "nodes must be of x, theta"),
+        (NODES.format("theta", "rate = 50.0") + SERVER, "'press 3' must give .* p_A, p_B and u, got theta"),
         ('[opcua]\nurl = "opc.tcp://user:secret@localhost"\n', "url: "),
         *(
             (f'[webhook]\nurl = "{url}"\n', "webhook.url")

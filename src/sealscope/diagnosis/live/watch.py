@@ -16,7 +16,7 @@ from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.live.balance import LEARNED, BlockConductance, LiveBalance, NotJudged, Shown
 from sealscope.diagnosis.live.estimates import BaselineLearning, BlockEstimate, WatchBaseline, WatchedLeak, within
-from sealscope.diagnosis.live.joining import SampleJoiner
+from sealscope.diagnosis.live.joining import SampleJoiner, ways_to_watch
 from sealscope.diagnosis.live.pressures import PressureEstimator
 from sealscope.diagnosis.live.sequential import RECENT, Rise, StepDetector
 from sealscope.diagnosis.verdict.evidence import Evidence
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 #: Format of the saved state.
-STATE_VERSION = 10
+STATE_VERSION = 11
 _BELIEVED = beliefs("live")["watch"]
 #: Blocks of one mean that is compared with the baseline, and of the mean that is the leak after an alarm.
 GROUP, _RECENT = _BELIEVED["group"], _BELIEVED["recent"]
@@ -84,7 +84,7 @@ class Watch:
             raise InputError(f"learn_hours must be > 0 and at most 1000 h, got {learn_hours:g}")
         self._rig = rig
         self._litres = {by: kind.states_flow(rig) for by, kind in _KINDS.items()} if litres is None else litres
-        self._samples = SampleJoiner(valved=rig.valve.spool == "present")
+        self._samples = SampleJoiner(ways_to_watch(rig))
         self._estimator: Estimator | None = None
         self.baseline: WatchBaseline | None = None
         self.leak: WatchedLeak | None = None
@@ -155,9 +155,9 @@ class Watch:
         Parameters
         ----------
         samples : Recording
-            The next samples, in SI units: ``p_A``, ``p_B``, ``x``, ``theta`` or ``omega``; or ``p_A``, ``p_B`` and
-            ``u``, ``omega`` or ``theta``; behind a servo valve ``x``, ``u`` and all four pressures. What does not fit
-            is dropped and counted (`counters`).
+            The next samples, in SI units: ``p_A``, ``p_B``, ``x`` and ``theta`` or ``omega``; or, of a cylinder with
+            two like areas, ``p_A``, ``p_B`` and ``u``; behind a servo valve ``x``, ``u`` and all four pressures. What
+            does not fit is dropped and counted (`counters`).
         follows : bool, default True
             False where the clock begins anew, as with a file of its own.
 
@@ -172,13 +172,11 @@ class Watch:
         """Yield what `update` returns, each estimate with the leak as of that block; to be gone through to the end."""
         if not follows:
             self._samples.restart("restart")
-            if self._estimator is not None:
-                self._estimator.interrupt()
-        for t, channels in self._samples.runs(samples):
+        for run in self._samples.runs(samples):
             if self._estimator is None or self._estimator.method != self.method:  # a position came later
                 self._estimator = self._estimator_by()
             with np.errstate(all="ignore"):  # a block whose sums overflow says nothing
-                every = self._estimator.take(t, channels, self._samples.rate)
+                every = self._estimator.take(run)
             self._samples.settled = self._estimator.begun
             for shown in every:
                 if isinstance(shown, NotJudged) and not shown.status:
@@ -187,7 +185,10 @@ class Watch:
                     yield self.judged(shown), self.leak
 
     def _estimator_by(self) -> Estimator:
-        return _KINDS[self.method](self._rig, self._samples.names, self._litres.get(self.method, False))
+        litres = self._litres.get(self.method, False)
+        if self.method == PressureEstimator.method:
+            return PressureEstimator(self._rig, litres)
+        return LiveBalance(self._rig, self._samples.names, litres)
 
     def continue_from(self, blocks: int, baseline_version: int) -> None:
         """Count blocks and baselines on from those of a watch before, whose settings or state were of another kind."""
