@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.lib.recfunctions import structured_to_unstructured, unstructured_to_structured
 from numpy.typing import NDArray
 
 from sealscope.errors import InputError
@@ -20,7 +21,12 @@ _LARGEST = 50_000_000
 
 
 def plain_array(values: NDArray[Any]) -> dict[str, Any]:
-    """Return an array of numbers as a mapping of its shape and its bytes (little endian, base64)."""
+    """Return an array of numbers as a mapping of its shape and its bytes (little endian, base64).
+
+    Named columns are the last axis, without their names.
+    """
+    if values.dtype.names:
+        values = structured_to_unstructured(values)
     values = np.ascontiguousarray(values, dtype="<f8")
     return {"shape": list(values.shape), "f8": b64encode(values.tobytes()).decode("ascii")}
 
@@ -114,9 +120,13 @@ def recall(owner: Any, names: Iterable[str], state: Any, kinds: Mapping[str, Any
         plain, there = name.lstrip("_"), getattr(owner, name)
         value = part_of(state, plain, object)
         if isinstance(there, np.ndarray):
-            value = array_of(value, plain)
+            value, kind = array_of(value, plain), there.dtype
+            if kind.names:
+                there = structured_to_unstructured(there)
             if value.ndim != there.ndim or any(b not in (a, 0) for a, b in zip(value.shape, there.shape, strict=True)):
                 raise InputError(f"saved state's {plain} must have the shape {there.shape}, got {value.shape}")
+            if kind.names:
+                value = unstructured_to_structured(value, kind)
         elif hasattr(there, "recall"):
             there.recall(value)
             continue
