@@ -204,7 +204,7 @@ class LiveBalance:
         """Return all of it as plain values that JSON holds."""
         waiting, stream = self._waiting, self._stream
         return {
-            **saved(self, ("names", *_SAVED)),
+            **saved(self, _SAVED),
             "known": [saved(known, _KNOWN) for known in self._known],
             "waiting": None if waiting is None else saved(waiting, _BLOCK),
             "stream": None if stream is None else stream.state(),

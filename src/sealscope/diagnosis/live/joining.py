@@ -69,7 +69,8 @@ class SampleJoiner:
 
     `ways`: channels that it may be watched by (`ways_to_watch`). `late_s`: samples up to this much older than the
     newest are late or repeated, and dropped; older ones show that the clock was set back. `settled`: a position that
-    is recorded later is left out. `counters`: samples that were dropped and interruptions, by reason.
+    is recorded later is left out. `changed`: the rate is another than that of the last run. `counters`: samples that
+    were dropped and interruptions, by reason.
     """
 
     ways: tuple[tuple[str, ...], ...]
@@ -78,6 +79,7 @@ class SampleJoiner:
     names: tuple[str, ...] = ()
     rate: float = 0.0
     newest: float = -math.inf
+    changed: bool = False
     counters: dict[str, int] = field(default_factory=dict)
 
     def count(self, reason: str, number: int = 1) -> None:
@@ -93,18 +95,17 @@ class SampleJoiner:
         """Yield the samples in runs without a hole."""
         if not self._fits(samples):
             return
-        alike = same_rate(samples.rate, self.rate)
-        if not alike:
+        if not same_rate(samples.rate, self.rate):
             self.count("rate changed")
-            self.rate = samples.rate
+            self.rate, self.changed = samples.rate, True
         for first, last in self._in_order(samples.t):
             joins = bool(follow(float(samples.t[first]) - self.newest, self.rate))
             if math.isfinite(self.newest) and not joins:
                 self.count("gap")
             self.newest = float(samples.t[last - 1])
             channels = {name: samples[name][first:last] for name in self.names}
-            yield SampleRun(samples.t[first:last], channels, self.rate, joins and alike)
-            alike = True
+            yield SampleRun(samples.t[first:last], channels, self.rate, joins and not self.changed)
+            self.changed = False
 
     def _fits(self, samples: Recording) -> bool:
         """Return whether the samples have the stream's channels and SI units; count them where they do not."""
@@ -164,7 +165,7 @@ class SampleJoiner:
             raise InputError(f"saved state's names must be {in_words(self.ways)}, got {', '.join(self.names)}")
 
 
-_SAVED = ("settled", "names", "rate", "newest", "counters")
+_SAVED = ("settled", "names", "rate", "newest", "changed", "counters")
 
 
 def _length(true: NDArray[np.bool_]) -> int:
