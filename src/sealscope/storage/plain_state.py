@@ -9,7 +9,6 @@ from types import MappingProxyType
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.lib.recfunctions import structured_to_unstructured, unstructured_to_structured
 from numpy.typing import NDArray
 
 from sealscope.errors import InputError
@@ -25,10 +24,14 @@ def plain_array(values: NDArray[Any]) -> dict[str, Any]:
 
     Named columns are the last axis, without their names.
     """
-    if values.dtype.names:
-        values = structured_to_unstructured(values)
-    values = np.ascontiguousarray(values, dtype="<f8")
+    values = np.ascontiguousarray(_unnamed(values), dtype="<f8")
     return {"shape": list(values.shape), "f8": b64encode(values.tobytes()).decode("ascii")}
+
+
+def _unnamed(values: NDArray[Any]) -> NDArray[Any]:
+    """Return an array whose named columns, all floats, are the last axis."""
+    names = values.dtype.names
+    return values if names is None else values.view(float).reshape(*values.shape, len(names))
 
 
 def plain_fields(values: Any) -> dict[str, Any]:
@@ -120,13 +123,11 @@ def recall(owner: Any, names: Iterable[str], state: Any, kinds: Mapping[str, Any
         plain, there = name.lstrip("_"), getattr(owner, name)
         value = part_of(state, plain, object)
         if isinstance(there, np.ndarray):
-            value, kind = array_of(value, plain), there.dtype
-            if kind.names:
-                there = structured_to_unstructured(there)
+            value, kind, there = array_of(value, plain), there.dtype, _unnamed(there)
             if value.ndim != there.ndim or any(b not in (a, 0) for a, b in zip(value.shape, there.shape, strict=True)):
                 raise InputError(f"saved state's {plain} must have the shape {there.shape}, got {value.shape}")
             if kind.names:
-                value = unstructured_to_structured(value, kind)
+                value = value.view(kind)[:, 0]
         elif hasattr(there, "recall"):
             there.recall(value)
             continue
