@@ -42,6 +42,7 @@ from threadpoolctl import threadpool_limits
 import sealscope as ss
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.live.balance import BlockConductance, LiveBalance, NotJudged, size_error
+from sealscope.diagnosis.live.joining import SampleRun
 
 RESULTS = Path(__file__).parent / "results" / "monitor_months.csv"
 SHIFT_S, DAY_S = 16 * 3600.0, 24 * 3600.0
@@ -87,7 +88,7 @@ def libraries(seed: int) -> tuple[ss.Recording, Libraries, float]:
         if key == OUTSIDE:
             outside_lpm = OUTSIDE_LPM * float(recording["p_A"].mean()) / (1e6 * charge)
         live = LiveBalance(ss.load_rig("thesis"), tuple(recording.channels))
-        shown = live.take(recording.t, recording.channels, recording.rate)
+        shown = live.take(SampleRun(recording.t, recording.channels, recording.rate, follows=False))
         made[key] = [block for blocks in shown if not isinstance(blocks, NotJudged) for block in blocks][25:]
     assert first is not None
     return first, made, outside_lpm

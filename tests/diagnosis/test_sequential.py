@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.live.balance import BLOCK_SECONDS, BlockConductance, LiveBalance
+from sealscope.diagnosis.live.joining import SampleRun
 from sealscope.diagnosis.live.sequential import StepDetector
 from sealscope.diagnosis.live.watch import Watch
 from sealscope.parameters import load_rig
@@ -118,7 +119,7 @@ def test_a_detector_is_restored_with_the_same_bits_and_stays_small():
 def test_a_live_balance_is_restored_at_any_instant():
     def conductances(live: LiveBalance, first: int, last: int) -> list[BlockConductance]:
         piece = WORN.samples(slice(first, last))
-        shown = live.take(piece.t, piece.channels, piece.rate)
+        shown = live.take(SampleRun(piece.t, piece.channels, piece.rate, follows=first > 0))
         return [block for blocks in shown if isinstance(blocks, list) for block in blocks]
 
     names = tuple(WORN.channels)

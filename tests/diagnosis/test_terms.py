@@ -9,12 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sealscope.control.drive import Drive
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.inference.balance import BlockStream, blocks_of
+from sealscope.diagnosis.inference.balance import BlockStream, blocks_of, commanded
 from sealscope.diagnosis.inference.blocks import information, zero_of
 from sealscope.diagnosis.inference.onset import StepTest, step_test
-from sealscope.diagnosis.inference.terms import SpeedLoop, equations
+from sealscope.diagnosis.inference.terms import equations
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.channels import CHANNEL_UNITS
 from sealscope.recordings.recording import Array, Recording
@@ -48,7 +49,8 @@ def cylinder(rig: Rig, u: Array, leak: float = LEAK) -> dict[str, Array]:
 
     A dx = D omega dt - (V/K) dp_A/2 + (V/K) dp_B/2 - G (p_A - p_B) dt, with the speed that the drive makes of u.
     """
-    omega, _ = SpeedLoop.of(rig).speed(u, RATE, None)
+    drive = Drive.of(rig)
+    omega = drive.flow(u, np.zeros(len(u)), RATE) / drive.displacement
     true = [3e6 + sign * (5e4 * np.tanh(omega / 5.0) + 300.0 * omega) for sign in (1.0, -1.0)]
     conductance = leak * (np.arange(len(u)) / RATE >= ONSET)
     flow = rig.pump.q_b / (2.0 * np.pi) * omega
@@ -118,19 +120,15 @@ def test_the_zero_of_a_pressure_changes_neither_leak_nor_chance(rig: Rig, leakin
     assert blocks.driving(zero_of(blocks, columns)).mean() == pytest.approx(mean, rel=0.05)
 
 
-def test_the_command_s_speed_is_the_same_in_pieces(rig: Rig) -> None:
-    """The drive's state goes on from piece to piece, over a missing sample too."""
-    u = command()
-    u[1000:1010] = np.nan
-    whole, end = SpeedLoop.of(rig).speed(u, RATE, None)
-    state, parts = None, []
-    for part in np.split(u, [1, 700, 1005, 5000]):
-        speed, state = SpeedLoop.of(rig).speed(part, RATE, state)
-        parts.append(speed)
-    assert np.allclose(np.concatenate(parts), whole, equal_nan=True, rtol=1e-9, atol=1e-6)
-    assert np.isnan(whole[1000:1010]).all()
-    assert np.isfinite(whole[1010:]).all()
-    assert state == pytest.approx(end, rel=1e-6)
+@pytest.mark.parametrize("loaded", [False, True])
+def test_a_missing_command_is_held_and_its_speed_is_missing(rig: Rig, leaking: dict[str, Array], loaded: bool) -> None:
+    read = {name: leaking[name] for name in ("u", "x", "p_A", "p_B")}
+    holed, held = read["u"].copy(), read["u"].copy()
+    holed[1000:1010], held[1000:1010] = np.nan, held[999]
+    speed, oracle = (commanded({**read, "u": u}, rig, RATE, loaded=loaded)["omega"] for u in (holed, held))
+    assert np.isnan(speed[1000:1010]).all()
+    rest = np.delete(np.arange(len(holed)), slice(1000, 1010))
+    np.testing.assert_allclose(speed[rest], oracle[rest], rtol=1e-12)
 
 
 def behind_valve(friction: Array, leak: Array) -> dict[str, Array]:
@@ -167,10 +165,10 @@ def test_port_pressures_that_are_the_chambers_leave_the_leak_whole(rig: Rig, lea
     assert with_ports.fitted[0] == pytest.approx(step_of(read, rig).fitted[0], rel=1e-3)
 
 
-def test_a_stream_is_oriented_and_driven_as_the_recording_is(rig: Rig, leaking: dict[str, Array]) -> None:
+def test_a_stream_is_oriented_as_the_recording_is(rig: Rig, leaking: dict[str, Array]) -> None:
     """Pieces of any size give the same blocks, from a command and with the encoder's sense unknown."""
     read = {"u": -leaking["u"], "x": leaking["x"], "p_A": leaking["p_A"], "p_B": leaking["p_B"]}
-    balances = equations(rig, frozenset(read))
+    balances, read = equations(rig, frozenset(read)), commanded(read, rig, RATE)
     whole = BlockStream(balances, RATE).push(read, last=True)
     stream, parts = BlockStream(balances, RATE), []
     for piece in np.array_split(np.arange(len(read["u"])), 7):

@@ -389,6 +389,7 @@ SERVER = '[opcua]\nurl = "opc.tcp://localhost:4840"\n'
         (NODES.format("x", "") + SERVER, r"\[opcua\] and its rate"),
         (NODES.format("valve", "rate = 50.0") + SERVER, "nodes must be of x, theta"),
         ('[opcua]\nurl = "opc.tcp://user:secret@localhost"\n', "opcua.url must"),
+        (NODES.format("theta", "rate = 50.0") + SERVER, "'press 3' must give .* p_A, p_B and u, got theta"),
         *(
             (f'[webhook]\nurl = "{url}"\n', "webhook.url")
             for url in ("ftp://host/x", "http://user:password@host/", "file:///etc/passwd", "host")

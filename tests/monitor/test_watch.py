@@ -142,6 +142,17 @@ def test_disorder_does_not_depend_on_the_cuts():
     assert whole.counters == fine.counters
 
 
+def test_another_rate_may_begin_with_late_samples():
+    first, rest = WORN.samples(slice(0, 4000)), WORN.samples(slice(3001, 6000, 2))
+    slow = Recording(rest.t, dict(rest.channels), rest.units, 25.0)
+    estimates = []
+    for pieces in ([slow], [slow.samples(slice(0, 400)), slow.samples(slice(400, None))]):
+        watch = ss.watch("thesis", learn_hours=LEARN)
+        estimates.append([block for piece in (first, *pieces) for block in watch.update(piece)])
+        assert watch.counters["late or repeated samples"] == 500
+    assert estimates[0] == estimates[1]
+
+
 def test_warm_oil_and_another_duty_are_no_leak():
     warm = machine(2, G_pump=lambda t: 2.4e-13 * (1.0 + 0.6 * (1.0 - np.exp(-t / 150.0))), duration=170.0, rate=50.0)
     watch, _ = run(warm, [997])

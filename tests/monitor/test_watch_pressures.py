@@ -15,7 +15,7 @@ import sealscope as ss
 from sealscope.diagnosis.live.estimates import BlockEstimate
 from sealscope.diagnosis.live.watch import Watch
 from sealscope.errors import InputError
-from sealscope.recordings.recording import Recording
+from sealscope.recordings.recording import CHANNEL_UNITS, Recording
 from sealscope.simulation.changes import ParameterDrift, linear
 
 from .plant import moved
@@ -111,7 +111,7 @@ def test_a_short_gap_is_bridged_and_after_a_pause_nothing_before_counts(learned:
     shown = [estimate.leak_lpm for estimate in bridged if estimate.leak_lpm is not None]
     assert abs(np.mean(shown)) < 0.004
     _, paused = run(moved(part(640, 780), 3600.0), 5_000, watch)  # it leaks, and the onset lies within the pause
-    assert {estimate.status for estimate in paused} <= {"settling", "at standstill"}  # too little is known, or nothing
+    assert {estimate.status for estimate in paused} <= {"settling", "conductance not resolved"}
     assert watch.leak is None and watch.baseline.level == level
     assert watch.counters["gap"] == 2
 
@@ -128,6 +128,69 @@ def test_another_duty_and_a_lost_machine_are_not_judged(learned: str):
     _, estimates = run(broken, 5_000, watch)
     assert "missing values" in {estimate.status for estimate in estimates}
     assert watch.leak is None
+
+
+def at_rate(recording: Recording, rate: float) -> Recording:
+    kept = recording.samples(slice(None, None, round(recording.rate / rate)))
+    return Recording(kept.t, dict(kept.channels), kept.units, rate)
+
+
+def test_another_rate_is_no_leak_and_hides_none(learned: str):
+    watch = Watch.from_state(json.loads(learned))
+    _, estimates = run(at_rate(part(500, 620), 250.0), 5_000, watch)
+    assert watch.leak is None
+    assert [estimate.status for estimate in estimates] == ["settling"] * 3 + ["watched"] * 17
+    run(at_rate(part(620, 780), 250.0), 5_000, watch)
+    assert watch.leak is not None
+    low, high = watch.leak.onset_interval_s
+    assert low <= OPENS <= high
+
+
+def test_a_rate_too_slow_costs_its_blocks_only(learned: str):
+    watch = Watch.from_state(json.loads(learned))
+    _, slow = run(at_rate(part(500, 530), 125.0), 5_000, watch)
+    _, estimates = run(part(530, 620), 5_000, watch)
+    assert {estimate.status for estimate in slow} == {"sampled at less than 200 Hz"}
+    assert estimates[-1].status == "watched"
+    assert watch.leak is None
+    late = ss.watch("thesis", learn_hours=LEARN)
+    run(at_rate(part(0, 30), 125.0), 5_000, late)
+    _, estimates = run(part(30, 200), 5_000, late)
+    assert estimates[-1].status == "learning"
+
+
+def test_what_is_not_resolved_is_not_said_to_stand_still():
+    recording = ss.simulate(command="3 sin(4t)", duration=600.0, seed=1).only(CHANNELS)  # its fit leaves G unknown
+    _, estimates = run(recording.between(0, 120), 10_000)
+    assert {estimate.status for estimate in estimates} == {"settling", "conductance not resolved"}
+
+
+def test_a_machine_without_a_command_that_changes_is_at_standstill(learned: str):
+    watch = Watch.from_state(json.loads(learned))
+    still = ss.simulate(command="step 0 at 1 s", duration=60.0, seed=2).only(CHANNELS)
+    _, estimates = run(moved(still, HEALTHY), 10_000, watch)
+    assert estimates[-1].status == "at standstill"
+    assert watch.leak is None
+
+
+@pytest.mark.parametrize(
+    ("rig", "names"),
+    [
+        ("thesis", ("p_A", "p_B", "theta")),
+        ("thesis", ("p_A", "p_B", "omega")),
+        ("single-rod-eha", ("p_A", "p_B", "u")),
+        ("servo-valve", ("p_A", "p_B", "u")),
+    ],
+)
+def test_channels_that_do_not_suffice_are_refused_with_those_that_do(rig: str, names: tuple[str, ...]):
+    t = np.arange(0.0, 100.0, 0.002)
+    units = {name: CHANNEL_UNITS[name] for name in names}
+    watch = ss.watch(rig)
+    assert watch.update(Recording(t, {name: np.sin(t) for name in names}, units, 500.0)) == []
+    ((reason, number),) = watch.counters.items()
+    assert number == len(t)
+    assert reason.startswith("samples without p_A, p_B")
+    assert watch.evidence.verdict == "cannot tell" and reason in watch.evidence.reason
 
 
 def test_slow_samples_are_said_to_be_too_slow():
@@ -159,7 +222,7 @@ def test_oil_that_warms_is_no_leak():
     assert estimates[-1].status == "watched"
 
 
-@pytest.mark.parametrize("damage", ["follower", "next", "settling"])
+@pytest.mark.parametrize("damage", ["follower", "end", "settling"])
 def test_a_damaged_state_is_refused_in_one_line(damage: str, learned: str):
     state = json.loads(learned)
     estimator = {**state["estimator"], damage: {"x": 1}}

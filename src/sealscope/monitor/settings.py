@@ -10,8 +10,9 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, model_validator
 
-from sealscope.diagnosis.live.joining import CHANNELS
+from sealscope.diagnosis.live.joining import CHANNELS, in_words, ways_to_watch
 from sealscope.errors import InputError
+from sealscope.parameters import load_rig
 from sealscope.storage.plain_values import one_line
 from sealscope.storage.toml_file import read_toml
 
@@ -194,6 +195,9 @@ class MonitorSettings(_Part):
             for channel in {**each.nodes, **each.units} if each.nodes else ():
                 if channel not in CHANNELS:
                     raise ValueError(f"nodes must be of {', '.join(CHANNELS)}, got {channel[:40]!r}")
+            ways = ways_to_watch(load_rig(each.rig)) if each.nodes else ()
+            if each.nodes and not any(each.nodes.keys() >= {*way} for way in ways):
+                raise ValueError(f"nodes of {each.name!r} must give {in_words(ways)}, got {', '.join(each.nodes)}")
         sends = self.sparkplug is not None or (mqtt is not None and mqtt.alarms_topic is not None)
         if sends and len({topic_part(each.name) for each in actuators}) < len(actuators):
             raise ValueError("actuators must have names that differ in more than the letters + # / as topics")

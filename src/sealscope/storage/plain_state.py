@@ -20,9 +20,18 @@ _LARGEST = 50_000_000
 
 
 def plain_array(values: NDArray[Any]) -> dict[str, Any]:
-    """Return an array of numbers as a mapping of its shape and its bytes (little endian, base64)."""
-    values = np.ascontiguousarray(values, dtype="<f8")
+    """Return an array of numbers as a mapping of its shape and its bytes (little endian, base64).
+
+    Named columns are the last axis, without their names.
+    """
+    values = np.ascontiguousarray(_unnamed(values), dtype="<f8")
     return {"shape": list(values.shape), "f8": b64encode(values.tobytes()).decode("ascii")}
+
+
+def _unnamed(values: NDArray[Any]) -> NDArray[Any]:
+    """Return an array whose named columns, all floats, are the last axis."""
+    names = values.dtype.names
+    return values if names is None else values.view(float).reshape(*values.shape, len(names))
 
 
 def plain_fields(values: Any) -> dict[str, Any]:
@@ -114,9 +123,11 @@ def recall(owner: Any, names: Iterable[str], state: Any, kinds: Mapping[str, Any
         plain, there = name.lstrip("_"), getattr(owner, name)
         value = part_of(state, plain, object)
         if isinstance(there, np.ndarray):
-            value = array_of(value, plain)
+            value, kind, there = array_of(value, plain), there.dtype, _unnamed(there)
             if value.ndim != there.ndim or any(b not in (a, 0) for a, b in zip(value.shape, there.shape, strict=True)):
                 raise InputError(f"saved state's {plain} must have the shape {there.shape}, got {value.shape}")
+            if kind.names:
+                value = value.view(kind)[:, 0]
         elif hasattr(there, "recall"):
             there.recall(value)
             continue

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.control.drive import Drive
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, Weighting, solve
 from sealscope.diagnosis.inference.distribution import distribution
@@ -88,8 +89,6 @@ class BlockStream:
         self._first = 0  # index, since `begin`, of the first sample that is kept
         self._have = 0  # ... and one past the last
         self._done = 0  # blocks since then that are closed
-        self._pushed = 0
-        self._loop: tuple[float, float] | None = None  # state of the drive's speed loop
 
     def push(self, samples: Mapping[str, Array], last: bool = False) -> Blocks | None:
         """Take the next samples, each channel of the same length; return the blocks they complete, None for none.
@@ -97,7 +96,7 @@ class BlockStream:
         A missing sample is NaN. `last`: nothing follows, so that what remains is closed as well.
         """
         if samples:
-            self._pieces.append(self._with_drive(samples))
+            self._pieces.append(samples)
             self._have += len(next(iter(samples.values())))
         length = self._strides * self._stride
         beyond = (SPAN - 1) * self._stride + 1 + (0 if last else self._margin)
@@ -133,8 +132,6 @@ class BlockStream:
             "done": self._done,
             "zeros": self._zeros,
             "signs": list(self._signs),
-            "pushed": self._pushed,
-            "loop": None if self._loop is None else list(self._loop),
             "weighting": self._weighting.state(),
         }
 
@@ -148,19 +145,7 @@ class BlockStream:
         zeros = part_of(state, "zeros", (Mapping, type(None)))
         self._zeros = None if zeros is None else {name: float(value) for name, value in zeros.items()}
         self._signs = tuple(float(sign) for sign in part_of(state, "signs", Sequence))
-        self._pushed, loop = int(part_of(state, "pushed", int)), part_of(state, "loop", (Sequence, type(None)))
-        self._loop = None if loop is None else (float(loop[0]), float(loop[1]))
         self._weighting.recall(part_of(state, "weighting", Mapping))
-
-    def _with_drive(self, samples: Mapping[str, Array]) -> Mapping[str, Array]:
-        """Return the samples, with a speed made of the command where none is recorded."""
-        drive = self._balances[0].drive
-        if drive is None or not len(samples["u"]):
-            return samples
-        speed, self._loop = drive.speed(samples["u"], self._rate, self._loop)
-        index = self._pushed + np.arange(len(speed))
-        self._pushed += len(speed)
-        return {**samples, "omega": speed, START: np.exp(-drive.pace * index / self._rate)}
 
     def _oriented(self, rows: Sequence[Array]) -> tuple[float, ...]:
         """Return the sign of each left side: an encoder, or the sides, may be connected the other way round.
@@ -277,6 +262,31 @@ def whole_samples(recording: Recording, names: Collection[str]) -> dict[str, Arr
     return samples
 
 
+def commanded(samples: Mapping[str, Array], rig: Rig, rate: float, *, loaded: bool = False) -> dict[str, Array]:
+    """Return the samples of a pump with what fades of its drive's start (`START`), and with the speed if none is there.
+
+    The speed is what the drive makes of the command; a missing command is held, and the speed is missing with it.
+    `loaded`: under p_A - p_B, whose sense is that of the command; else what the load costs the drive is in the leak's
+    level.
+    """
+    drive = Drive.of(rig)
+    made = {START: np.exp(-np.arange(len(samples["p_A"])) / (rate * drive.lag))}
+    if flow_source(samples) == "u":
+        u, load = _held(samples["u"]), np.zeros(len(samples["u"]))
+        if loaded:
+            dp = _held(samples["p_A"] - samples["p_B"])
+            load = dp if float((u - u.mean()) @ (dp - dp.mean())) >= 0.0 else -dp
+        speed = drive.flow(u, load, rate) / drive.displacement
+        made["omega"] = np.where(np.isnan(samples["u"]), np.nan, speed)
+    return {**samples, **made}
+
+
+def _held(values: Array) -> Array:
+    """Return values (n,) of which each that is missing is that before it, 0 at the beginning."""
+    last = np.maximum.accumulate(np.where(np.isnan(values), -1, np.arange(len(values))))
+    return np.where(last < 0, 0.0, values[last])
+
+
 def shortest(rate: float) -> int:
     """Return the fewest samples of a recording from which a step can be told: `FEWEST` blocks."""
     stride = stride_samples(rate)
@@ -295,6 +305,8 @@ def blocks_of(recording: Recording, rig: Rig) -> tuple[Blocks, Blocks, tuple[Col
     needed = {"x", "p_A", "p_B", str(flow_source(names))}
     needed |= {name for balance in balances for term in balance.terms for name in term.needs}
     samples = whole_samples(recording, needed)
+    if balances[0].by_command:
+        samples = commanded(samples, rig, recording.rate)
     seconds = min(LONGEST, max(SHORTEST, recording.duration / _BLOCKS["wanted"]))
     zero = 0.0
     blocks, plain = None, None

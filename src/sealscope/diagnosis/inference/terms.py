@@ -157,46 +157,6 @@ def _slope(values: Array) -> Array:
     return slope
 
 
-class SpeedLoop(NamedTuple):
-    """The speed loop of the pump's motor without a load.
-
-    (k_p + C_e) omega = k_p omega_d + K_i I, dI/dt = omega_d - omega, omega_d = `per_volt` u (eqs. 4.2-4.5); what the
-    load adds is a droop with p_A - p_B, in the leak's level.
-
-    `gain`: k_p / (k_p + C_e); `pace`: K_i / (k_p + C_e) [1/s].
-    """
-
-    per_volt: float
-    gain: float
-    pace: float
-
-    @classmethod
-    def of(cls, rig: Rig) -> SpeedLoop:
-        """Return the drive that a rig's file describes."""
-        motor = rig.motor
-        total = motor.k_p + motor.C_e
-        return cls(motor.omega_per_volt, motor.k_p / total, motor.K_i / total)
-
-    def speed(
-        self, u: Array, rate: float, state: tuple[float, float] | None = None
-    ) -> tuple[Array, tuple[float, float]]:
-        """Return the speed [rad/s] for a command, missing where it is, and the state to go on from.
-
-        `state` None is standstill. A missing command is held; the state is the filter's and the command that is held.
-        """
-        from scipy.signal import lfilter
-
-        half = 0.5 * self.pace / rate
-        numerator = np.array([self.gain + half, half - self.gain]) / (1.0 + half)
-        missing = np.isnan(u)
-        before = 0.0 if state is None else state[1]
-        last = np.maximum.accumulate(np.where(missing, -1, np.arange(len(u))))
-        held = np.where(last < 0, before, self.per_volt * np.where(missing, 0.0, u)[last])
-        start = (1.0 - numerator[0]) * held[0] if state is None else state[0]
-        speed, end = lfilter(numerator, np.array([1.0, (half - 1.0) / (1.0 + half)]), held, zi=[start])
-        return np.where(missing, np.nan, speed), (float(end[0]), float(held[-1]))
-
-
 class Term(NamedTuple):
     """A term of a balance: a row of data.
 
@@ -223,15 +183,15 @@ class Equation(NamedTuple):
     """A balance: what gives the increments of its left side [m^3], and its terms, with those of the leak last.
 
     `healthy`: what is believed of a healthy machine's leak (a row of `priors.toml`), where that says more than nothing;
-    `drive`: what makes a speed of the command, and `START`, where none is recorded; `takes`: 1 where a flow into A is
-    positive on the left, -1 where it is negative.
+    `by_command`: no channel gives its flow, so that `balance.commanded` makes a speed of the command; `takes`: 1 where
+    a flow into A is positive on the left, -1 where it is negative.
     """
 
     name: str
     left: Callable[[Signals], Array]
     terms: tuple[Term, ...]
     healthy: str = ""
-    drive: SpeedLoop | None = None
+    by_command: bool = False
     takes: float = 1.0
 
 
@@ -248,7 +208,7 @@ MADE_UP = ", made up"
 #: The balance with a position of a pump-controlled cylinder, and that of a load that shut valves hold, by name.
 CYLINDER = "cylinder"
 LOCKED = "locked"
-#: What remains of a speed loop's state at the first sample, which nothing recorded tells.
+#: What remains of a speed loop's state at the first sample, which nothing recorded tells (19 s of the thesis's drive).
 START = "start"
 
 _LEAKS = (
@@ -535,7 +495,7 @@ def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
         terms.remove(_SPEED_LOSS)
     one_side = rig.cylinder.single_rod
     terms.insert(-len(_LEAKS), _released(rig, lambda s: _middle(s.carried_by_A) if one_side else 0.5))
-    balance = Equation(CYLINDER, left, tuple(terms), drive=SpeedLoop.of(rig) if by_command else None)
+    balance = Equation(CYLINDER, left, tuple(terms), by_command=by_command)
     return (_with_channels(balance, channels | {START}),)
 
 

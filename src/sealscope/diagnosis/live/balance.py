@@ -20,9 +20,9 @@ from sealscope.diagnosis.inference.balance import BlockStream
 from sealscope.diagnosis.inference.blocks import Blocks, Columns
 from sealscope.diagnosis.inference.terms import Equation, equations
 from sealscope.diagnosis.inference.weak_form import stride_samples
+from sealscope.diagnosis.live.joining import SampleRun
 from sealscope.diagnosis.live.known import STANDSTILL, Known, add, begin, known_shapes, motion, says, take
 from sealscope.errors import InputError
-from sealscope.recordings.recording import Array
 from sealscope.storage.plain_state import array_of, part_of, recall, saved
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -37,8 +37,6 @@ LEARNED: int = _BELIEVED["learned"]
 #: and after so many that move so much more, all before were of a machine at standstill.
 TELLS: float = _BELIEVED["tells"]
 WAKES: int = _BELIEVED["wakes"]
-#: Two samples follow each other where their times differ by so many steps.
-FOLLOWS: list[float] = _BELIEVED["follows"]
 
 
 @dataclass(frozen=True)
@@ -104,10 +102,10 @@ class LiveBalance:
     def __init__(self, rig: Rig, names: Sequence[str], litres: bool | None = None) -> None:
         self._balances = live_equations(rig, names)
         if not self._balances:
-            needed = "x, u, p_A, p_B, p_1 and p_2" if _valved(rig) else "x, p_A, p_B and theta, omega or u"
+            needed = "x, u, p_A, p_B, p_1 and p_2" if _valved(rig) else "x, p_A, p_B and theta or omega"
             raise InputError(f"a live balance must have {needed}, got {', '.join(names) or 'nothing'}")
         read = {"x", "p_A", "p_B", *(name for each in self._balances for term in each.terms for name in term.needs)}
-        read |= {next(name for name in ("theta", "omega", "u") if name in names)}
+        read |= {next((name for name in ("theta", "omega") if name in names), "x")}
         self.names = tuple(name for name in names if name in read)
         self.size_error, self.cause = size_error(rig), "piston leak" if _valved(rig) else "piston or pump leak"
         self.litres = self.states_flow(rig) if litres is None else litres
@@ -119,36 +117,31 @@ class LiveBalance:
         self._precision, self._woken = 0.0, 0  # of the usual block; blocks that moved as never before
         self._waiting: Blocks | None = None
         self._stream: BlockStream | None = None
-        self._rate, self._next = 0.0, -math.inf
+        self._rate = 0.0
 
     @staticmethod
     def states_flow(rig: Rig) -> bool:
         """Return whether a rig states what turns the balance into L/min."""
         return rig.states(*(("cylinder.A_A", "cylinder.A_B") if _valved(rig) else ("pump.q_b",)))
 
-    def take(self, t: Array, samples: Mapping[str, Array], rate: float) -> list[Shown]:
-        """Take samples that follow each other at the times `t` [s]; return what each block says that they complete.
+    def take(self, run: SampleRun) -> list[Shown]:
+        """Take the next samples; return what each block says that they complete.
 
         The first blocks say nothing until there are `LEARNED`; the last of these says what all of them do. After a gap
         the balance goes on with what it knew; what lay before the gap and fills no block is dropped.
         """
         shown: list[Shown] = []
-        stream, steps = self._stream, (float(t[0]) - self._next) * rate + 1.0
-        if stream is None or rate != self._rate or not FOLLOWS[0] < steps < FOLLOWS[1]:
+        stream = self._stream
+        if stream is None or not run.follows:
             if stream is not None:
                 shown += self._said(stream.push({}, last=True))
-            if stream is None or rate != self._rate:
-                fresh, self._rate = BlockStream(self._balances, rate, BLOCK_SECONDS), rate
+            if stream is None or run.rate != self._rate:
+                fresh, self._rate = BlockStream(self._balances, run.rate, BLOCK_SECONDS), run.rate
                 if stream is not None:
                     fresh.recall({**stream.state(), "samples": {}, "first": 0, "done": 0})
                 self._stream = stream = fresh
-            stream.restart(float(t[0]))
-        self._next = float(t[-1]) + 1.0 / rate
-        return shown + self._said(stream.push({name: samples[name] for name in self.names}))
-
-    def interrupt(self) -> None:
-        """Take the next samples as those after a gap, whatever their time is."""
-        self._next = -math.inf
+            stream.restart(float(run.t[0]))
+        return shown + self._said(stream.push({name: run.channels[name] for name in self.names}))
 
     def _said(self, blocks: Blocks | None) -> list[Shown]:
         return [] if blocks is None else [self._taken(block) for block in _parts(blocks)]
@@ -211,7 +204,7 @@ class LiveBalance:
         """Return all of it as plain values that JSON holds."""
         waiting, stream = self._waiting, self._stream
         return {
-            **saved(self, ("names", *_SAVED)),
+            **saved(self, _SAVED),
             "known": [saved(known, _KNOWN) for known in self._known],
             "waiting": None if waiting is None else saved(waiting, _BLOCK),
             "stream": None if stream is None else stream.state(),
@@ -233,7 +226,7 @@ class LiveBalance:
             self._stream.recall(stream)
 
 
-_SAVED = ("litres", "_precision", "_woken", "_rate", "_next")
+_SAVED = ("litres", "_precision", "_woken", "_rate")
 _KNOWN, _BLOCK = ("sums", "coefficients", "along", "numbers"), tuple(Blocks.__dataclass_fields__)
 
 
@@ -253,6 +246,6 @@ def size_error(rig: Rig) -> float:
 
 def live_equations(rig: Rig, names: Sequence[str]) -> list[Equation]:
     """Return a machine's balances with the terms that have a column: none has what is zero or lies beside the leak."""
-    balances = equations(rig, frozenset(names))
+    balances = [own for own in equations(rig, frozenset(names)) if not own.by_command]
     nuisances = [tuple(term for term in own.terms if term.nuisance and term.name != "pump leak") for own in balances]
     return [own._replace(terms=terms) for own, terms in zip(balances, nuisances, strict=True)]

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import WITHIN_95
-from sealscope.diagnosis.live.sequential import Rise
+from sealscope.diagnosis.live.sequential import StepEstimate
 
 Interval = tuple[float, float]
 Duty = tuple[float, float]
@@ -45,9 +45,9 @@ class WatchedLeak:
     """A leak that the tests show, until `dismiss` or `relearn` is called.
 
     `raised_s`: clock when it was first shown, `onset_s`: since when it leaks [s], `leak_lpm`: its size when it was
-    shown [L/min], both with 95 % intervals; `before`, `before_sd`: conductance before the onset and its deviation
-    [m^3/(s Pa)]; `test`, `cause`, `reason`: which test shows it, where the oil goes, and why, in one line; `score`,
-    `threshold`: of the test's statistic.
+    shown [L/min], both with 95 % intervals; `conductance_before`, `conductance_before_sd`: that before the onset and
+    its deviation [m^3/(s Pa)]; `test`, `cause`, `reason`: which test shows it, where the oil goes, and why, in one
+    line; `score`, `threshold`: of the test's statistic.
     """
 
     raised_s: float
@@ -55,8 +55,8 @@ class WatchedLeak:
     onset_interval_s: Interval
     leak_lpm: float | None
     leak_interval_lpm: Interval | None
-    before: float
-    before_sd: float
+    conductance_before: float
+    conductance_before_sd: float
     test: str
     cause: str
     reason: str
@@ -99,7 +99,7 @@ class WatchBaseline:
     duty_low: Duty
     duty_high: Duty
 
-    def rise(self, at: float, g: float, deviation: float, probability: float) -> Rise | None:
+    def rise(self, at: float, g: float, deviation: float, probability: float) -> StepEstimate | None:
         """Return the rise where a mean conductance is over what warm oil makes of the baseline's least; None where not.
 
         `deviation`: of `g`; `probability`: of a look at a healthy machine as warm as that.
@@ -118,7 +118,9 @@ class WatchBaseline:
         # what is healthy may be anywhere from the least of the baseline to the ceiling
         healthy = max(self.level - self.low, ceiling - self.level, 0.0) / WITHIN_95
         size = g - max(self.level, 0.0)
-        return Rise(score, (at, self.learned_s, at), size, math.hypot(deviation, healthy), "level", threshold, reason)
+        return StepEstimate(
+            score, (at, self.learned_s, at), size, math.hypot(deviation, healthy), "level", threshold, reason
+        )
 
 
 def within(duty: Duty, low: Duty, high: Duty) -> bool:

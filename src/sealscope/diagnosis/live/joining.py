@@ -6,64 +6,80 @@ The result depends on the samples and their order alone, never on how they were 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.live.balance import FOLLOWS
+from sealscope.diagnosis.beliefs import beliefs
 from sealscope.errors import InputError
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
 from sealscope.storage.plain_state import recall, saved
 
-#: Channels by which an actuator is watched, and with those that are kept beside the estimates.
-_WATCHED = ("x", "theta", "omega", "p_A", "p_B", "p_1", "p_2", "u")
-CHANNELS = (*_WATCHED, "T_oil")
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+
+#: Channels of an actuator that are kept: those that it may be watched by, and beside the estimates the oil's.
+CHANNELS = ("x", "theta", "omega", "p_A", "p_B", "p_1", "p_2", "u", "T_oil")
+_BELIEVED = beliefs("live")["samples"]
+_NEAREST, _FARTHEST = _BELIEVED["follows"]
+_CLOCKS: float = _BELIEVED["rate"]
 
 
-@cache
-def channels_to_watch(names: frozenset[str], valved: bool = False) -> tuple[str, ...]:
-    """Return the channels by which an actuator is watched, of those of its samples; () where they do not suffice.
+def ways_to_watch(rig: Rig) -> tuple[tuple[str, ...], ...]:
+    """Return the sets of channels by any of which an actuator is watched, the best first.
 
-    The balance of volumes reads position, angle or speed, and the chambers' pressures, or, behind a servo valve
-    (`valved`), the command and all pressures; without a position the chamber pressures and what moves the machine
-    suffice.
+    A balance of volumes reads the position; the response of the pressures needs none, but a cylinder of like areas.
     """
-    if not {"p_A", "p_B"} <= names:
-        return ()
-    if valved and {"x", "u", "p_1", "p_2"} <= names:
-        apart = {"theta", "omega"}
-    elif not valved and "x" in names and {"theta", "omega"} & names:
-        apart = {"u", "p_1", "p_2"}
-    elif {"u", "theta", "omega"} & names:
-        apart = {"x", "p_1", "p_2"}
-    else:
-        return ()
-    return tuple(name for name in _WATCHED if name in names - apart)
+    if rig.valve.spool == "present":
+        return (("p_A", "p_B", "p_1", "p_2", "u", "x"),)
+    by_volumes = tuple(("p_A", "p_B", "x", flow) for flow in ("theta", "omega"))
+    return by_volumes if rig.cylinder.single_rod else (*by_volumes, ("p_A", "p_B", "u"))
 
 
-#: Samples that follow each other: their times [s], and the channels.
-Run = tuple[Array, dict[str, Array]]
+def in_words(ways: Sequence[Sequence[str]]) -> str:
+    """Return what `ways_to_watch` gives, as a line names it."""
+    return ", or ".join(f"{', '.join(way[:-1])} and {way[-1]}" for way in ways)
+
+
+def follow(steps: Any, rate: float) -> Any:
+    """Return whether samples that are `steps` [s] apart follow each other: nearer ones are copies."""
+    return (steps * rate > _NEAREST) & (steps * rate < _FARTHEST)
+
+
+def same_rate(rate: float, before: float) -> bool:
+    """Return whether two sampling rates [Hz] are the same, as far as clocks tell."""
+    return abs(rate / before - 1.0) < _CLOCKS
+
+
+class SampleRun(NamedTuple):
+    """Samples without a hole: times `t` [s], `channels`, sampling `rate` [Hz], and whether they follow those before."""
+
+    t: Array
+    channels: Mapping[str, Array]
+    rate: float
+    follows: bool
 
 
 @dataclass
 class SampleJoiner:
-    """Which samples of one actuator follow each other.
+    """Which samples of an actuator follow each other.
 
-    `late_s`: samples up to this much older than the newest are late or repeated, and dropped; older ones show that the
-    clock was set back. `valved`: the machine moves by a servo valve. `settled`: a position that is recorded later is
-    left out. `counters`: samples that were dropped and interruptions, by reason.
+    `ways`: channels that it may be watched by (`ways_to_watch`). `late_s`: samples up to this much older than the
+    newest are late or repeated, and dropped; older ones show that the clock was set back. `settled`: a position that
+    is recorded later is left out. `changed`: the rate is another than that of the last run. `counters`: samples that
+    were dropped and interruptions, by reason.
     """
 
+    ways: tuple[tuple[str, ...], ...]
     late_s: float = 60.0
-    valved: bool = False
     settled: bool = False
     names: tuple[str, ...] = ()
     rate: float = 0.0
     newest: float = -math.inf
+    changed: bool = False
     counters: dict[str, int] = field(default_factory=dict)
 
     def count(self, reason: str, number: int = 1) -> None:
@@ -75,32 +91,30 @@ class SampleJoiner:
         self.count(reason)
         self.newest = -math.inf
 
-    def runs(self, samples: Recording) -> Iterator[Run]:
-        """Yield the samples in runs without a hole; each follows the one before, unless a gap is counted."""
+    def runs(self, samples: Recording) -> Iterator[SampleRun]:
+        """Yield the samples in runs without a hole."""
         if not self._fits(samples):
             return
-        if abs(samples.rate / self.rate - 1.0) > 0.01:
+        if not same_rate(samples.rate, self.rate):
             self.count("rate changed")
-            self.rate = samples.rate
+            self.rate, self.changed = samples.rate, True
         for first, last in self._in_order(samples.t):
-            step = float(samples.t[first]) - self.newest
-            if math.isfinite(self.newest) and not self._follows(step, step):
+            joins = bool(follow(float(samples.t[first]) - self.newest, self.rate))
+            if math.isfinite(self.newest) and not joins:
                 self.count("gap")
             self.newest = float(samples.t[last - 1])
-            yield samples.t[first:last], {name: samples[name][first:last] for name in self.names}
-
-    def _follows(self, least: float, most: float) -> bool:
-        """Return whether samples follow each other that are so far apart, at least and at most [s]."""
-        return least * self.rate > FOLLOWS[0] and most * self.rate < FOLLOWS[1]
+            channels = {name: samples[name][first:last] for name in self.names}
+            yield SampleRun(samples.t[first:last], channels, self.rate, joins and not self.changed)
+            self.changed = False
 
     def _fits(self, samples: Recording) -> bool:
         """Return whether the samples have the stream's channels and SI units; count them where they do not."""
-        names, offered = self.names, channels_to_watch(frozenset(samples.channels), self.valved)
+        names, offered = self.names, next((way for way in self.ways if samples.channels.keys() >= {*way}), ())
         if not names or ("x" in offered and "x" not in names and not self.settled):
             names = offered
         wrong = [name for name in names if name not in samples or samples.units[name] != CHANNEL_UNITS[name]]
         if not names:
-            reason = "samples without p_A, p_B and x with theta or omega, or u, theta or omega"
+            reason = f"samples without {in_words(self.ways)}"
         elif wrong:
             missing = [name for name in wrong if name not in samples]
             of = f" of {wrong[0]} not in {CHANNEL_UNITS[wrong[0]]}"
@@ -120,7 +134,7 @@ class SampleJoiner:
         """Yield first and one past the last index of runs of samples that follow each other."""
         with np.errstate(all="ignore"):  # NaN and infinity follow nothing
             steps = np.diff(t)
-            whole = t.size > 1 and t[0] > self.newest and self._follows(float(steps.min()), float(steps.max()))
+            whole = t.size > 1 and t[0] > self.newest and bool(follow(steps, self.rate).all())
         if whole:  # as nearly always
             yield 0, t.size
             return
@@ -130,9 +144,7 @@ class SampleJoiner:
         while known.size:
             first, times = int(known[0]), t[known]
             if times[0] > self.newest:
-                steps = np.diff(times) * self.rate
-                follows = (steps > FOLLOWS[0]) & (steps < FOLLOWS[1]) & (np.diff(known) == 1)
-                run = _length(follows) + 1
+                run = _length(follow(np.diff(times), self.rate) & (np.diff(known) == 1)) + 1
                 yield first, first + run
             elif self.newest - times[0] > self.late_s:
                 self.restart("clock set back")
@@ -144,13 +156,16 @@ class SampleJoiner:
 
     def state(self) -> dict[str, Any]:
         """Return all of it as plain values."""
-        return saved(self, vars(self))
+        return saved(self, _SAVED)
 
     def recall(self, state: Any) -> None:
         """Continue from a `state`; raises InputError where it does not fit."""
-        recall(self, [*vars(self)], state, {"names": tuple[str, ...], "counters": dict[str, int]})
-        if not {*self.names} <= {*CHANNELS}:
-            raise InputError(f"saved state's samples must be of channels that are known, got {', '.join(self.names)}")
+        recall(self, _SAVED, state, {"names": tuple[str, ...], "counters": dict[str, int]})
+        if self.names not in ((), *self.ways):
+            raise InputError(f"saved state's names must be {in_words(self.ways)}, got {', '.join(self.names)}")
+
+
+_SAVED = ("settled", "names", "rate", "newest", "changed", "counters")
 
 
 def _length(true: NDArray[np.bool_]) -> int:

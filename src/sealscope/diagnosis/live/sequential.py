@@ -49,7 +49,7 @@ _SAVED = tuple(f"_{name}" for name in ("level", "spread", "total", "weight", "wi
                                        "known", "blocks", "last"))  # fmt: skip
 
 
-class Rise(NamedTuple):
+class StepEstimate(NamedTuple):
     """A rise of a coefficient that a `test` shows, by a `score` over a `threshold` for a `reason`.
 
     `score`: of a step, twice log M; `onset`: value, low and high [s]; `size` and its `deviation`.
@@ -143,7 +143,7 @@ class StepDetector:
         prior = np.logaddexp.reduce(healthy, axis=0) + np.log(len(SIZES) * len(PARTS))
         return np.asarray(np.where(along > 0.0, ratio, -np.inf) + healthy - prior)
 
-    def rise(self) -> Rise:
+    def rise(self) -> StepEstimate:
         """Return the step that the blocks show: its onset and size, averaged over all that may be."""
         terms = self._terms()
         log_e = float(np.logaddexp.reduce(terms.ravel()))
@@ -161,7 +161,7 @@ class StepDetector:
         last = order[min(high, len(order) - 1)]
         apart = float((onset - begin)[-len(PARTS)]) / len(PARTS)  # a part of a block, about
         since = float(shares @ onset), float(onset[order[low]]) - apart, float(onset[last]) + apart
-        return Rise(2.0 * log_e, since, self._unit * value, self._unit * deviation)
+        return StepEstimate(2.0 * log_e, since, self._unit * value, self._unit * deviation)
 
     def bound(self, probability: float = 0.95) -> float:
         """Return the rise that is exceeded with probability 1 - `probability`, given that there is one."""

@@ -16,9 +16,9 @@ from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.live.balance import LEARNED, BlockConductance, LiveBalance, NotJudged, Shown
 from sealscope.diagnosis.live.estimates import BaselineLearning, BlockEstimate, WatchBaseline, WatchedLeak, within
-from sealscope.diagnosis.live.joining import SampleJoiner
+from sealscope.diagnosis.live.joining import SampleJoiner, ways_to_watch
 from sealscope.diagnosis.live.pressures import PressureEstimator
-from sealscope.diagnosis.live.sequential import RECENT, Rise, StepDetector
+from sealscope.diagnosis.live.sequential import RECENT, StepDetector, StepEstimate
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
@@ -29,10 +29,14 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 #: Format of the saved state.
-STATE_VERSION = 10
+STATE_VERSION = 11
 _BELIEVED = beliefs("live")["watch"]
 #: Blocks of one mean that is compared with the baseline, and of the mean that is the leak after an alarm.
-GROUP, _RECENT = _BELIEVED["group"], _BELIEVED["recent"]
+GROUP, _OF_NOW = _BELIEVED["group"], _BELIEVED["recent"]
+#: What is kept of the last blocks: end, conductance, deviation, flow of a unit of it, and the duty's logarithms; and of
+#: those whose mean is not whole yet, with what all conductances are off by.
+_LAST = np.dtype([(name, float) for name in ("end", "g", "sd", "flow", "pressure", "motion")])
+_GROUP = np.dtype([(name, float) for name in ("end", "g", "sd", "offset")])
 #: What a watched leak and the evidence of it call alike.
 _FIGURES = ("score", "threshold", "onset_s", "onset_interval_s", "leak_lpm", "leak_interval_lpm")
 #: Ways of watching, each a stream of conductances.
@@ -84,15 +88,13 @@ class Watch:
             raise InputError(f"learn_hours must be > 0 and at most 1000 h, got {learn_hours:g}")
         self._rig = rig
         self._litres = {by: kind.states_flow(rig) for by, kind in _KINDS.items()} if litres is None else litres
-        self._samples = SampleJoiner(valved=rig.valve.spool == "present")
+        self._samples = SampleJoiner(ways_to_watch(rig))
         self._estimator: Estimator | None = None
         self.baseline: WatchBaseline | None = None
         self.leak: WatchedLeak | None = None
         self.blocks, self.baseline_version = 0, 1
         self._learning, self._detector = BaselineLearning(), StepDetector()
-        # of the last blocks end, conductance, deviation, flow of a unit of it, duty; of those whose mean is not whole
-        # yet end, conductance, deviation, and what all conductances are off by
-        self._last, self._group = np.empty((0, 6)), np.empty((0, 4))
+        self._last, self._group = np.empty(0, _LAST), np.empty(0, _GROUP)
 
     def _probability(self, test: str, seconds: float) -> float:
         """Return the probability of a false alarm of one look of a test, with so many seconds between looks.
@@ -142,8 +144,8 @@ class Watch:
         if own is None or not math.isfinite(bound):
             why = f": {', '.join(self.counters)}" if self.counters else ""
             return Evidence("cannot tell", f"waits for the first blocks{why}")
-        flow, _, motion = self._last[-1, 3:].tolist()
-        bound, pump = own.orifice * bound * flow, math.exp(motion) / LITRE_PER_MINUTE
+        last = self._last[-1]
+        bound, pump = own.orifice * bound * float(last["flow"]), math.exp(last["motion"]) / LITRE_PER_MINUTE
         limit = f"{bound:.2g} L/min" if own.litres else f"{100.0 * bound / pump:.2g} % of the pump's flow"
         enough = bound <= beliefs("inference")["worth"]["share"] * pump
         return Evidence(
@@ -160,9 +162,9 @@ class Watch:
         Parameters
         ----------
         samples : Recording
-            The next samples, in SI units: ``p_A``, ``p_B``, ``x``, ``theta`` or ``omega``; or ``p_A``, ``p_B`` and
-            ``u``, ``omega`` or ``theta``; behind a servo valve ``x``, ``u`` and all four pressures. What does not fit
-            is dropped and counted (`counters`).
+            The next samples, in SI units: ``p_A``, ``p_B``, ``x`` and ``theta`` or ``omega``; or, of a cylinder with
+            two like areas, ``p_A``, ``p_B`` and ``u``; behind a servo valve ``x``, ``u`` and all four pressures. What
+            does not fit is dropped and counted (`counters`).
         follows : bool, default True
             False where the clock begins anew, as with a file of its own.
 
@@ -177,13 +179,11 @@ class Watch:
         """Yield what `update` returns, each estimate with the leak as of that block; to be gone through to the end."""
         if not follows:
             self._samples.restart("restart")
-            if self._estimator is not None:
-                self._estimator.interrupt()
-        for t, channels in self._samples.runs(samples):
+        for run in self._samples.runs(samples):
             if self._estimator is None or self._estimator.method != self.method:  # a position came later
                 self._estimator = self._estimator_by()
             with np.errstate(all="ignore"):  # a block whose sums overflow says nothing
-                every = self._estimator.take(t, channels, self._samples.rate)
+                every = self._estimator.take(run)
             self._samples.settled = self._estimator.begun
             for shown in every:
                 if isinstance(shown, NotJudged) and not shown.status:
@@ -192,7 +192,10 @@ class Watch:
                     yield self.judged(shown), self.leak
 
     def _estimator_by(self) -> Estimator:
-        return _KINDS[self.method](self._rig, self._samples.names, self._litres.get(self.method, False))
+        litres = self._litres.get(self.method, False)
+        if self.method == PressureEstimator.method:
+            return PressureEstimator(self._rig, litres)
+        return LiveBalance(self._rig, self._samples.names, litres)
 
     def continue_from(self, blocks: int, baseline_version: int) -> None:
         """Count blocks and baselines on from those of a watch before, whose settings or state were of another kind."""
@@ -234,11 +237,11 @@ class Watch:
         if self.baseline is not None and not within(block.duty, self.baseline.duty_low, self.baseline.duty_high):
             self._samples.count("blocks: another duty")
             return BlockEstimate(self.blocks, block.end, "another duty")
-        if len(self._last) and not 0.0 <= block.end - self._last[-1, 0] <= _BELIEVED["pause"]:
+        if len(self._last) and not 0.0 <= block.end - self._last["end"][-1] <= _BELIEVED["pause"]:
             self._forget()
         self._detector.take(block.begin, block.end, block.g, block.sd)
-        row = block.end, block.g, block.sd, block.flow, *block.duty
-        self._last = np.vstack([self._last[1 - RECENT :], row])
+        row = np.array((block.end, block.g, block.sd, block.flow, *block.duty), _LAST)
+        self._last = np.append(self._last[1 - RECENT :], row)
         self._test_step(own, block)
         self._test_level(own, block)
         if self.baseline is None and self.leak is None:
@@ -272,11 +275,11 @@ class Watch:
         )
         self._raise(own, rise._replace(threshold=2.0 * threshold, reason=reason), block)
 
-    def _other_duty(self, own: Estimator, rise: Rise) -> bool:
+    def _other_duty(self, own: Estimator, rise: StepEstimate) -> bool:
         """Return whether the duty changed with a rise, beyond what it was before and what a leak makes of it."""
-        ends, *_, pressure, motion = self._last.T
-        after = ends > rise.onset[0]
-        if np.count_nonzero(~after) < _RECENT or not after.any():
+        pressure, motion = self._last["pressure"], self._last["motion"]
+        after = self._last["end"] > rise.onset[0]
+        if np.count_nonzero(~after) < _OF_NOW or not after.any():
             return False
         low, high = ((float(f(pressure[~after])), float(f(motion[~after]))) for f in (np.min, np.max))
         now = float(np.median(pressure[after])), float(np.median(motion[after]))
@@ -286,11 +289,11 @@ class Watch:
 
     def _test_level(self, own: Estimator, block: BlockConductance) -> None:
         """Gather blocks to means, and compare these with the baseline."""
-        self._group = np.vstack([self._group, (block.end, block.g, block.sd, block.offset)])
+        self._group = np.append(self._group, np.array((block.end, block.g, block.sd, block.offset), _GROUP))
         if len(self._group) < GROUP:
             return
-        at, g, _, offset = self._group.mean(axis=0).tolist()
-        sd = math.sqrt(sum(value**2 for value in self._group[:, 2].tolist())) / GROUP
+        at, g, offset = (float(self._group[name].mean()) for name in ("end", "g", "offset"))
+        sd = math.sqrt(sum(value**2 for value in self._group["sd"].tolist())) / GROUP
         self._group = self._group[:0]
         if self.leak is not None or self.baseline is None:
             return
@@ -300,12 +303,12 @@ class Watch:
         if rise is not None:
             self._raise(own, rise, block, self.baseline.level)
 
-    def _raise(self, own: Estimator, rise: Rise, block: BlockConductance, before: float | None = None) -> None:
+    def _raise(self, own: Estimator, rise: StepEstimate, block: BlockConductance, before: float | None = None) -> None:
         leak, (onset, *ends) = self.leak, rise.onset
         if before is None:
-            earlier = self._last[self._last[:, 0] <= ends[0], 1][-GROUP:]
+            earlier = self._last["g"][self._last["end"] <= ends[0]][-GROUP:]
             known = float(np.mean(earlier)) if earlier.size else block.g - rise.size
-            before = leak.before if leak is not None else known
+            before = leak.conductance_before if leak is not None else known
         half = WITHIN_95 * math.hypot(rise.deviation, own.size_error * rise.size)
         low, high = own.inside * max(0.0, rise.size - half) * block.flow, own.orifice * (rise.size + half) * block.flow
         self.leak = WatchedLeak(
@@ -314,8 +317,8 @@ class Watch:
             onset_interval_s=(ends[0], ends[1]),
             leak_lpm=rise.size * block.flow if own.litres else None,
             leak_interval_lpm=(low, high) if own.litres else None,
-            before=before,
-            before_sd=rise.deviation,
+            conductance_before=before,
+            conductance_before_sd=rise.deviation,
             test=rise.test,
             cause=own.cause,
             reason=rise.reason,
@@ -343,12 +346,14 @@ class Watch:
 
     def _beyond_leak(self, leak: WatchedLeak, own: Estimator, block: BlockConductance, sd: float) -> _WithInterval:
         """Return the conductance since the onset of a leak, and its interval, in which the oil may have warmed."""
-        recent = self._last[self._last[:, 0] - self.block_seconds >= leak.onset_interval_s[1], 1][-_RECENT:]
+        since = self._last["end"] - self.block_seconds >= leak.onset_interval_s[1]
+        recent = self._last["g"][since][-_OF_NOW:]
         now, oil = float(np.mean(recent)) if recent.size else block.g, beliefs("inference")["oil"]
         hours = max(0.0, block.end - leak.onset_s) / 3600.0
         warmed = oil["warmest"] ** min(1.0, hours / oil["shift"])
-        before, rise = max(leak.before, 0.0), now - leak.before
-        spread = WITHIN_95 * math.hypot(sd / math.sqrt(max(len(recent), 1)), leak.before_sd, own.size_error * rise)
+        before, rise = max(leak.conductance_before, 0.0), now - leak.conductance_before
+        noise = sd / math.sqrt(max(len(recent), 1))
+        spread = WITHIN_95 * math.hypot(noise, leak.conductance_before_sd, own.size_error * rise)
         return rise, own.inside * (now - before * warmed - spread), now - before / warmed + spread
 
     def state(self) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sealscope.diagnosis.live.joining import CHANNELS
+from sealscope.diagnosis.live.joining import CHANNELS, follow, same_rate
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.details import Details, details, shortest
@@ -55,8 +55,8 @@ class _Window:
             return
         if self.t.size and self.t[0] <= t[0] and t[-1] <= self.t[-1]:
             return  # repeated
-        follows = self.t.size > 0 and [*self.channels] == names and abs(samples.rate / self.rate - 1.0) < 0.01
-        if not (follows and 0.5 < (t[0] - self.t[-1]) * samples.rate < 1.5):
+        alike = self.t.size > 0 and [*self.channels] == names and same_rate(samples.rate, self.rate)
+        if not (alike and follow(t[0] - self.t[-1], samples.rate)):
             self.t, self.channels = np.empty(0), {name: np.empty(0) for name in names}
         self.rate = samples.rate
         self.t = np.concatenate([self.t, t])[-most:]

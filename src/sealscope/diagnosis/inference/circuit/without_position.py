@@ -23,9 +23,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.control.drive import Drive
 from sealscope.diagnosis.beliefs import beliefs
-from sealscope.diagnosis.inference.balance import LONGEST, whole_samples
+from sealscope.diagnosis.inference.balance import LONGEST, commanded, whole_samples
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, Weighting
 from sealscope.diagnosis.inference.circuit.store import cycle_length, lost_oil
 from sealscope.diagnosis.inference.distribution import distribution
@@ -34,7 +33,6 @@ from sealscope.diagnosis.inference.terms import (
     LEAK,
     LOCKED,
     ORIFICE,
-    START,
     Equation,
     Signals,
     circulation,
@@ -79,9 +77,11 @@ def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
     equation = locked(rig, channels) if "x" in channels else circulation(rig, channels)
     if equation is None:
         return []
-    signals = Signals(_samples(recording, rig, equation), recording.rate, {})
+    shut, samples = equation.name == LOCKED, whole_samples(recording, _READ)
+    if not shut:
+        samples = commanded(samples, rig, recording.rate, loaded=True)
+    signals = Signals(samples, recording.rate, {})
     speed, dp = equation.left(signals) * recording.rate, signals.pressure_difference
-    shut = equation.name == LOCKED
     if not shut and float(np.nansum((dp - np.nanmean(dp)) * speed)) < 0.0:  # friction takes work: wired reversed
         forward = equation.left
         equation, speed = equation._replace(left=lambda s: -forward(s)), -speed
@@ -103,23 +103,6 @@ def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
             lost = lost_oil(signals, rig, cycle, begin)
             made.append(CycleBalance(blocks, equation, Columns(equation), lost))
     return made
-
-
-def _samples(recording: Recording, rig: Rig, equation: Equation) -> dict[str, Array]:
-    """Return the samples that the balance reads, NaN where missing, with the speed that the drive makes of a command.
-
-    The thesis's drive takes 19 s to make good what the load costs it: what of that is left at first fades (`START`).
-    """
-    samples = whole_samples(recording, _READ)
-    if equation.name != LOCKED:
-        drive = Drive.of(rig)
-        if "u" in samples and samples.keys().isdisjoint(("theta", "omega", "q_pump")):
-            difference = samples["p_A"] - samples["p_B"]
-            u, dp = (np.where(np.isnan(of), 0.0, of) for of in (samples["u"], difference))
-            sense = -1.0 if float((u - u.mean()) @ (dp - dp.mean())) < 0.0 else 1.0
-            samples["omega"] = drive.flow(u, sense * dp, recording.rate) / drive.displacement
-        samples[START] = np.exp(-np.arange(len(recording)) / (recording.rate * drive.lag))
-    return samples
 
 
 def _held(speed: Array, rate: float, area: float = 0.0) -> NDArray[np.bool_]:

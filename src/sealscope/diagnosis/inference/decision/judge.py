@@ -81,7 +81,7 @@ def questions_of(balance: RecordedBalance, against: Rise | None, probability: fl
     """Return the questions that can be asked of a balance."""
     healthy = healthy_leakage(balance.rig)
     # a drive's droop with the load passes for a level of the leak
-    measured = len(balance.columns) == 1 and balance.equations[0].drive is None
+    measured = len(balance.columns) == 1 and not balance.equations[0].by_command
     if not (healthy > 0.0 and against is None and balance.size.stated and measured):
         return questions(balance.test, against, probability)
     own = balance.level

@@ -422,6 +422,14 @@ class Follower:
         follower.covariance, follower.states, follower.last = covariance, states, math.nan
         return follower
 
+    def at(self, rig: Rig, rate: float) -> Follower:
+        """Return it about to take samples at another rate [Hz]: what is known of the machine stays."""
+        machine = Machine.of(rig, rate, self.machine.law)
+        follower = Follower(machine, self.beliefs, self.sense)
+        follower.theta, follower.covariance = self.theta, self.covariance
+        follower.variance, follower.states = self.variance, self.states
+        return follower
+
     def interrupt(self, seconds: float) -> None:
         """Go on after so many seconds without samples, the parameters at most as little known as at first."""
         beliefs = self.beliefs
