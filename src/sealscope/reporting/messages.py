@@ -384,7 +384,7 @@ def what_to_do(diagnosis: Diagnosis) -> str:
 
 
 def table_line(diagnosis: Diagnosis, start_s: float | None = None) -> str:
-    """Return a diagnosis as a line of a table: file, date, verdict, L/min, and where it is no `no leak` what to do.
+    """Return a diagnosis as a line of a table: file, date, verdict, L/min, and what to do where anything changed.
 
     `start_s`: when the recording began [s since 1970].
     """
@@ -392,6 +392,8 @@ def table_line(diagnosis: Diagnosis, start_s: float | None = None) -> str:
     file = file if len(file) <= 22 else f"{file[:10]}..{file[-10:]}"
     date = "" if start_s is None else datetime.fromtimestamp(start_s, UTC).date().isoformat()
     line = f"{file:<22} {date:<10} {diagnosis.verdict:<11} {flow(diagnosis)}"
-    if diagnosis.verdict == "no leak":
+    named = cause(diagnosis)
+    if diagnosis.verdict == "no leak" and named is None:
         return line
-    return f"{line}\n    {shorten(what_to_do(diagnosis), WIDTH - 4)}"
+    before = "" if named is None or diagnosis.verdict == "leak" else f"{named}: "
+    return f"{line}\n    {shorten(before + what_to_do(diagnosis), WIDTH - 4)}"

@@ -13,6 +13,7 @@ import numpy as np
 
 from sealscope.calls import checked_call
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
+from sealscope.diagnosis.verdict.machine import states_rig
 from sealscope.errors import InputError
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Recording
@@ -99,7 +100,8 @@ def _rig_of(diagnosis: Diagnosis, rig: Rig | str | os.PathLike[str] | None) -> R
     from sealscope.parameters import load_rig, rig_names
 
     if rig is not None:
-        return load_rig(rig)
+        own = load_rig(rig)
+        return own if states_rig(own) else None
     machine = diagnosis.machine
     known = machine is not None and machine.stated_by != "nobody" and machine.rig in rig_names()
     return load_rig(machine.rig) if known and machine is not None else None

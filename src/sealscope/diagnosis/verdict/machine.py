@@ -66,7 +66,7 @@ def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) 
     if rig is None:
         stated_by = "recording" if _made_with(recording.provenance, known) else "nobody"
         known = known if stated_by == "recording" else unstated()
-    elif known.entry("cylinder.M_eq").source == f"{ASSUMED} {_REASON}":  # area or displacement was stated, no rig
+    elif not states_rig(known):
         stated_by = "nobody"
     return known, AssumedMachine(
         known.name,
@@ -77,6 +77,11 @@ def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) 
         displacement_stated=known.states("pump.q_b"),
         flow_meter=measures_flow(recording.units),
     )
+
+
+def states_rig(rig: Rig) -> bool:
+    """Whether a rig is somebody's, and not the default one of which area or displacement alone is stated."""
+    return rig.entry("cylinder.M_eq").source != f"{ASSUMED} {_REASON}"
 
 
 def measures_flow(units: Mapping[str, str]) -> bool:
@@ -90,7 +95,8 @@ def healthy_leakage(rig: Rig) -> float:
     What a file assumes of its own pump counts; not what is left of another rig's where only the displacement is stated.
     """
     healthy, pump = rig.entry("pump.G_healthy"), rig.entry("pump.q_b")
-    own = rig.states("pump.G_healthy") or (rig.states("pump.q_b") and healthy.place == pump.place)
+    assumed_of_it = states_rig(rig) and rig.states("pump.q_b") and healthy.place == pump.place
+    own = rig.states("pump.G_healthy") or assumed_of_it
     return rig.pump.G_healthy if own else 0.0
 
 
