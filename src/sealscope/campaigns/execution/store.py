@@ -64,7 +64,7 @@ def made_from(plan: SimulatedPlan, mode: str = RUN_BY_RUN) -> dict[str, Any]:
     """Return what a campaign's rows depend on, as plain values; `mode`: `RUN_BY_RUN` or `batches.IN_BATCHES`."""
     detectors = [plan_detector(name) for name in plan.detectors]
     searching = any(detector.scorer is None for detector in detectors)  # its verdict follows from the probability
-    assumed = plan.assumed or plan.rig
+    assumed = plan.assumed
     return {
         "format": FORMAT,
         "name": plan.name,

@@ -236,7 +236,7 @@ def _facts(result: CampaignResult) -> list[tuple[str, str]]:
 
 def _assumed(plan: SimulatedPlan) -> str:
     """Return what the detectors assume of the machine, as text."""
-    if plan.assumed is None or plan.assumed == plan.rig:
+    if plan.assumed == plan.rig:
         return f"the rig {plan.rig.name} as it stands, not the machine that was drawn"
     true = {row.name: row.value for row in plan.rig.table()}
     other = [f"{row.name} {row.value:g}" if isinstance(row.value, float) else f"{row.name} {row.value}"
