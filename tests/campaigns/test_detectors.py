@@ -9,6 +9,7 @@ import runpy
 from dataclasses import replace
 from pathlib import Path
 from shutil import copytree
+from typing import get_args
 
 import pytest
 
@@ -21,10 +22,11 @@ from sealscope.campaigns.plans.reader import load_plan
 from sealscope.campaigns.results import simulated_result, write_result
 from sealscope.diagnosis import registry
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.verdict.evidence import Evidence
+from sealscope.diagnosis.verdict.evidence import Cause, Evidence
 from sealscope.errors import InputError
 from sealscope.recordings import read
 from sealscope.reporting.campaign.page import campaign_text, render_campaign_page
+from sealscope.simulation.faults import FAULTS
 
 PLAN = """
 [campaign]
@@ -254,12 +256,12 @@ def test_what_names_stand_for(plan):
     [
         ('pressures = ["u"', 'pressures = ["q_leak"', "must not hold q_leak"),
         ('pressures = ["u"', 'pressures = ["v"', "must be a list of channels"),
-        ('pressures = ["u", "p_A", "p_B"]', "pressures = []", "must be a list of channels"),
+        ('pressures = ["u", "p_A", "p_B"]', "pressures = []", "views.pressures must have at least 1"),
         ("[views]", '[views]\n"a @ b" = ["u"]', "plain name"),
         ("seed = 3", 'seed = 3\nassume = "nowhere"', "campaign.assume"),
-        ("seed = 3", "seed = 3\nassume_set = 3", "campaign.assume: must be a table"),
+        ("seed = 3", "seed = 3\nassume_set = 3", "campaign.assume_set must be"),
         ("seed = 3", 'seed = 3\nassume_set = { "V_9" = 1.0 }', "campaign.assume"),
-        ('"watcher",', '"watcher", 3,', "campaign.detectors.1 must be"),
+        ('"watcher",', '"watcher", 3,', "campaign.detectors.2. must be"),
     ],
 )
 def test_what_breaks_a_rule_is_one_line(plan, tmp_path, before, after, message):
@@ -324,7 +326,7 @@ def test_flows_onsets_and_causes_by_hand():
     assert not outcome.thresholds
 
 
-def test_every_fault_of_the_simulator_has_a_cause():
+def test_a_fault_has_the_cause_that_a_detector_should_name():
     for words, cause in (
         ("pump leak x3", "pump leak"),
         ("rod seal B 0.01 L/min", "external leak"),
@@ -332,8 +334,12 @@ def test_every_fault_of_the_simulator_has_a_cause():
         ("air 1 %", "air in the oil"),
         ("sensor p_A gain 2 %", "sensor fault"),
         ("duty amplitude x1.1", "changed duty"),
+        ("circulation from 60 s", "pump leak"),
+        ("filter A x10", "filter A x10"),
+        ("what nobody simulates", "what nobody simulates"),
     ):
         assert cause_of(words) == cause
+    assert {row.cause for row in FAULTS.values()} - {""} <= set(get_args(Cause))
 
 
 def test_the_documented_plan_is_sound_where_the_example_is_installed(monkeypatch):

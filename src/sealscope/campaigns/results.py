@@ -40,17 +40,18 @@ def prior_knowledge(plan: SimulatedPlan | RecordedPlan) -> dict[str, PriorKnowle
     """Return what a plan gives its detectors beside the recording.
 
     A scorer of the two sides of a split knows the true onset where the records are simulated, for they are split
-    there; in recordings it is split half-way, and nothing is known. Registered detectors assume a rig.
+    there; in recordings it is split half-way, and nothing is known. Other detectors assume the rig that the plan
+    states.
     """
     simulated = isinstance(plan, SimulatedPlan)
-    rig = plan.assumed or (plan.rig if isinstance(plan, SimulatedPlan) else None)
+    rig = "" if plan.assumed is None else plan.assumed.name
     known = {}
     for name in plan.detectors:
         detector = plan_detector(name)
         known[name] = PriorKnowledge(
             onset=simulated and detector.scorer is not None and detector.scorer.split,
             channels=tuple(plan.views.get(detector.view, ALL_CHANNELS)),
-            rig=(rig.name if rig is not None else "thesis") if detector.scorer is None else "",
+            rig=rig if detector.scorer is None else "",
         )
     return known
 
