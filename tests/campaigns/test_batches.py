@@ -58,7 +58,7 @@ def alone(plan, case):
     experiment = unsized(plan, case)
     experiment = replace(experiment, step=step_chooser(plan)(case, experiment))
     made = simulate_with_truth(replace(experiment, leaks=sized_once(experiment)))
-    return judged_record(made.recording, plan.onset_s, plan, plan.rig)["scores"], made.truth
+    return judged_record(made.recording, plan.onset_s, plan, plan.rig)[0], made.truth
 
 
 @pytest.mark.slow

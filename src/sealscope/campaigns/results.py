@@ -83,7 +83,7 @@ def held_out_result(plan: HeldOutPlan, samples: MeasuredSamples) -> CampaignResu
     """Return the result of a campaign over measured data; an alarm is log odds over 0."""
     rows = held_out_rows(plan, samples)
     names = detectors_of(plan)
-    judgement = judge(rows, names, own=dict.fromkeys(names, 0.0), confidence=plan.confidence)
+    judgement = judge(rows, names, limits=dict.fromkeys(names, 0.0), confidence=plan.confidence)
     return CampaignResult(plan, tuple(rows), 0, judgement, tuple(checks_of(plan, samples)))
 
 

@@ -77,9 +77,9 @@ def _row(plan: RecordedPlan, recordings: RecordingSet, path: Path, name: str) ->
     )
     try:
         recording = read(path, map=plan.channel_map or None, rate=plan.rate_hz)
-        judged = judged_record(recording, None, plan, assumed_rig(plan.assumed, recording)[0])
+        scores, statements = judged_record(recording, None, plan, assumed_rig(plan.assumed, recording)[0])
         levels[STROKE] = _direction(inspected(recording, INSPECTED).part)
-        return row(**judged)
+        return row(scores=scores, statements=statements)
     except Exception as error:  # one recording must not end the others; the table says it
         if not isinstance(error, SealscopeError):
             _log.debug("cannot judge %s", path, exc_info=True)

@@ -6,7 +6,6 @@ import math
 import os
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TypedDict
 
 from sealscope.campaigns.cases.row import Scores, Statement, finite, rank_of
 from sealscope.campaigns.plans.detectors import ALL_CHANNELS, DIAGNOSE, WATCH, PlanDetector, Views, plan_detector
@@ -26,16 +25,9 @@ INSPECTED = ("u", "x", "p_A", "p_B")
 _PORTION = 1.0
 
 
-class JudgedRecord(TypedDict):
-    """What the row of a record holds of its detectors."""
-
-    scores: Scores
-    statements: dict[str, Statement]
-
-
 def judged_record(
     recording: Recording, split_s: float | None, plan: SimulatedPlan | RecordedPlan, rig: Rig
-) -> JudgedRecord:
+) -> tuple[Scores, dict[str, Statement]]:
     """Return score and onset of each detector of a plan, and what each that is no scorer states; each is run once.
 
     `split_s` [s]: the moment on the recording's time axis at which scorers split it, None for its middle; `rig`: what
@@ -60,7 +52,7 @@ def judged_record(
             statements[detector.name] = statement
             rank = _share(statement) if detector.of == DIAGNOSE else rank_of(statement)
             scores[detector.name] = (rank, statement.onset_s)
-    return {"scores": scores, "statements": statements}
+    return scores, statements
 
 
 def _evidence(detector: PlanDetector, examination: Examination) -> Evidence:

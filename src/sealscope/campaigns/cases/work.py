@@ -34,7 +34,7 @@ def _work(plan: SimulatedPlan, case: CampaignCase, folder: Path | None) -> CaseR
         from sealscope.recordings import write
 
         write(simulated.recording, folder / f"{case.id}.nc")
-    judged = judged_record(simulated.recording, plan.onset_s, plan, plan.assumed)
+    scores, statements = judged_record(simulated.recording, plan.onset_s, plan, plan.assumed)
     bound = None
     if case.leak_lpm in plan.bounded:
         truth = simulated.truth
@@ -42,4 +42,4 @@ def _work(plan: SimulatedPlan, case: CampaignCase, folder: Path | None) -> CaseR
         dp = float(np.mean(np.abs(truth.outputs["p_A"] - truth.outputs["p_B"])[healthy]))
         bound = change_bound(experiment, plan.onset_s, plan.duration_s - plan.onset_s, dp)
     flow = simulated.truth.mean_leak_lpm if case.leak_lpm else 0.0
-    return CaseRow.of(case, flow_lpm=flow, bound_lpm=bound, **judged)
+    return CaseRow.of(case, flow_lpm=flow, scores=scores, statements=statements, bound_lpm=bound)

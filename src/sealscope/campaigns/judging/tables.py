@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from sealscope.campaigns.cases.row import CaseRow
-from sealscope.campaigns.judging.judge import ALLOWED_DETECTION, Judgement
+from sealscope.campaigns.judging.alarms import ALLOWED_DETECTION
+from sealscope.campaigns.judging.judge import Judgement
 from sealscope.storage.atomic import atomic_write
 
 Value = str | float | int | None

@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 
 from sealscope.campaigns.execution.store import RUN_BY_RUN
-from sealscope.campaigns.judging.judge import AlarmShares, DetectorPod, Judgement, SizeRoc
+from sealscope.campaigns.judging.alarms import AlarmShares
+from sealscope.campaigns.judging.curves import DetectorPod, SizeRoc
+from sealscope.campaigns.judging.judge import Judgement
 from sealscope.campaigns.judging.tables import PriorKnowledge
 from sealscope.campaigns.plans.detectors import DIAGNOSE, plan_detector
 from sealscope.campaigns.plans.model import HeldOutPlan, RecordedPlan, SimulatedPlan
