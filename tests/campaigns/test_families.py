@@ -14,7 +14,7 @@ from sealscope.campaigns.judging.tables import tables_of
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.errors import InputError
-from sealscope.reporting.campaign.tables import page_tables
+from sealscope.reporting.campaign.page_tables import page_tables
 from sealscope.simulation.experiment import Experiment
 
 NAME = "diagnose"

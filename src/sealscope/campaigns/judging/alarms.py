@@ -52,6 +52,11 @@ class AlarmShares:
     failed: int = 0
 
     @property
+    def leak(self) -> str:
+        """Size and law of the leak, in words."""
+        return f"{self.leak_lpm:g} {self.law}" if self.leak_lpm else "no leak"
+
+    @property
     def informedness(self) -> float:
         """Share of alarms less that of false alarms, 0 for chance."""
         return self.alarms.value - self.false_alarm.value if self.false_alarm else math.nan

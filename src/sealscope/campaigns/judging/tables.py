@@ -44,7 +44,7 @@ def _columns() -> dict[str, dict[str, str]]:
     return tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
-def _attribute(of: Any, path: str) -> Any:
+def attribute_of(of: Any, path: str) -> Any:
     """Return an attribute by its path, of a mapping or of a tuple its entry; None where there is none on the way."""
     for name in path.split("."):
         if of is None:
@@ -56,7 +56,7 @@ def _attribute(of: Any, path: str) -> Any:
 def _cells(column: str, content: str, row: Any, factors: Sequence[str]) -> TableRow:
     """Return the cells of one column of `tables.toml`: one, or several by name."""
     *how, path = content.split(" ")
-    value = _attribute(row, path)
+    value = attribute_of(row, path)
     if path == "levels":
         return {name: value.get(name) for name in factors}
     if "share" in how:
@@ -98,7 +98,7 @@ def tables_of(
         cells: TableRow = {}
         for column, content in columns.items():
             if content.startswith("known ") and given:
-                cells[column] = _attribute(given.get(_attribute(row, "detector")), content.removeprefix("known "))
+                cells[column] = attribute_of(given.get(attribute_of(row, "detector")), content.removeprefix("known "))
             elif not content.startswith("known "):
                 name = column.format(unit=unit, allowed=ALLOWED_DETECTION)
                 cells |= _cells(name, content, row, factors)
@@ -126,7 +126,7 @@ def records_table(rows: Iterable[CaseRow], detectors: Sequence[str], unit: str =
         }
         for name in stating:
             for column, content in _columns()["records"].items():
-                record[f"{name}: {column}"] = _attribute(row.statements.get(name), content)
+                record[f"{name}: {column}"] = attribute_of(row.statements.get(name), content)
         table.append({**record, "error": row.error})
     return table
 

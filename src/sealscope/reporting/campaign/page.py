@@ -23,7 +23,7 @@ from sealscope.evaluation.binomial import Proportion
 from sealscope.evaluation.roc import Area
 from sealscope.recordings.channels import Array
 from sealscope.reporting import template
-from sealscope.reporting.campaign.tables import cause_tables, page_tables, percent
+from sealscope.reporting.campaign.page_tables import cause_tables, page_tables, percent
 from sealscope.reporting.messages import say
 from sealscope.reporting.picture import Scale
 
