@@ -210,6 +210,8 @@ def test_rows_of_other_assumptions_are_not_mixed_in(plan, done, tmp_path, change
         text = text.replace(*change[1])
     (tmp_path / "watched.toml").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=message):
+        simulated_result(load_plan(tmp_path / "watched.toml"), done)
+    with pytest.raises(InputError, match=message):
         campaign.run(load_plan(tmp_path / "watched.toml"), done, jobs=1)
 
 
@@ -261,6 +263,7 @@ def test_what_names_stand_for(plan):
         ("seed = 3", 'seed = 3\nassume = "nowhere"', "campaign.assume"),
         ("seed = 3", "seed = 3\nassume_set = 3", "campaign.assume_set must be"),
         ("seed = 3", 'seed = 3\nassume_set = { "V_9" = 1.0 }', "campaign.assume"),
+        ("false_alarm = 0.2", "false_alarm = 0.3", "campaign.false_alarm: .* got 0.3"),
         ('"watcher",', '"watcher", 3,', "campaign.detectors.2. must be"),
     ],
 )

@@ -85,6 +85,10 @@ def test_a_campaign_over_recordings_goes_on(batch, call, monkeypatch, tmp_path):
         '[[recordings.sets]]\nfiles = "*.nc"\n'
     )
 
+    done = call("campaign", "run", tmp_path / "plan.toml", "--data", batch, "-o", tmp_path / "rows")
+    assert done.status == 1
+    assert "bad.nc" in done.err
+
     def failing(*arguments):
         raise IndexError("deep")
 

@@ -6,6 +6,7 @@ import hashlib
 import logging
 import os
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -31,7 +32,7 @@ ProgressCallback = Callable[[int, int, int], None]
 
 def _natural(path: Path) -> list[str | int]:
     """Return a key that orders names as people count: stroke 2 before stroke 10."""
-    return [int(word) if word.isdigit() else word for word in re.split(r"(\d+)", path.name)]
+    return [int(word) if word.isdecimal() else word for word in re.split(r"(\d+)", path.name)]
 
 
 def _files(plan: RecordedPlan, folder: Path) -> Iterator[tuple[RecordingSet, Path]]:
@@ -46,11 +47,12 @@ def _files(plan: RecordedPlan, folder: Path) -> Iterator[tuple[RecordingSet, Pat
 def recorded_rows(plan: RecordedPlan, folder: Path, progress: ProgressCallback | None = None) -> list[CaseRow]:
     """Return a row for each recording, in the order of their ids; one that cannot be judged has its error."""
     files = list(_files(plan, folder))
+    for path, count in Counter(path for _, path in files).items():
+        if count > 1:
+            raise InputError(f"a recording must be in one set, got it in two ({path})")
     rows: dict[str, CaseRow] = {}
     for number, (recordings, path) in enumerate(files, 1):
         row = _row(plan, recordings, path, path.relative_to(folder).as_posix())
-        if row.id in rows:
-            raise InputError(f"a recording must be in one set, got it in two ({path})")
         rows[row.id] = row
         if progress is not None:
             progress(number, len(files), sum(row.error is not None for row in rows.values()))

@@ -107,11 +107,12 @@ class CaseRow(CaseInputs):
 
     `flow_lpm`: mean leak [L/min] while open, as the run really had it; `bound_lpm`: standard deviation [L/min] of the
     best unbiased estimate of the change at the onset, from pressures and command (`bound.change_bound`), None where it
-    was not asked for or there is none; `scores` and `statements` by the plan's name of a detector; `seconds`: processor
-    time, which takes no part in the result.
+    was not asked for (`bounded`) or there is none; `scores` and `statements` by the plan's name of a detector;
+    `seconds`: processor time, which takes no part in the result.
     """
 
     flow_lpm: float | None = None
+    bounded: bool = False
     scores: Scores = field(default_factory=dict)
     error: str | None = None
     seconds: float = 0.0

@@ -35,11 +35,11 @@ def _work(plan: SimulatedPlan, case: CampaignCase, folder: Path | None) -> CaseR
 
         write(simulated.recording, folder / f"{case.id}.nc")
     scores, statements = judged_record(simulated.recording, plan.onset_s, plan, plan.assumed)
-    bound = None
-    if case.leak_lpm in plan.bounded:
+    bound, bounded = None, case.leak_lpm in plan.bounded
+    if bounded:
         truth = simulated.truth
         healthy = truth.t < plan.onset_s
         dp = float(np.mean(np.abs(truth.outputs["p_A"] - truth.outputs["p_B"])[healthy]))
         bound = change_bound(experiment, plan.onset_s, plan.duration_s - plan.onset_s, dp)
     flow = simulated.truth.mean_leak_lpm if case.leak_lpm else 0.0
-    return CaseRow.of(case, flow_lpm=flow, scores=scores, statements=statements, bound_lpm=bound)
+    return CaseRow.of(case, flow_lpm=flow, scores=scores, statements=statements, bounded=bounded, bound_lpm=bound)

@@ -42,11 +42,18 @@ def _file_name(name: str) -> str:
 
 def _pattern(files: str) -> str:
     parts = Path(files).parts
-    if Path(files).is_absolute() or ".." in parts:
+    if not parts or Path(files).is_absolute() or ".." in parts:
         raise ValueError("must be a pattern within the folder")
     if "\0" in files or any("**" in part and part != "**" for part in parts) or files.count("**") > 1:
         raise ValueError("must be a pattern of names, with ** once at most")
     return files
+
+
+def _level(value: Any) -> Any:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if isinstance(value, str) or (number and math.isfinite(value)):
+        return value
+    raise ValueError(f"must be a text or a number, got {value!r:.60}")
 
 
 def _channels(names: tuple[str, ...]) -> tuple[str, ...]:
@@ -74,7 +81,7 @@ Seconds = Annotated[Number, _quantity("s")]
 #: Names, one or more.
 Names = Annotated[tuple[str, ...], Field(min_length=1)]
 Channels = Annotated[Names, AfterValidator(_channels)]
-Level = str | Annotated[int, Field(strict=True)] | Number
+Level = Annotated[str | int | float, BeforeValidator(_level)]
 Values = Mapping[str, Any]
 
 
@@ -154,7 +161,7 @@ class SimulatedPlan(_JudgedPlan):
 
     rig_name: Annotated[Text, Field(alias="rig")] = "thesis"
     rig_set: Annotated[Values, Field(alias="set")] = field(default_factory=dict)
-    rate: str | float | None = None
+    rate: Level | None = None
     profile: Text = ""
     duration_s: Annotated[Seconds, Field(alias="duration")]
     onset_s: Annotated[Seconds, Field(alias="onset")] = math.nan

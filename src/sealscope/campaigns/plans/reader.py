@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from sealscope.campaigns.plans.detectors import check_detector, plan_detector
+from sealscope.campaigns.plans.detectors import DIAGNOSE, WATCH, check_detector, plan_detector
 from sealscope.campaigns.plans.duty import (
     COMMAND,
     CONTROLLER,
@@ -21,6 +21,7 @@ from sealscope.campaigns.plans.duty import (
     voltage_in,
 )
 from sealscope.campaigns.plans.model import AnyPlan, HeldOutPlan, RecordedPlan, SimulatedPlan
+from sealscope.diagnosis.diagnose import check_probability
 from sealscope.errors import InputError
 from sealscope.evaluation.thresholds import records_needed
 from sealscope.parameters import load_rig
@@ -32,11 +33,15 @@ _T = TypeVar("_T")
 _PACKAGED = Path(__file__).parent / "packaged"
 #: Most records of a campaign: a mistyped count shall not plan a year of work. Most combinations of levels.
 MOST_RECORDS, MOST_CELLS = 1_000_000, 100_000
-#: What holds the records of a plan -> its kind, and the tables that it has.
-_KINDS: Mapping[str, tuple[type[AnyPlan], tuple[str, ...]]] = {
-    "recordings": (RecordedPlan, ("campaign", "views", "recordings")),
-    "held_out": (HeldOutPlan, ("campaign", "held_out")),
-    "records": (SimulatedPlan, ("campaign", "factors", "views", "records")),
+#: What holds the records of a plan -> its kind, the tables that it has, and the entries of the last of them.
+_KINDS: Mapping[str, tuple[type[AnyPlan], tuple[str, ...], tuple[str, ...]]] = {
+    "recordings": (RecordedPlan, ("campaign", "views", "recordings"), ("map", "rate", "unit", "sets")),
+    "held_out": (
+        HeldOutPlan,
+        ("campaign", "held_out"),
+        ("data", "leave_out", "permutations", "seed", "detectors"),
+    ),
+    "records": (SimulatedPlan, ("campaign", "factors", "views", "records"), ()),
 }
 
 
@@ -58,16 +63,19 @@ def load_plan(name_or_path: str | os.PathLike[str]) -> AnyPlan:
 def read_plan(tree: Mapping[str, Any], place: str = "plan") -> AnyPlan:
     """Read the plan in a TOML file's tables; its kind follows from the tables that are there."""
     source = next((name for name in _KINDS if name in tree), "records")
-    kind, tables = _KINDS[source]
+    kind, tables, own = _KINDS[source]
     for key in tree:
         if key not in tables:
             known = ", ".join(f"[{name}]" for name in tables)
             raise InputError(f"[{key}] is not known; a plan with [{source}] has {known} ({place})")
     entries, names = dict(tree), {"records": "records"} | {name: name for name in tree}
-    for table in {"campaign", "recordings", "held_out"} & tree.keys():  # whose entries are fields of the plan
-        given = entries.pop(table)
+    for table in ("campaign", source) if own else ("campaign",):  # their entries are fields of the plan
+        given = entries.pop(table, {})
         if not isinstance(given, Mapping):
             raise InputError(f"{table} must be a table, got {given!r} ({place})")
+        for entry in given:
+            if (entry in own) != (table == source) or entry in ("place", *tables):
+                raise InputError(f"{table}.{entry} is not known ({place})")
         entries |= given
         names |= {entry: f"{table}.{entry}" for entry in given}
     plan = read_model(entries | {"place": place}, kind, place, lambda entry: names.get(entry, f"campaign.{entry}"))
@@ -85,6 +93,8 @@ def read_plan(tree: Mapping[str, Any], place: str = "plan") -> AnyPlan:
     _in("campaign.assume", place, lambda: plan.assumed)
     for name in plan.detectors:
         _in("campaign.detectors", place, partial(check_detector, name, plan.views))
+    if {DIAGNOSE, WATCH} & {plan_detector(name).of for name in plan.detectors}:
+        _in("campaign.false_alarm", place, partial(check_probability, plan.false_alarm))
     if len(set(plan.detectors)) < len(plan.detectors):
         raise InputError(f"campaign.detectors must be named once each ({place})")
     return plan
