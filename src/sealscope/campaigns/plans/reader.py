@@ -62,30 +62,14 @@ def load_plan(name_or_path: str | os.PathLike[str]) -> AnyPlan:
 
 def read_plan(tree: Mapping[str, Any], place: str = "plan") -> AnyPlan:
     """Read the plan in a TOML file's tables; its kind follows from the tables that are there."""
-    source = next((name for name in _KINDS if name in tree), "records")
-    kind, tables, own = _KINDS[source]
-    for key in tree:
-        if key not in tables:
-            known = ", ".join(f"[{name}]" for name in tables)
-            raise InputError(f"[{key}] is not known; a plan with [{source}] has {known} ({place})")
-    entries, names = dict(tree), {"records": "records"} | {name: name for name in tree}
-    for table in ("campaign", source) if own else ("campaign",):  # their entries are fields of the plan
-        given = entries.pop(table, {})
-        if not isinstance(given, Mapping):
-            raise InputError(f"{table} must be a table, got {given!r} ({place})")
-        for entry in given:
-            if (entry in own) != (table == source) or entry in ("place", *tables):
-                raise InputError(f"{table}.{entry} is not known ({place})")
-        entries |= given
-        names |= {entry: f"{table}.{entry}" for entry in given}
-    plan = read_model(entries | {"place": place}, kind, place, lambda entry: names.get(entry, f"campaign.{entry}"))
+    plan = _entries(tree, place)
     plan = replace(plan, title=plan.title or plan.name)
     if isinstance(plan, HeldOutPlan):
         if len({classifier.name for classifier in plan.detectors}) < len(plan.detectors):
             raise InputError(f"held_out.detectors must have names of their own ({place})")
         return plan
-    given_none = {} if plan.channels is None else {"": plan.channels}
-    plan = replace(plan, views={**plan.views, **given_none}, assume=plan.assume and _beside(plan.assume, place))
+    without_view = {} if plan.channels is None else {"": plan.channels}
+    plan = replace(plan, views={**plan.views, **without_view}, assume=plan.assume and _beside(plan.assume, place))
     if isinstance(plan, SimulatedPlan):
         plan = _simulated(plan)
     elif not any(recordings.use == "judge" for recordings in plan.sets):
@@ -98,6 +82,27 @@ def read_plan(tree: Mapping[str, Any], place: str = "plan") -> AnyPlan:
     if len(set(plan.detectors)) < len(plan.detectors):
         raise InputError(f"campaign.detectors must be named once each ({place})")
     return plan
+
+
+def _entries(tree: Mapping[str, Any], place: str) -> AnyPlan:
+    """Return the entries of all tables as a plan, each checked alone; an error names the table of its entry."""
+    source = next((name for name in _KINDS if name in tree), "records")
+    kind, tables, own = _KINDS[source]
+    for key in tree:
+        if key not in tables:
+            known = ", ".join(f"[{name}]" for name in tables)
+            raise InputError(f"[{key}] is not known; a plan with [{source}] has {known} ({place})")
+    entries, names = {**tree, "place": place}, {name: name for name in tables}
+    for table in ("campaign", source) if own else ("campaign",):
+        given = entries.pop(table, {})
+        if not isinstance(given, Mapping):
+            raise InputError(f"{table} must be a table, got {given!r} ({place})")
+        for entry in given:
+            if (entry in own) != (table == source) or entry in ("place", *tables):
+                raise InputError(f"{table}.{entry} is not known ({place})")
+            names[entry] = f"{table}.{entry}"
+        entries |= given
+    return read_model(entries, kind, place, lambda entry: names.get(entry, f"campaign.{entry}"))
 
 
 def _in(entry: str, place: str, read: Callable[[], _T]) -> _T:
