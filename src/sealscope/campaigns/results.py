@@ -56,15 +56,20 @@ def prior_knowledge(plan: SimulatedPlan | RecordedPlan) -> dict[str, PriorKnowle
     return known
 
 
-def _judged(plan: SimulatedPlan | RecordedPlan, rows: Sequence[CaseRow], **known: float) -> Judgement:
+def _judged(
+    plan: SimulatedPlan | RecordedPlan,
+    rows: Sequence[CaseRow],
+    onset_s: float | None = None,
+    hours: float | None = None,
+) -> Judgement:
     return judge(
         rows,
         plan.detectors,
         false_alarm=plan.false_alarm,
         promise=plan.promise,
         confidence=plan.confidence,
-        onset_s=known.get("onset_s"),
-        hours=known.get("hours"),
+        onset_s=onset_s,
+        hours=hours,
     )
 
 
