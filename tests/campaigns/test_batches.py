@@ -12,14 +12,13 @@ from scipy import stats
 
 from sealscope.campaigns.cases.case import cases_of
 from sealscope.campaigns.cases.machines import sized_once, unsized
-from sealscope.campaigns.cases.scoring import stated
+from sealscope.campaigns.cases.scoring import judged_record
 from sealscope.campaigns.cases.work import work
 from sealscope.campaigns.execution import batches, store
 from sealscope.campaigns.execution import run as campaign
 from sealscope.campaigns.execution.batches import step_chooser
 from sealscope.campaigns.plans.reader import read_plan
 from sealscope.campaigns.results import simulated_result, write_result
-from sealscope.diagnosis.diagnose import Examination
 from sealscope.errors import InputError
 from sealscope.simulation.simulate import simulate_with_truth
 
@@ -59,8 +58,7 @@ def alone(plan, case):
     experiment = unsized(plan, case)
     experiment = replace(experiment, step=step_chooser(plan)(case, experiment))
     made = simulate_with_truth(replace(experiment, leaks=sized_once(experiment)))
-    examination = Examination(made.recording, false_alarm_probability=plan.false_alarm, rig=plan.rig)
-    return stated(examination, plan.onset_s, plan.detectors, plan.views)[0], made.truth
+    return judged_record(made.recording, plan.onset_s, plan, plan.rig)[0], made.truth
 
 
 @pytest.mark.slow

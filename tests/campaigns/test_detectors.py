@@ -9,6 +9,7 @@ import runpy
 from dataclasses import replace
 from pathlib import Path
 from shutil import copytree
+from typing import get_args
 
 import pytest
 
@@ -21,10 +22,11 @@ from sealscope.campaigns.plans.reader import load_plan
 from sealscope.campaigns.results import simulated_result, write_result
 from sealscope.diagnosis import registry
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.verdict.evidence import Evidence
+from sealscope.diagnosis.verdict.evidence import Cause, Evidence
 from sealscope.errors import InputError
 from sealscope.recordings import read
 from sealscope.reporting.campaign.page import campaign_text, render_campaign_page
+from sealscope.simulation.faults import FAULTS
 
 PLAN = """
 [campaign]
@@ -208,6 +210,8 @@ def test_rows_of_other_assumptions_are_not_mixed_in(plan, done, tmp_path, change
         text = text.replace(*change[1])
     (tmp_path / "watched.toml").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=message):
+        simulated_result(load_plan(tmp_path / "watched.toml"), done)
+    with pytest.raises(InputError, match=message):
         campaign.run(load_plan(tmp_path / "watched.toml"), done, jobs=1)
 
 
@@ -254,12 +258,13 @@ def test_what_names_stand_for(plan):
     [
         ('pressures = ["u"', 'pressures = ["q_leak"', "must not hold q_leak"),
         ('pressures = ["u"', 'pressures = ["v"', "must be a list of channels"),
-        ('pressures = ["u", "p_A", "p_B"]', "pressures = []", "must be a list of channels"),
+        ('pressures = ["u", "p_A", "p_B"]', "pressures = []", "views.pressures must have at least 1"),
         ("[views]", '[views]\n"a @ b" = ["u"]', "plain name"),
         ("seed = 3", 'seed = 3\nassume = "nowhere"', "campaign.assume"),
-        ("seed = 3", "seed = 3\nassume_set = 3", "campaign.assume: must be a table"),
+        ("seed = 3", "seed = 3\nassume_set = 3", "campaign.assume_set must be"),
         ("seed = 3", 'seed = 3\nassume_set = { "V_9" = 1.0 }', "campaign.assume"),
-        ('"watcher",', '"watcher", 3,', "campaign.detectors.1 must be"),
+        ("false_alarm = 0.2", "false_alarm = 0.3", "campaign.false_alarm: .* got 0.3"),
+        ('"watcher",', '"watcher", 3,', "campaign.detectors.2. must be"),
     ],
 )
 def test_what_breaks_a_rule_is_one_line(plan, tmp_path, before, after, message):
@@ -324,7 +329,7 @@ def test_flows_onsets_and_causes_by_hand():
     assert not outcome.thresholds
 
 
-def test_every_fault_of_the_simulator_has_a_cause():
+def test_a_fault_has_the_cause_that_a_detector_should_name():
     for words, cause in (
         ("pump leak x3", "pump leak"),
         ("rod seal B 0.01 L/min", "external leak"),
@@ -332,8 +337,12 @@ def test_every_fault_of_the_simulator_has_a_cause():
         ("air 1 %", "air in the oil"),
         ("sensor p_A gain 2 %", "sensor fault"),
         ("duty amplitude x1.1", "changed duty"),
+        ("circulation from 60 s", "pump leak"),
+        ("filter A x10", "filter A x10"),
+        ("what nobody simulates", "what nobody simulates"),
     ):
         assert cause_of(words) == cause
+    assert {row.cause for row in FAULTS.values()} - {""} <= set(get_args(Cause))
 
 
 def test_the_documented_plan_is_sound_where_the_example_is_installed(monkeypatch):

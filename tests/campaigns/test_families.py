@@ -8,12 +8,13 @@ from sealscope.campaigns.cases.bound import UNKNOWN, change_bound, in_lpm, leak_
 from sealscope.campaigns.cases.case import cases_of
 from sealscope.campaigns.cases.machines import leak_of
 from sealscope.campaigns.cases.row import CaseRow
-from sealscope.campaigns.judging.judge import ALL, ANY_LAW, judge
+from sealscope.campaigns.judging.alarms import ALL, ANY_LAW
+from sealscope.campaigns.judging.judge import judge
 from sealscope.campaigns.judging.tables import tables_of
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.errors import InputError
-from sealscope.reporting.campaign.tables import page_tables
+from sealscope.reporting.campaign.page_tables import page_tables
 from sealscope.simulation.experiment import Experiment
 
 NAME = "diagnose"

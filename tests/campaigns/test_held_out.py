@@ -161,7 +161,7 @@ def test_swapped_labels_show_what_chance_reaches():
     swapped = swapped_areas(samples, detector, "test", 60, seed=5)
     assert np.array_equal(swapped, swapped_areas(samples, detector, "test", 60, seed=5))
     assert 0.3 < np.mean(swapped) < 0.55  # held out, what is not there is found less often than by guessing
-    plan = HeldOutPlan("x", "appendix-c", (detector, CHOSEN), permutations=60, seed=5)
+    plan = HeldOutPlan(name="x", data="appendix-c", detectors=(detector, CHOSEN), permutations=60, seed=5)
     first, second = checks_of(plan, samples)
     assert (first.reached, first.swaps) == (0, 60)
     assert first.chance == pytest.approx(np.quantile(swapped, 0.95))
@@ -169,10 +169,10 @@ def test_swapped_labels_show_what_chance_reaches():
     assert sum(times for _, times in second.picks) == 24
     assert "0 reach" in first.sentence()
     assert "good" in second.sentence()
-    useless = checks_of(HeldOutPlan("x", "appendix-c", (LogisticClassifier("n", ("noise",), 1.0),),
+    useless = checks_of(HeldOutPlan(name="x", data="appendix-c", detectors=(LogisticClassifier("n", ("noise",), 1.0),),
                                     permutations=60), paired(3))  # fmt: skip
     assert useless[0].reached > 1
-    assert checks_of(HeldOutPlan("x", "appendix-c", (detector,)), samples) == []
+    assert checks_of(HeldOutPlan(name="x", data="appendix-c", detectors=(detector,)), samples) == []
 
 
 def test_the_interval_of_clustered_samples():

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import csv
 import re
-from shutil import copytree
+from shutil import copy, copytree
 
 import pytest
 
 from sealscope.campaigns.cases.recordings import recorded_rows
 from sealscope.campaigns.held_out.data_sets import hydraulic_samples, needs_folder
 from sealscope.campaigns.plans.reader import load_plan
-from sealscope.campaigns.results import held_out_result, recorded_result, write_result
+from sealscope.campaigns.results import held_out_result, prior_knowledge, recorded_result, write_result
+from sealscope.diagnosis.diagnose import diagnose
 from sealscope.errors import InputError, UnreadableFile
-from sealscope.recordings import write
+from sealscope.recordings import read, write
+from sealscope.reporting.campaign.page import campaign_text, render_campaign_page
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_with_truth
 
@@ -106,12 +108,52 @@ def test_a_file_that_cannot_be_judged_is_a_row_with_its_error(folder):
         ("end = 11", "end = 11\nsize = 1.0", "0 to calibrate"),
         ('rate = "500 Hz"', "map = 3", "recordings.map must be a valid"),
         ("size = 0.3", "colour = 1", "colour is not known"),
+        ('files = "leaky-*.csv"', 'files = ""', "recordings.sets[3].files must be"),
+        ('name = "mine"', 'name = "mine"\nplace = "here"', "campaign.place is not known"),
+        ('name = "mine"', 'name = "mine"\nrate = "1 kHz"', "campaign.rate is not known"),
     ],
 )
 def test_a_wrong_plan_is_one_line(tmp_path, before, after, message):
     assert before in PLAN
     with pytest.raises(InputError, match=re.escape(message)):
         plan_of(tmp_path, PLAN.replace(before, after))
+
+
+@pytest.mark.parametrize("stated", [False, True])
+def test_a_recording_is_judged_as_diagnose_judges_it(recordings, tmp_path, stated):
+    """Where nobody states a rig neither of them states a flow, and the plan has given none."""
+    text = PLAN[: PLAN.index("[[recordings.sets]]")] + '[[recordings.sets]]\nfiles = "leaky-0.csv"\n'
+    text = text.replace('"d3 of p_A changed", "sign rule: d3 of p_A fell"]', '"diagnose", "volume balance"]')
+    plan = plan_of(tmp_path, text.replace("[recordings]", 'assume = "thesis"\n[recordings]') if stated else text)
+    lines = (recordings / "leaky-0.csv").read_text(encoding="utf-8").splitlines(keepends=True)
+    file = tmp_path / "leaky-0.csv"
+    file.write_text("".join(line for line in lines if not line.startswith("#")), encoding="utf-8")  # of no known rig
+    (row,) = recorded_rows(plan, tmp_path)
+    diagnosis = diagnose(
+        read(file, rate=500.0),
+        rig="thesis" if stated else None,
+        false_alarm_probability=plan.false_alarm,
+    )
+    said = row.statements["diagnose"]
+    assert (said.verdict, said.onset_s, said.leak_lpm) == (diagnosis.verdict, diagnosis.onset_s, diagnosis.leak_lpm)
+    assert (said.verdict, said.leak_lpm is not None) == ("leak", stated)
+    assert {known.rig for known in prior_knowledge(plan).values()} == {"thesis" if stated else ""}
+
+
+def test_names_of_files_may_hold_any_digit(recordings, tmp_path):
+    for name in ("1²2.csv", "1.csv", "².csv"):
+        copy(recordings / "healthy-1.csv", tmp_path / name)
+    text = PLAN[: PLAN.index("[[recordings.sets]]")] + '[[recordings.sets]]\nfiles = "*.csv"\n'
+    assert len(recorded_rows(plan_of(tmp_path, text.replace('"d3 of p_A changed", ', "")), tmp_path)) == 3
+
+
+def test_one_recording_is_a_campaign(recordings, tmp_path):
+    copy(recordings / "leaky-0.csv", tmp_path)
+    text = PLAN[: PLAN.index("[[recordings.sets]]")] + '[[recordings.sets]]\nfiles = "*.csv"\nsize = 0.3\n'
+    result = recorded_result(plan_of(tmp_path, text.replace('"d3 of p_A changed", ', "")), tmp_path)
+    assert [(row.alarms.count, row.alarms.n, row.false_alarm) for row in result.judgement.table[:1]] == [(1, 1, None)]
+    assert "leaks of 0.3 L/min" in campaign_text(result) + render_campaign_page(result)
+    assert write_result(result, tmp_path / "out")
 
 
 def test_a_set_without_files_and_a_file_in_two_sets_are_refused(folder):

@@ -249,6 +249,35 @@ def test_two_at_once_are_refused(tiny, tmp_path):
         campaign.run(plan, tmp_path / "mine", jobs=1)
 
 
+def test_a_run_that_is_refused_changes_nothing_of_the_one_at_work(tiny, text, tmp_path):
+    other = tmp_path / "other.toml"
+    other.write_text(text.replace("seed = 3", "seed = 4"), encoding="utf-8")
+    folder = tmp_path / "mine"
+    store.begin(folder, store.made_from(load_plan(tiny)))  # it has no row yet
+    with locked(folder, "a campaign"), pytest.raises(InputError, match="by one process at a time"):
+        campaign.run(load_plan(other), folder, jobs=1)
+    assert store.head(folder) == store.made_from(load_plan(tiny))
+
+
+def test_rows_whose_origin_is_lost_are_not_continued(tiny, finished_tiny):
+    (finished_tiny / store.HEAD).unlink()
+    with pytest.raises(InputError, match="continues only with the same"):
+        campaign.run(load_plan(tiny), finished_tiny, jobs=1)
+
+
+def test_a_bound_asked_for_later_is_made(tiny, text, tmp_path):
+    few = text.replace("count = 6", "count = 1").replace("count = 5", "count = 1").replace("count = 10", "count = 8")
+    path = tmp_path / "few.toml"
+    path.write_text(few, encoding="utf-8")
+    assert campaign.run(load_plan(path), tmp_path / "rows", jobs=1).complete
+    path.write_text(few.replace('leak = "0.015 L/min"', 'leak = "0.015 L/min"\nbound = true'), encoding="utf-8")
+    plan = load_plan(path)
+    assert store.progress_of(plan, tmp_path / "rows").done == plan.size - 1
+    assert campaign.run(plan, tmp_path / "rows", jobs=1).complete
+    rows = store.rows_of(plan, tmp_path / "rows").values()
+    assert {row.leak_lpm for row in rows if row.bound_lpm is not None} == plan.bounded
+
+
 def test_a_spoilt_line_is_refused_with_its_place(tiny, tmp_path):
     plan = load_plan(tiny)
     store.begin(tmp_path, store.made_from(plan))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import multiprocessing
+import os
+import signal
 import time
 from functools import partial
 from importlib import import_module
@@ -23,6 +25,19 @@ def die_on(monkeypatch):
 def test_a_process_that_dies_loses_its_own_item_alone(die_on):
     results = dict(carried_out(partial(die_on, 3), range(8), 2))
     assert results == {item: None if item == 3 else item for item in range(8)}
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="kills as POSIX does")
+def test_a_process_that_dies_idle_loses_nothing():
+    others = {child.pid for child in multiprocessing.active_children()}
+    ended = carried_out(math.sqrt, (float(number) for number in range(6)), 2)
+    results = dict([next(ended)])
+    for child in multiprocessing.active_children():
+        if child.pid not in others:
+            os.kill(child.pid, signal.SIGKILL)
+            child.join()
+    time.sleep(0.5)  # until the parent knows
+    assert results | dict(ended) == {float(number): math.sqrt(number) for number in range(6)}
 
 
 def test_what_a_task_raises_is_raised():

@@ -85,10 +85,14 @@ def test_a_campaign_over_recordings_goes_on(batch, call, monkeypatch, tmp_path):
         '[[recordings.sets]]\nfiles = "*.nc"\n'
     )
 
+    done = call("campaign", "run", tmp_path / "plan.toml", "--data", batch, "-o", tmp_path / "rows")
+    assert done.status == 1
+    assert "bad.nc" in done.err
+
     def failing(*arguments):
         raise IndexError("deep")
 
-    monkeypatch.setattr(module, "stated", failing)
+    monkeypatch.setattr(module, "judged_record", failing)
     rows = module.recorded_rows(load_plan(tmp_path / "plan.toml"), batch)
     assert len(rows) == 3
     assert sum(row.error == "IndexError: deep" for row in rows) == 2

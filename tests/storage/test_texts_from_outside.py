@@ -40,7 +40,7 @@ def test_a_message_is_one_line_of_bounded_length(kind: type[SealscopeError]) -> 
         (f"seed = {'1' * 4400}", "a plan must be TOML"),
         (f"seed = {2**53 + 1}", r"a whole number must be at most 2\^53 in size"),
         (f"duration = 1{'0' * 400}", r"a whole number must be at most 2\^53 in size"),
-        ("channels = [['p_A']]", r"channels must be a list of channels, each once, got \[\['p_A'\]\]"),
+        ("channels = [['p_A']]", r"channels\[1\] must be a valid string, got \['p_A'\]"),
         (f'rig = "{"thesis" * 900}"', "is no packaged rig"),
         ("false_alarm = 1e-320", "the false-alarm probability must be at least 1e-15"),
     ],

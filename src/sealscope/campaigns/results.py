@@ -40,30 +40,36 @@ def prior_knowledge(plan: SimulatedPlan | RecordedPlan) -> dict[str, PriorKnowle
     """Return what a plan gives its detectors beside the recording.
 
     A scorer of the two sides of a split knows the true onset where the records are simulated, for they are split
-    there; in recordings it is split half-way, and nothing is known. Registered detectors assume a rig.
+    there; in recordings it is split half-way, and nothing is known. Other detectors assume the rig that the plan
+    states.
     """
     simulated = isinstance(plan, SimulatedPlan)
-    rig = plan.assumed or (plan.rig if isinstance(plan, SimulatedPlan) else None)
+    rig = "" if plan.assumed is None else plan.assumed.name
     known = {}
     for name in plan.detectors:
         detector = plan_detector(name)
         known[name] = PriorKnowledge(
             onset=simulated and detector.scorer is not None and detector.scorer.split,
             channels=tuple(plan.views.get(detector.view, ALL_CHANNELS)),
-            rig=(rig.name if rig is not None else "thesis") if detector.scorer is None else "",
+            rig=rig if detector.scorer is None else "",
         )
     return known
 
 
-def _judged(plan: SimulatedPlan | RecordedPlan, rows: Sequence[CaseRow], **known: float) -> Judgement:
+def _judged(
+    plan: SimulatedPlan | RecordedPlan,
+    rows: Sequence[CaseRow],
+    onset_s: float | None = None,
+    hours: float | None = None,
+) -> Judgement:
     return judge(
         rows,
         plan.detectors,
         false_alarm=plan.false_alarm,
         promise=plan.promise,
         confidence=plan.confidence,
-        onset_s=known.get("onset_s"),
-        hours=known.get("hours"),
+        onset_s=onset_s,
+        hours=hours,
     )
 
 
@@ -82,7 +88,7 @@ def held_out_result(plan: HeldOutPlan, samples: MeasuredSamples) -> CampaignResu
     """Return the result of a campaign over measured data; an alarm is log odds over 0."""
     rows = held_out_rows(plan, samples)
     names = detectors_of(plan)
-    judgement = judge(rows, names, own=dict.fromkeys(names, 0.0), confidence=plan.confidence)
+    judgement = judge(rows, names, limits=dict.fromkeys(names, 0.0), confidence=plan.confidence)
     return CampaignResult(plan, tuple(rows), 0, judgement, tuple(checks_of(plan, samples)))
 
 

@@ -69,7 +69,8 @@ def run(
     if not isinstance(loaded, SimulatedPlan):
         if batch:
             raise InputError(f"a plan in batches must simulate its records; run it without --batch ({loaded.place})")
-        _report(loaded, place, sheet, data)
+        if _report(loaded, place, sheet, data):
+            raise Exit(1)
         return
     opt.say_jobs(jobs)
     with _progress() as progress:
@@ -135,7 +136,8 @@ def _progress() -> Iterator[ProgressCallback]:
         yield lambda done, total, failures: update(done, total, f"{failures} failed" if failures else "")
 
 
-def _report(plan: AnyPlan, folder: Path, sheet: Path | None, data: Path | None) -> None:
+def _report(plan: AnyPlan, folder: Path, sheet: Path | None, data: Path | None) -> int:
+    """Write tables and page; return how many records failed."""
     from sealscope.campaigns.results import write_result
     from sealscope.reporting.campaign.page import PAGE, campaign_text, write_campaign_page
 
@@ -146,6 +148,7 @@ def _report(plan: AnyPlan, folder: Path, sheet: Path | None, data: Path | None) 
     for row in result.judgement.failed[:5]:
         opt.complain(f"record {row.id} failed: {row.error}")
     echo(f"tables: {folder}\npage:   {folder / PAGE}")
+    return len(result.judgement.failed)
 
 
 def _result(plan: AnyPlan, folder: Path, sheet: Path | None, data: Path | None) -> CampaignResult:

@@ -8,13 +8,12 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, model_validator
 
 from sealscope.diagnosis.live.joining import CHANNELS, in_words, ways_to_watch
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig
-from sealscope.storage.plain_values import one_line
-from sealscope.storage.toml_file import read_toml
+from sealscope.storage.toml_file import read_model, read_toml
 
 _Place = TypeVar("_Place", Path, str)
 _Text = Annotated[str, Field(min_length=1, max_length=100)]
@@ -224,10 +223,8 @@ def read_settings(path: Path) -> MonitorSettings:
     Raises InputError of one line where it cannot be read or breaks a rule.
     """
     values = read_toml(path, "the monitor's settings", os.fspath(path))
-    try:
-        return MonitorSettings.model_validate(values, context={"folder": path.resolve().parent})
-    except ValidationError as error:
-        raise InputError(f"{one_line(error, lambda entry: entry or 'settings')} ({path})") from None
+    context = {"folder": path.resolve().parent}
+    return read_model(values, MonitorSettings, os.fspath(path), lambda entry: entry or "settings", context)
 
 
 def template() -> str:

@@ -65,6 +65,7 @@ class FaultRow:
     kind: str
     pattern: str
     words: str
+    cause: str = ""
     what: str = ""
     parameters: tuple[str, ...] = ()
     factor: bool = False

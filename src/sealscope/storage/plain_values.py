@@ -49,23 +49,20 @@ def _adapter(kind: Any) -> Any:
     return TypeAdapter(kind)
 
 
-def as_type(kind: type[_T], value: Any, named: Callable[[str], str] = str) -> _T:
-    """Return plain values as the dataclass `kind`; ValueError of one line where a value has no place in it.
+def as_type(kind: type[_T], value: Any, named: Callable[[str], str] = str, context: Any = None) -> _T:
+    """Return plain values as the dataclass or model `kind`; ValueError of one line where a value has no place in it.
 
-    `named`: name in the error of an entry of `value`.
+    `named`: name in the error of an entry of `value`; `context` is for the validators of `kind`.
     """
     from pydantic import ValidationError
 
-    if is_dataclass(kind) and isinstance(value, dict):
-        unknown = sorted(map(str, value.keys() - {field.name for field in fields(kind)}))
-        if unknown:
-            raise ValueError(f"{named(unknown[0][:60])} is not known")
     try:
-        return _adapter(kind).validate_python(value)  # type: ignore[no-any-return, arg-type]
+        return _adapter(kind).validate_python(value, context=context)  # type: ignore[no-any-return, arg-type]
     except ValidationError as error:
         raise ValueError(one_line(error, named)) from None
 
 
+#: Rules in plainer words than those of pydantic, by the type of its error.
 _PLAIN_RULES = {
     "missing": "is missing",
     "missing_argument": "is missing",
@@ -77,10 +74,12 @@ _PLAIN_RULES = {
 def one_line(error: ValidationError, named: Callable[[str], str] = str, unit: str = "") -> str:
     """Return what pydantic says first of values: entry, rule and value, as "ENTRY must be ..., got ...".
 
-    `named`: name of an entry of the whole ("" for this); `unit`: of the rule.
+    An entry that is not known comes before others. `named`: name of an entry of the whole ("" for this); `unit`: of the
+    rule.
     """
-    first = error.errors(include_url=False)[0]
-    entry, *inner = map(str, first["loc"] or ("",))
+    errors = error.errors(include_url=False)
+    first = next((own for own in errors if _PLAIN_RULES.get(own["type"]) == "is not known"), errors[0])
+    entry, *inner = (str(part) for part in first["loc"] or ("",) if part != "[key]")
     place = "".join([named(entry), *(f"[{int(part) + 1}]" if part.isdigit() else f".{part}" for part in inner)])
     if plain_rule := _PLAIN_RULES.get(first["type"]):
         return f"{place} {plain_rule}"

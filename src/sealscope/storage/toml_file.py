@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from sealscope.errors import InputError
 from sealscope.storage.opening import open_regular
-from sealscope.storage.plain_values import LARGEST_WHOLE
+from sealscope.storage.plain_values import LARGEST_WHOLE, as_type
 
+_T = TypeVar("_T")
 #: Largest file read [bytes]; what is larger is no file of settings.
 LARGEST = 1_000_000
 #: Most dots in a key: tomllib takes a time that goes with their square. What stands between keys.
@@ -48,6 +49,19 @@ def read_toml(path: Path, what: str, place: str, largest: int = LARGEST) -> dict
     except (ValueError, RecursionError) as error:  # tomllib lets errors of dates and of very long numbers through
         raise InputError(f"{what} must be TOML: {str(error).splitlines()[0]} ({place})") from None
     return tree
+
+
+def read_model(
+    tree: Mapping[str, Any], kind: type[_T], place: str, named: Callable[[str], str] = str, context: Any = None
+) -> _T:
+    """Return the tables of a TOML file as the model or dataclass `kind` (`plain_values.as_type`).
+
+    Raises InputError that names the entry, the rule, the value and the `place`.
+    """
+    try:
+        return as_type(kind, tree, named, context)
+    except ValueError as error:
+        raise InputError(f"{error} ({place})") from None
 
 
 @cache

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -12,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from sealscope.campaigns.cases.row import STROKE, CaseRow, error_text
-from sealscope.campaigns.cases.scoring import stated
+from sealscope.campaigns.cases.scoring import INSPECTED, judged_record
 from sealscope.campaigns.plans.model import RecordedPlan, RecordingSet
-from sealscope.diagnosis.diagnose import Examination
 from sealscope.diagnosis.inspection import inspected
+from sealscope.diagnosis.verdict.machine import assumed_rig
 from sealscope.errors import InputError, SealscopeError
 from sealscope.recordings import read
 from sealscope.recordings.chambers import CHAMBERS
@@ -42,11 +43,12 @@ def _files(plan: RecordedPlan, folder: Path) -> Iterator[tuple[RecordingSet, Pat
 def recorded_rows(plan: RecordedPlan, folder: Path, progress: ProgressCallback | None = None) -> list[CaseRow]:
     """Return a row for each recording, in the order of their ids; one that cannot be judged has its error."""
     files = list(_files(plan, folder))
+    for path, count in Counter(path for _, path in files).items():
+        if count > 1:
+            raise InputError(f"a recording must be in one set, got it in two ({path})")
     rows: dict[str, CaseRow] = {}
     for number, (recordings, path) in enumerate(files, 1):
         row = _row(plan, recordings, path, path.relative_to(folder).as_posix())
-        if row.id in rows:
-            raise InputError(f"a recording must be in one set, got it in two ({path})")
         rows[row.id] = row
         if progress is not None:
             progress(number, len(files), sum(row.error is not None for row in rows.values()))
@@ -63,23 +65,19 @@ def _direction(recording: Recording) -> str:
 
 
 def _row(plan: RecordedPlan, recordings: RecordingSet, path: Path, name: str) -> CaseRow:
-    label = recordings.label or recordings.files
+    levels = {"set": recordings.label or recordings.files, STROKE: "unknown"}
     row = partial(
         CaseRow,
         id=hashlib.sha256(os.fsencode(name)).hexdigest()[:16],
         use=recordings.use,
         leak_lpm=recordings.size,
-        levels={"set": label, STROKE: "unknown"},
+        levels=levels,
     )
     try:
         recording = read(path, map=plan.channel_map or None, rate=plan.rate_hz)
-        record = inspected(recording)
-        if record.defect is not None:
-            return row(error=f"{name}: {record.defect}")
-        part, levels = record.part, {"set": label, STROKE: _direction(record.part)}
-        examination = Examination(part, false_alarm_probability=plan.false_alarm, rig=plan.assumed or "thesis")
-        scores, statements = stated(examination, float(part.t[0]) + part.duration / 2, plan.detectors, plan.views)
-        return row(levels=levels, scores=scores, statements=statements)
+        scores, statements = judged_record(recording, None, plan, assumed_rig(plan.assumed, recording)[0])
+        levels[STROKE] = _direction(inspected(recording, INSPECTED).part)
+        return row(scores=scores, statements=statements)
     except Exception as error:  # one recording must not end the others; the table says it
         if not isinstance(error, SealscopeError):
             _log.debug("cannot judge %s", path, exc_info=True)

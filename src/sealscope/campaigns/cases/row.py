@@ -5,28 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
+from functools import cache
 from typing import Any
 
 from sealscope.campaigns.cases.case import CampaignCase, CaseInputs
 from sealscope.campaigns.plans.duty import COMMAND
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause, Evidence, Verdict
-from sealscope.errors import SealscopeError
+from sealscope.errors import InputError, SealscopeError
 from sealscope.evaluation.table import CANNOT_TELL
+from sealscope.simulation.faults import parse_fault
 from sealscope.storage.plain_values import as_type
 
 PISTON_LEAK, NO_CAUSE = "piston leak", "none"
 #: The level that tells strokes in either direction, of recordings.
 STROKE = "stroke"
-#: First words of a fault as plans have it, and the cause that a detector should name for it.
-_CAUSES = (
-    ("pump leak", "pump leak"),
-    ("rod seal", "external leak"),
-    ("external leak", "external leak"),
-    ("friction", "friction change"),
-    ("air", "air in the oil"),
-    ("sensor", "sensor fault"),
-    ("duty", "changed duty"),
-)
 #: A cause that a detector names where no channel tells two apart, and those two.
 _EITHER = {"piston or pump leak": (PISTON_LEAK, "pump leak")}
 #: detector -> (score, None where it cannot tell; onset [s], None where it finds none)
@@ -57,9 +49,14 @@ class Statement:
         return cls(**values)
 
 
+@cache
 def cause_of(fault: str) -> str:
-    """Return the cause behind a fault as text; a fault that has no cause of its own is its own."""
-    return next((cause for beginning, cause in _CAUSES if fault.startswith(beginning)), fault)
+    """Return the cause that a detector should name for a fault as text; where there is none, the text itself."""
+    try:
+        parsed = parse_fault(fault)
+    except InputError:  # of rows that were not simulated
+        return fault
+    return fault if parsed is None else parsed.row.cause or fault
 
 
 def duty_of(levels: Mapping[str, str | float]) -> str:
@@ -110,11 +107,12 @@ class CaseRow(CaseInputs):
 
     `flow_lpm`: mean leak [L/min] while open, as the run really had it; `bound_lpm`: standard deviation [L/min] of the
     best unbiased estimate of the change at the onset, from pressures and command (`bound.change_bound`), None where it
-    was not asked for or there is none; `scores` and `statements` by the plan's name of a detector; `seconds`: processor
-    time, which takes no part in the result.
+    was not asked for (`bounded`) or there is none; `scores` and `statements` by the plan's name of a detector;
+    `seconds`: processor time, which takes no part in the result.
     """
 
     flow_lpm: float | None = None
+    bounded: bool = False
     scores: Scores = field(default_factory=dict)
     error: str | None = None
     seconds: float = 0.0

@@ -9,30 +9,42 @@ from dataclasses import replace
 
 from sealscope.campaigns.cases.row import Scores, Statement, finite, rank_of
 from sealscope.campaigns.plans.detectors import ALL_CHANNELS, DIAGNOSE, WATCH, PlanDetector, Views, plan_detector
+from sealscope.campaigns.plans.model import RecordedPlan, SimulatedPlan
 from sealscope.campaigns.plans.scorers import Sides
 from sealscope.diagnosis.diagnose import Examination
+from sealscope.diagnosis.inspection import inspected
 from sealscope.diagnosis.live.watch import Watch
 from sealscope.diagnosis.verdict.evidence import Evidence
+from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording
 
+#: Channels that are inspected for findings: those that can spoil a verdict.
+INSPECTED = ("u", "x", "p_A", "p_B")
 #: Samples of a stream arrive in portions of this length [s].
 _PORTION = 1.0
 
 
-def stated(
-    examination: Examination, split_s: float, names: Sequence[str], views: Views
+def judged_record(
+    recording: Recording, split_s: float | None, plan: SimulatedPlan | RecordedPlan, rig: Rig
 ) -> tuple[Scores, dict[str, Statement]]:
-    """Return score and onset of each detector, and what each that is no scorer states; every detector is run once.
+    """Return score and onset of each detector of a plan, and what each that is no scorer states; each is run once.
 
-    `split_s` [s]: the moment on the recording's time axis at which scorers split it.
+    `split_s` [s]: the moment on the recording's time axis at which scorers split it, None for its middle; `rig`: what
+    detectors may assume. Raises InputError for a recording that none of them can judge.
     """
-    detectors = [plan_detector(name) for name in names]
+    record = inspected(recording, INSPECTED)
+    if record.defect is not None:
+        raise InputError(f"the record cannot be judged: {record.defect}" + (f" ({record.file})" if record.file else ""))
+    examination = Examination(record.part, false_alarm_probability=plan.false_alarm, rig=rig, share=record.share)
+    detectors = [plan_detector(name) for name in plan.detectors]
     examinations = {
-        view: examination.through(views.get(view, ALL_CHANNELS)) for view in {d.view: None for d in detectors}
+        view: examination.through(plan.views.get(view, ALL_CHANNELS)) for view in {d.view: None for d in detectors}
     }
-    rules = [detector.name for detector in detectors if detector.scorer is not None]
-    scores = scored(Sides.of(examination.recording, split_s), rules, views) if rules else {}
+    scores: dict[str, tuple[float | None, float | None]] = {}
+    if any(detector.scorer is not None for detector in detectors):
+        split_s = float(record.part.t[0]) + record.part.duration / 2 if split_s is None else split_s
+        scores = scored(Sides.of(record.part, split_s), plan.detectors, plan.views)
     statements: dict[str, Statement] = {}
     for detector in detectors:
         if detector.scorer is None:

@@ -12,15 +12,9 @@ from sealscope.campaigns.cases.bound import change_bound
 from sealscope.campaigns.cases.case import CampaignCase
 from sealscope.campaigns.cases.machines import experiment_of
 from sealscope.campaigns.cases.row import CaseRow, error_text
-from sealscope.campaigns.cases.scoring import stated
+from sealscope.campaigns.cases.scoring import judged_record
 from sealscope.campaigns.plans.model import SimulatedPlan
-from sealscope.diagnosis.diagnose import Examination
-from sealscope.diagnosis.inspection import inspected
-from sealscope.errors import InputError
 from sealscope.simulation.simulate import simulate_with_truth
-
-#: Channels that are inspected for findings: those that can spoil a verdict.
-INSPECTED = ("u", "x", "p_A", "p_B")
 
 
 def work(plan: SimulatedPlan, case: CampaignCase, folder: Path | None = None) -> CaseRow:
@@ -40,21 +34,12 @@ def _work(plan: SimulatedPlan, case: CampaignCase, folder: Path | None) -> CaseR
         from sealscope.recordings import write
 
         write(simulated.recording, folder / f"{case.id}.nc")
-    record = inspected(simulated.recording, INSPECTED)
-    if record.defect is not None:
-        raise InputError(f"the record cannot be judged: {record.defect}")
-    examination = Examination(record.part, false_alarm_probability=plan.false_alarm, rig=plan.assumed or plan.rig)
-    scores, statements = stated(examination, plan.onset_s, plan.detectors, plan.views)
-    bound = None
-    if case.leak_lpm in plan.bounded:
+    scores, statements = judged_record(simulated.recording, plan.onset_s, plan, plan.assumed)
+    bound, bounded = None, case.leak_lpm in plan.bounded
+    if bounded:
         truth = simulated.truth
         healthy = truth.t < plan.onset_s
         dp = float(np.mean(np.abs(truth.outputs["p_A"] - truth.outputs["p_B"])[healthy]))
         bound = change_bound(experiment, plan.onset_s, plan.duration_s - plan.onset_s, dp)
-    return CaseRow.of(
-        case,
-        flow_lpm=simulated.truth.mean_leak_lpm if case.leak_lpm else 0.0,
-        scores=scores,
-        statements=statements,
-        bound_lpm=bound,
-    )
+    flow = simulated.truth.mean_leak_lpm if case.leak_lpm else 0.0
+    return CaseRow.of(case, flow_lpm=flow, scores=scores, statements=statements, bounded=bounded, bound_lpm=bound)

@@ -17,7 +17,7 @@ from sealscope.campaigns.execution.workers import carried_out, process_count
 from sealscope.campaigns.plans.duty import check_controllers
 from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.errors import InputError
-from sealscope.storage.folders import inner_folder
+from sealscope.storage.folders import inner_folder, make_folder
 from sealscope.storage.rows import locked, stored
 
 #: Carries out one case of a plan; `folder` to write its recording into, None for none.
@@ -57,8 +57,9 @@ def run(
         batches.check_plan(plan, cases)
         mode = batches.IN_BATCHES
     place = Path(folder)
-    store.begin(place, store.made_from(plan, mode))
+    make_folder(place)
     with locked(place, store.WHAT):
+        store.begin(place, store.made_from(plan, mode))
         rows = store.rows_of(plan, place)
         if retry:
             rows = {name: row for name, row in rows.items() if row.error is None}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -64,7 +64,7 @@ def made_from(plan: SimulatedPlan, mode: str = RUN_BY_RUN) -> dict[str, Any]:
     """Return what a campaign's rows depend on, as plain values; `mode`: `RUN_BY_RUN` or `batches.IN_BATCHES`."""
     detectors = [plan_detector(name) for name in plan.detectors]
     searching = any(detector.scorer is None for detector in detectors)  # its verdict follows from the probability
-    assumed = plan.assumed or plan.rig
+    assumed = plan.assumed
     return {
         "format": FORMAT,
         "name": plan.name,
@@ -107,10 +107,13 @@ def read_rows(folder: Path) -> dict[str, CaseRow]:
 def rows_of(plan: SimulatedPlan, folder: Path) -> dict[str, CaseRow]:
     """Return the folder's rows that belong to the plan, by case id in rising order.
 
-    A row without one of the plan's detectors is not among them. Raises UnreadableFile for a row that says another input
-    than its case has.
+    A row without one of the plan's detectors, or without a bound that it asks for, is not among them. Raises InputError
+    where the rows were made from something else than the plan says, by whatever sources; UnreadableFile for a row that
+    says another input than its case has.
     """
     made = read_rows(folder)
+    if made:
+        _check_same(folder, head(folder) or {}, made_from(plan), ("mode", "code"))
     wanted = set(plan.detectors)
     of_plan: dict[str, CaseRow] = {}
     for case in sorted(cases_of(plan), key=lambda case: case.id):
@@ -120,7 +123,7 @@ def rows_of(plan: SimulatedPlan, folder: Path) -> dict[str, CaseRow]:
         if any(getattr(row, of.name) != getattr(case, of.name) for of in fields(CaseInputs)):
             place = folder / rows.ROWS
             raise UnreadableFile(f"a row must say the inputs of its case, got others of {case.id} ({place})")
-        if row.error is not None or wanted <= set(row.scores):
+        if row.error is not None or (wanted <= set(row.scores) and (row.bounded or case.leak_lpm not in plan.bounded)):
             of_plan[row.id] = row
     return of_plan
 
@@ -153,13 +156,19 @@ def head(folder: Path) -> dict[str, Any] | None:
 def begin(folder: Path, source: Mapping[str, Any]) -> None:
     """Make the folder a campaign's, or continue in it; raise InputError where it holds rows of another campaign."""
     make_folder(folder)
-    before = head(folder)
-    if before is not None and (folder / rows.ROWS).is_file():
-        for key, name in _SAME.items():
-            if before.get(key) != source[key]:
-                raise InputError(
-                    f"a campaign continues only with the same {name}: its rows would not belong together; choose "
-                    f"another folder or remove this one ({folder})"
-                )
+    before = head(folder) or {}
+    if (folder / rows.ROWS).is_file():
+        open_inner(folder / rows.ROWS, f"{WHAT}'s file of rows", "ab+").close()
+        _check_same(folder, before, source)
     with atomic_write(folder / HEAD) as temporary:
         temporary.write_text(json.dumps(source, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+
+
+def _check_same(folder: Path, before: Mapping[str, Any], source: Mapping[str, Any], but: Collection[str] = ()) -> None:
+    """Raise InputError where rows made from what `before` says were not made from `source`, `but` for these entries."""
+    for key, name in _SAME.items():
+        if key not in but and before.get(key) != source[key]:
+            raise InputError(
+                f"a campaign continues only with the same {name}: its rows would not belong together; choose "
+                f"another folder or remove this one ({folder})"
+            )

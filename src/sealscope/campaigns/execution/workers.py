@@ -50,7 +50,12 @@ def carried_out(
         while True:
             for item in islice(waiting, (1 if tried_again else pools.most) - len(busy)):
                 pool = idle.pop() if idle else pools.new()
-                busy[pools.submit(pool, item)] = pool, item
+                try:
+                    future = pools.submit(pool, item)
+                except pools.death:  # of an idle process
+                    pool = pools.new()
+                    future = pools.submit(pool, item)
+                busy[future] = pool, item
             if not busy:
                 if tried_again or not died:
                     return

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from sealscope.campaigns.cases.row import CaseRow
-from sealscope.campaigns.judging.judge import ALLOWED_DETECTION, Judgement
+from sealscope.campaigns.judging.alarms import ALLOWED_DETECTION
+from sealscope.campaigns.judging.judge import Judgement
 from sealscope.storage.csv_file import write_csv
 
 Value = str | float | int | None
@@ -42,7 +43,7 @@ def _columns() -> dict[str, dict[str, str]]:
     return tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
-def _attribute(of: Any, path: str) -> Any:
+def attribute_of(of: Any, path: str) -> Any:
     """Return an attribute by its path, of a mapping or of a tuple its entry; None where there is none on the way."""
     for name in path.split("."):
         if of is None:
@@ -54,7 +55,7 @@ def _attribute(of: Any, path: str) -> Any:
 def _cells(column: str, content: str, row: Any, factors: Sequence[str]) -> TableRow:
     """Return the cells of one column of `tables.toml`: one, or several by name."""
     *how, path = content.split(" ")
-    value = _attribute(row, path)
+    value = attribute_of(row, path)
     if path == "levels":
         return {name: value.get(name) for name in factors}
     if "share" in how:
@@ -96,7 +97,7 @@ def tables_of(
         cells: TableRow = {}
         for column, content in columns.items():
             if content.startswith("known ") and given:
-                cells[column] = _attribute(given.get(_attribute(row, "detector")), content.removeprefix("known "))
+                cells[column] = attribute_of(given.get(attribute_of(row, "detector")), content.removeprefix("known "))
             elif not content.startswith("known "):
                 name = column.format(unit=unit, allowed=ALLOWED_DETECTION)
                 cells |= _cells(name, content, row, factors)
@@ -124,7 +125,7 @@ def records_table(rows: Iterable[CaseRow], detectors: Sequence[str], unit: str =
         }
         for name in stating:
             for column, content in _columns()["records"].items():
-                record[f"{name}: {column}"] = _attribute(row.statements.get(name), content)
+                record[f"{name}: {column}"] = attribute_of(row.statements.get(name), content)
         table.append({**record, "error": row.error})
     return table
 

@@ -1,21 +1,28 @@
-"""The three kinds of plan: simulated records, recordings of a real machine, and measured data held out in turn."""
+"""The three kinds of plan: simulated records, recordings of a real machine, and measured data held out in turn.
+
+Fields are the entries of a plan's file, under their names there or their `alias`, and `place`, the file.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import combinations
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
 
-from sealscope.parameters import Rig
+from sealscope.evaluation.thresholds import Promise
+from sealscope.parameters import Rig, load_rig
+from sealscope.recordings.recording import CHANNEL_UNITS
+from sealscope.storage.plain_values import as_type
 from sealscope.units import parse_quantity
 
 Use = Literal["calibrate", "judge"]
 LeakLaw = Literal["laminar", "orifice", "mixture"]
-Promise = Literal["average", "bound"]
 DataSet = Literal["appendix-c", "hydraulic"]
 LeaveOut = Literal["test", "condition"]
 
@@ -35,11 +42,32 @@ def _file_name(name: str) -> str:
 
 def _pattern(files: str) -> str:
     parts = Path(files).parts
-    if Path(files).is_absolute() or ".." in parts:
+    if not parts or Path(files).is_absolute() or ".." in parts:
         raise ValueError("must be a pattern within the folder")
     if "\0" in files or any("**" in part and part != "**" for part in parts) or files.count("**") > 1:
         raise ValueError("must be a pattern of names, with ** once at most")
     return files
+
+
+def _level(value: Any) -> Any:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if isinstance(value, str) or (number and math.isfinite(value)):
+        return value
+    raise ValueError(f"must be a text or a number, got {value!r:.60}")
+
+
+def _channels(names: tuple[str, ...]) -> tuple[str, ...]:
+    if not set(names) <= set(CHANNEL_UNITS) or len(set(names)) < len(names):
+        raise ValueError(f"must be a list of channels, each once, got {list(names)}")
+    if "q_leak" in names:
+        raise ValueError("must not hold q_leak: it measures what detectors are to find")
+    return names
+
+
+def _view(name: str) -> str:
+    if not name.strip() or name != name.strip() or "@" in name:
+        raise ValueError("must be a plain name without '@'")
+    return name
 
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -52,25 +80,33 @@ FileName = Annotated[str, Field(min_length=1), AfterValidator(_file_name)]
 Seconds = Annotated[Number, _quantity("s")]
 #: Names, one or more.
 Names = Annotated[tuple[str, ...], Field(min_length=1)]
-Level = str | Annotated[int, Field(strict=True)] | Number
+Channels = Annotated[Names, AfterValidator(_channels)]
+Level = Annotated[str | int | float, BeforeValidator(_level)]
+Values = Mapping[str, Any]
 
 
-@dataclass(frozen=True)
-class RecordGroup:
+class _Entries:
+    """Entries of a table, which has no others."""
+
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordGroup(_Entries):
     """`count` records of one kind, spread evenly over the cells of the factors.
 
     `use`: `calibrate` sets thresholds (leak-free), `judge` is judged by them, on seeds of its own; `leak_lpm`: mean
     flow [L/min] of a leak of that `law` (`mixture`: half of each) from the plan's onset on, 0 for none; `fault`:
     another fault, as text; `bound`: whether the rows of leaks of this size say what the Cramer-Rao bound of their
-    machine allows, which does not depend on the size.
+    machine allows, which does not depend on the size, as the plan says where it is None.
     """
 
     count: Annotated[Whole, Field(ge=1)]
     use: Use = "judge"
-    leak_lpm: Annotated[Number, Field(ge=0), _quantity("L/min")] = 0.0
+    leak_lpm: Annotated[Number, Field(ge=0, alias="leak"), _quantity("L/min")] = 0.0
     law: LeakLaw = "laminar"
     fault: Text = ""
-    bound: Flag = False
+    bound: Flag | None = None
 
     def __post_init__(self) -> None:
         if self.use == "calibrate" and (self.leak_lpm or self.fault):
@@ -78,45 +114,75 @@ class RecordGroup:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _JudgedPlan:
-    """What plans over records of a machine have in common.
-
-    `unit`: of the sizes of leaks; `views`: sets of channels that detectors see (`detectors`); `assumed`: what detectors
-    may assume of the machine, None for the plan's rig, or the thesis's where it has none.
-    """
+class _Plan(_Entries):
+    """What all plans have in common; `title`: the name where it is empty."""
 
     name: FileName
     title: Text = ""
+    confidence: Share = 0.95
+    note: Text = ""
+    place: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _JudgedPlan(_Plan):
+    """What plans over records of a machine have in common.
+
+    `unit`: of the sizes of leaks; `views`: sets of channels that detectors see (`detectors`), "" for those that name
+    none, of which `channels` says it; `assume`: the rig that detectors may assume, with the values `assume_set`.
+    """
+
     false_alarm: Share = 0.01
     promise: Promise = "average"
-    confidence: Share = 0.95
     detectors: Names
-    place: str = ""
     unit: Text = "L/min"
-    note: Text = ""
-    views: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    assumed: Rig | None = None
+    views: Mapping[Annotated[str, AfterValidator(_view)], Channels] = field(default_factory=dict)
+    channels: Channels | None = None
+    assume: Text | None = None
+    assume_set: Values = field(default_factory=dict)
+
+    def _assumed(self, rig: Rig | None) -> Rig | None:
+        rig = rig if self.assume is None else load_rig(self.assume)
+        if not self.assume_set:
+            return rig
+        return (rig or load_rig("thesis")).with_overrides(self.assume_set, source="assumed by the plan")
 
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatedPlan(_JudgedPlan):
     """A simulated campaign.
 
-    `profile`: the bench whose nuisances each record draws, "" for the rig without drift; `factors`: name -> levels,
-    every combination is a cell; `command` and `closed` are the duty, `family` names families of the profile, other
-    names are parameters of the rig; `seed`: the base of every case's seed; `part`: what the plan is for, such as
-    development or judging.
+    `rig_name`: the rig, with its sampling `rate` and the values `rig_set`; `profile`: the bench whose nuisances each
+    record draws, "" for the rig without drift; `onset_s`: of the leaks, nan for half of the duration; `factors`: name
+    -> levels, every combination is a cell; `command` and `closed` are the duty, `family` names families of the profile,
+    other names are parameters of the rig; `seed`: the base of every case's seed; `part`: what the plan is for, such as
+    development or judging; `bound`: of groups of records that do not say it.
     """
 
-    rig: Rig
-    profile: str = ""
-    duration_s: Seconds
-    onset_s: Seconds
+    rig_name: Annotated[Text, Field(alias="rig")] = "thesis"
+    rig_set: Annotated[Values, Field(alias="set")] = field(default_factory=dict)
+    rate: Level | None = None
+    profile: Text = ""
+    duration_s: Annotated[Seconds, Field(alias="duration")]
+    onset_s: Annotated[Seconds, Field(alias="onset")] = math.nan
     seed: Whole = 0
     keep_recordings: Flag = False
-    records: tuple[RecordGroup, ...]
+    records: Annotated[tuple[RecordGroup, ...], Field(min_length=1)]
     factors: Mapping[str, Annotated[tuple[Level, ...], Field(min_length=1)]] = field(default_factory=dict)
     part: Text = ""
+    bound: Flag = False
+
+    @cached_property
+    def rig(self) -> Rig:
+        """The rig that is simulated."""
+        values = self.rig_set if self.rate is None else {"daq.sample_rate": self.rate, **self.rig_set}
+        rig = load_rig(self.rig_name)
+        return rig.with_overrides(values, source="set by the plan") if values else rig
+
+    @cached_property
+    def assumed(self) -> Rig:
+        """What detectors may assume of the machine."""
+        return self._assumed(self.rig) or self.rig
 
     @property
     def size(self) -> int:
@@ -126,11 +192,12 @@ class SimulatedPlan(_JudgedPlan):
     @property
     def bounded(self) -> frozenset[float]:
         """Sizes of leaks [L/min] whose rows get the bound of their machine."""
-        return frozenset(group.leak_lpm for group in self.records if group.bound and group.leak_lpm)
+        wanted = (group for group in self.records if (self.bound if group.bound is None else group.bound))
+        return frozenset(group.leak_lpm for group in wanted if group.leak_lpm)
 
 
-@dataclass(frozen=True)
-class RecordingSet:
+@dataclass(frozen=True, kw_only=True)
+class RecordingSet(_Entries):
     """Recordings of one kind.
 
     `files`: a pattern; of the files that match, in the order of the numbers in their names, the `first` to before the
@@ -153,13 +220,18 @@ class RecordingSet:
 class RecordedPlan(_JudgedPlan):
     """A campaign over recordings in a folder of the caller."""
 
-    channel_map: Mapping[str, str] = field(default_factory=dict)
-    rate_hz: Annotated[Number, _quantity("Hz")] | None = None
-    sets: tuple[RecordingSet, ...]
+    channel_map: Annotated[Mapping[str, str], Field(alias="map")] = field(default_factory=dict)
+    rate_hz: Annotated[Number | None, _quantity("Hz"), Field(alias="rate")] = None
+    sets: Annotated[tuple[RecordingSet, ...], Field(min_length=1)]
+
+    @cached_property
+    def assumed(self) -> Rig | None:
+        """What detectors may assume of the machine, None where the plan does not say it."""
+        return self._assumed(None)
 
 
 @dataclass(frozen=True)
-class LogisticClassifier:
+class LogisticClassifier(_Entries):
     """A logistic regression on `features` with a `ridge` on the standardised coefficients."""
 
     name: Text
@@ -172,7 +244,7 @@ class LogisticClassifier:
 
 
 @dataclass(frozen=True)
-class ChosenClassifier:
+class ChosenClassifier(_Entries):
     """A logistic regression whose features and ridge are chosen within the training samples.
 
     Candidates are the unions of `groups` of features with each of `ridges`; the one with the smallest loss on tests
@@ -180,7 +252,7 @@ class ChosenClassifier:
     """
 
     name: Text
-    groups: Annotated[tuple[Names, ...], Field(min_length=1, max_length=8)]
+    groups: Annotated[tuple[Names, ...], Field(min_length=1, max_length=8, alias="choose")]
     ridges: Annotated[tuple[Ridge, ...], Field(min_length=1)]
 
     def candidates(self) -> list[LogisticClassifier]:
@@ -196,26 +268,30 @@ class ChosenClassifier:
 Classifier = LogisticClassifier | ChosenClassifier
 
 
-@dataclass(frozen=True)
-class HeldOutPlan:
+def _classifier(entries: Any) -> Classifier:
+    chosen = isinstance(entries, Mapping) and "choose" in entries
+    return as_type(ChosenClassifier, entries) if chosen else as_type(LogisticClassifier, entries)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeldOutPlan(_Plan):
     """A campaign over a measured data set.
 
-    `unit`: of the sizes of its faults; `leave_out`: what is held out whole in turn, a test (its part without and its
-    part with the leak, or its unbroken block of cycles) or all tests of one operating condition; `permutations`: how
-    often labels are swapped within tests to estimate what chance reaches, 0 for no such check; `seed`: of the swaps.
+    `leave_out`: what is held out whole in turn, a test (its part without and its part with the leak, or its unbroken
+    block of cycles) or all tests of one operating condition; `permutations`: how often labels are swapped within tests
+    to estimate what chance reaches, 0 for no such check; `seed`: of the swaps.
     """
 
-    name: FileName
     data: DataSet
-    detectors: tuple[Classifier, ...]
-    title: Text = ""
+    detectors: Annotated[tuple[Annotated[Classifier, BeforeValidator(_classifier)], ...], Field(min_length=1)]
     leave_out: LeaveOut = "test"
-    confidence: Share = 0.95
-    place: str = ""
-    unit: str = "L/min"
-    note: Text = ""
     permutations: Annotated[Whole, Field(le=100_000)] = 0
     seed: Whole = 0
+
+    @property
+    def unit(self) -> str:
+        """Unit of the sizes of its faults."""
+        return "grade" if self.data == "hydraulic" else "L/min"
 
 
 AnyPlan: TypeAlias = SimulatedPlan | HeldOutPlan | RecordedPlan

@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 
 from sealscope.campaigns.execution.store import RUN_BY_RUN
-from sealscope.campaigns.judging.judge import AlarmShares, DetectorPod, Judgement, SizeRoc
+from sealscope.campaigns.judging.alarms import AlarmShares
+from sealscope.campaigns.judging.curves import DetectorPod, SizeRoc
+from sealscope.campaigns.judging.judge import Judgement
 from sealscope.campaigns.judging.tables import PriorKnowledge
 from sealscope.campaigns.plans.detectors import DIAGNOSE, plan_detector
 from sealscope.campaigns.plans.model import HeldOutPlan, RecordedPlan, SimulatedPlan
@@ -21,7 +23,7 @@ from sealscope.evaluation.roc import Area
 from sealscope.paragraphs import paragraph
 from sealscope.recordings.channels import Array
 from sealscope.reporting import template
-from sealscope.reporting.campaign.tables import cause_tables, page_tables, percent
+from sealscope.reporting.campaign.page_tables import cause_tables, page_tables, percent
 from sealscope.reporting.messages import say
 from sealscope.reporting.picture import Picture, SvgText, log_ticks, ticks
 
@@ -236,7 +238,7 @@ def _facts(result: CampaignResult) -> list[tuple[str, str]]:
 
 def _assumed(plan: SimulatedPlan) -> str:
     """Return what the detectors assume of the machine, as text."""
-    if plan.assumed is None or plan.assumed == plan.rig:
+    if plan.assumed == plan.rig:
         return f"the rig {plan.rig.name} as it stands, not the machine that was drawn"
     true = {row.name: row.value for row in plan.rig.table()}
     other = [f"{row.name} {row.value:g}" if isinstance(row.value, float) else f"{row.name} {row.value}"

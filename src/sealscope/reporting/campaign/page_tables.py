@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 import tomllib
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from sealscope.campaigns.judging.judge import Judgement
+from sealscope.campaigns.judging.tables import attribute_of
 from sealscope.evaluation.binomial import IntervalEstimate, Proportion
 
 
@@ -45,41 +47,22 @@ class PageTable(NamedTuple):
 
 def page_tables(judgement: Judgement, unit: str, part: str = "") -> dict[str, PageTable]:
     """Return the tables of what detectors state and of faults and families, by name; those that have rows."""
-    rows: dict[str, list[tuple[str, ...]]] = {
-        "flows": [
-            (
-                of.detector, f"{of.leak_lpm:g}" if of.leak_lpm else "no leak", str(of.errors.n),
-                f"{of.errors.bias.value:+.2g}", f"{of.errors.median_size.value:.2g}", percent(of.errors.coverage),
-            )
-            for of in judgement.flows
-        ],
-        "families": [
-            (
-                of.detector, of.family, f"{of.leak_lpm:g} {of.law}" if of.leak_lpm else "no leak",
-                percent(of.alarms), percent(of.cannot_tell), percent(of.coverage), _of(of.reachable),
-                _counted(of.allowed),
-            )
-            for of in judgement.families
-        ],
-        "onsets": [
-            (
-                of.detector, f"{of.leak_lpm:g}", str(of.errors.n), _quantile(of.errors.median_size),
-                percent(of.errors.coverage),
-            )
-            for of in judgement.onsets
-        ],
-        "faults": [
-            (of.detector, of.fault, percent(of.alarms), percent(of.named), percent(of.cannot_tell))
-            for of in judgement.faults
-        ],
-    }  # fmt: skip
-    tables = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
-    tables["families"]["title"] += f" ({part})" if part else ""
-    return {
-        name: PageTable(name, own["title"], own["about"], [head.format(unit=unit) for head in own["heads"]],
-                        rows[name], own.get("words", 1))
-        for name, own in tables.items() if rows[name]
-    }  # fmt: skip
+    tables = {}
+    for name, layout in tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")).items():
+        columns = layout["columns"]
+        rows = [tuple(_cell(row, content) for content in columns.values()) for row in getattr(judgement, name)]
+        if rows:
+            title = layout["title"].format(part=f" ({part})" if part else "")
+            heads = [head.format(unit=unit) for head in columns]
+            tables[name] = PageTable(name, title, layout["about"], heads, rows, layout.get("words", 1))
+    return tables
+
+
+def _cell(row: Any, content: str) -> str:
+    """Return what stands in a column of a row, as the layout says it."""
+    how, _, path = content.rpartition(" ")
+    value = attribute_of(row, path)
+    return _FORMATS[how](value) if how in _FORMATS else format(value, how)
 
 
 class CauseTable(NamedTuple):
@@ -118,3 +101,12 @@ def _quantile(quantile: IntervalEstimate) -> str:
         return f"{quantile.value:.2g}"
     ends = [f"{end:.2g}" if math.isfinite(end) else "–" for end in (quantile.low, quantile.high)]
     return f"{quantile.value:.2g} ({ends[0]}–{ends[1]})"
+
+
+_FORMATS: Mapping[str, Callable[[Any], str]] = {
+    "size": lambda size: f"{size:g}" if size else "no leak",
+    "percent": percent,
+    "count": _of,
+    "counted": _counted,
+    "quantile": _quantile,
+}

@@ -1,0 +1,149 @@
+"""Alarms of each detector on records that have something in common: a size of leak, levels, a fault, a family."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from sealscope.campaigns.cases.bound import smallest_detectable
+from sealscope.campaigns.cases.case import FAMILY
+from sealscope.campaigns.cases.row import cause_of, covers, named_cause
+from sealscope.campaigns.judging.verdicts import JudgedRow, Verdicts, grouped, without_fault
+from sealscope.evaluation.binomial import IntervalEstimate, Proportion, proportion
+from sealscope.evaluation.table import CANNOT_TELL, events_per_hour
+
+#: Two detectors that do not look, beside which the others are shown.
+ALWAYS, NEVER = "always fire", "never fire"
+#: What stands for all families together, and for all laws of a leak.
+ALL, ANY_LAW = "all", "any"
+#: Probability with which the best test finds a leak that the bound allows.
+ALLOWED_DETECTION = 0.9
+
+
+@dataclass(frozen=True)
+class AlarmShares:
+    """Alarms of one detector on records that have something in common.
+
+    `leak_lpm` (0: no leak, nan: any) and `law` of the leak, `fault` that is no leak, `family` of machines, `levels` of
+    the factors: what they have in common, where it was asked for. `coverage`: how often a stated interval holds the
+    flow that there was; `false_alarm` and `per_hour`: of that detector on its leak-free records, None where there are
+    none, or no hours; `named`: alarms that name the fault's cause, alone or with the piston, None where the detector
+    names no cause; `reachable`: records whose leak the Cramer-Rao bound of their machine allows to find, over those
+    that have a bound, and `allowed`: alarms over these, both None where there is no bound; `failed`: records without a
+    result, which are among those that cannot be told.
+    """
+
+    detector: str
+    alarms: Proportion
+    cannot_tell: Proportion
+    coverage: Proportion
+    false_alarm: Proportion | None = None
+    per_hour: IntervalEstimate | None = None
+    leak_lpm: float = 0.0
+    law: str = ANY_LAW
+    fault: str = ""
+    family: str = ALL
+    levels: Mapping[str, str | float] = field(default_factory=dict)
+    named: Proportion | None = None
+    reachable: Proportion | None = None
+    allowed: Proportion | None = None
+    failed: int = 0
+
+    @property
+    def leak(self) -> str:
+        """Size and law of the leak, in words."""
+        return f"{self.leak_lpm:g} {self.law}" if self.leak_lpm else "no leak"
+
+    @property
+    def informedness(self) -> float:
+        """Share of alarms less that of false alarms, 0 for chance."""
+        return self.alarms.value - self.false_alarm.value if self.false_alarm else math.nan
+
+
+@dataclass(frozen=True)
+class Alarms:
+    """What alarms add up to; `false_alarm`: the probability at which the bound's best test is taken."""
+
+    verdicts: Verdicts
+    confidence: float
+    false_alarm: float
+
+    def _with_references(self) -> Verdicts:
+        """Return the verdicts, and after them those of the two detectors that do not look."""
+        rows = [judged.row for judged in next(iter(self.verdicts.values()), ())]
+        always = {name: [JudgedRow(row, verdict, None) for row in rows]
+                  for name, verdict in ((ALWAYS, "leak"), (NEVER, "no leak"))}  # fmt: skip
+        return {**self.verdicts, **always}
+
+    def by_size(self, hours: float | None, together: bool = False) -> Iterator[AlarmShares]:
+        """Yield alarms by size, or of all sizes `together`, and false alarms beside; those that do not look last.
+
+        A detector without a record with a leak has one row of size 0, with no detection.
+        """
+        for name, own in without_fault(self._with_references()).items():
+            free, leaky = ([judged for judged in own if bool(judged.size) == leaks] for leaks in (False, True))
+            alarms = self._share(judged.alarm for judged in free) if free else None
+            hourly = events_per_hour(alarms.count, hours * alarms.n, self.confidence) if alarms and hours else None
+            for size, alike in grouped(leaky or free, lambda judged: math.nan if together else judged.size).items():
+                shares = self._shares(name, alike, leak_lpm=size)
+                detected = shares.alarms if leaky else self._share(())
+                yield replace(shares, alarms=detected, false_alarm=alarms, per_hour=hourly)
+
+    def by_cell(self) -> Iterator[AlarmShares]:
+        """Yield the alarms at each size in each cell of the factors."""
+        for name, own in without_fault(self.verdicts).items():
+            cells = grouped(own, lambda judged: (judged.size, repr(tuple(judged.row.levels.items()))))
+            for (size, _), alike in cells.items():
+                yield self._shares(name, alike, leak_lpm=size, levels=dict(alike[0].row.levels))
+
+    def by_fault(self) -> Iterator[AlarmShares]:
+        """Yield the alarms on records with each fault that is no piston leak."""
+        for name, own in self._with_references().items():
+            faulty = (judged for judged in own if judged.row.fault and judged.size == 0)
+            for fault, alike in grouped(faulty, lambda judged: judged.row.fault).items():
+                yield self._shares(name, alike, fault=fault)
+
+    def by_family(self) -> Iterator[AlarmShares]:
+        """Yield the alarms by family, size and law; all families together first, none where there are no families.
+
+        Each size has its laws apart, and together where there are several.
+        """
+        for name, own in without_fault(self.verdicts).items():
+            members = (judged for judged in own if FAMILY in judged.row.levels)
+            families = grouped(members, lambda judged: str(judged.row.levels[FAMILY]))
+            for family, relatives in {ALL: own, **families}.items() if families else ():
+                for size, alike in grouped(relatives, lambda judged: judged.size).items():
+                    laws = grouped(alike, lambda judged: judged.row.law) if size else {}
+                    for law, of_law in laws.items() if len(laws) == 1 else {ANY_LAW: alike, **laws}.items():
+                        yield self._shares(name, of_law, family=family, leak_lpm=size, law=law)
+
+    def _share(self, flags: Iterable[bool]) -> Proportion:
+        counted = list(flags)
+        return proportion(sum(counted), len(counted), self.confidence)
+
+    def _shares(self, detector: str, alike: Sequence[JudgedRow], **common: Any) -> AlarmShares:
+        stated = [(judged, judged.statement) for judged in alike if judged.statement is not None]
+        intervals = [(judged.flow_lpm, statement.leak_interval_lpm) for judged, statement in stated]
+        named = [
+            judged.alarm and covers(named_cause(statement), cause_of(judged.row.fault)) for judged, statement in stated
+        ]
+        silent = [False] * (len(alike) - len(stated))
+        bounded = [judged for judged in alike if judged.row.bound_lpm is not None] if common.get("leak_lpm") else []
+        return AlarmShares(
+            detector=detector,
+            alarms=self._share(judged.alarm for judged in alike),
+            cannot_tell=self._share(judged.verdict == CANNOT_TELL for judged in alike),
+            coverage=self._share(ends[0] <= flow <= ends[1] for flow, ends in intervals if ends is not None),
+            named=self._share(named + silent) if stated else None,
+            reachable=self._share(map(self._allowed, bounded)) if bounded else None,
+            allowed=self._share(judged.alarm for judged in bounded if self._allowed(judged)) if bounded else None,
+            failed=sum(judged.row.error is not None for judged in alike),
+            **common,
+        )
+
+    def _allowed(self, judged: JudgedRow) -> bool:
+        """Whether the best test at this false-alarm probability finds the leak of a row nine times in ten."""
+        bound = judged.row.bound_lpm
+        return bound is not None and smallest_detectable(bound, self.false_alarm, ALLOWED_DETECTION) <= judged.flow_lpm

@@ -1,0 +1,105 @@
+"""What detectors state beyond a verdict, against the truth: when the leak began, how large it is, what the cause is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sealscope.campaigns.cases.row import NO_CAUSE, PISTON_LEAK, cause_of, covers, named_cause
+from sealscope.campaigns.judging.verdicts import JudgedRow, Verdicts, grouped
+from sealscope.evaluation.binomial import Proportion, proportion
+from sealscope.evaluation.estimates import EstimateErrors, estimate_errors
+from sealscope.evaluation.table import CANNOT_TELL, Confusion, confusion_matrix
+
+
+@dataclass(frozen=True)
+class StatedErrors:
+    """Errors of what one detector states at one size of leak (0: leak-free records).
+
+    Of the onset [s] over its alarms, or of the flow over all records, alarm or not.
+    """
+
+    detector: str
+    leak_lpm: float
+    errors: EstimateErrors
+
+
+@dataclass(frozen=True)
+class NamedCauses:
+    """Which cause one detector names for which there is; `none` where nothing leaks and no fault is put in.
+
+    `covered`: records for which it names the true cause, alone or with the one that no channel tells from it.
+    """
+
+    detector: str
+    confusion: Confusion
+    covered: Proportion
+
+
+def onset_errors(verdicts: Verdicts, onset_s: float, confidence: float) -> Iterator[StatedErrors]:
+    """Yield, for detectors that search for the onset, its error over the alarms, by size."""
+    for name, own in verdicts.items():
+        for size, alike in grouped((judged for judged in own if judged.size > 0 and judged.alarm), _size).items():
+            stated = [
+                (onset, onset_s, None if judged.statement is None else judged.statement.onset_interval_s)
+                for judged in alike
+                if (onset := judged.row.scores[name][1]) is not None
+            ]
+            yield from _errors(name, size, stated, confidence)
+
+
+def flow_errors(verdicts: Verdicts, confidence: float) -> Iterator[StatedErrors]:
+    """Yield, for detectors that state a flow, its errors against the flow that the record really had, by size."""
+    for name, own in verdicts.items():
+        for size, alike in grouped(own, _size).items():
+            stated = [
+                (judged.statement.leak_lpm, judged.flow_lpm, judged.statement.leak_interval_lpm)
+                for judged in alike
+                if judged.statement is not None
+            ]
+            yield from _errors(name, size, stated, confidence)
+
+
+def _size(judged: JudgedRow) -> float:
+    return judged.size
+
+
+def _errors(
+    detector: str,
+    leak_lpm: float,
+    stated: Sequence[tuple[float | None, float, tuple[float, float] | None]],
+    confidence: float,
+) -> Iterator[StatedErrors]:
+    """Yield the errors of (estimate, truth, interval), where there is any estimate."""
+    estimates = [math.nan if value is None else value for value, _, _ in stated]
+    if np.isfinite(estimates).any():
+        low, high = zip(*((math.nan, math.nan) if ends is None else ends for _, _, ends in stated), strict=True)
+        truth = [value for _, value, _ in stated]
+        yield StatedErrors(detector, leak_lpm, estimate_errors(estimates, truth, low, high, confidence))
+
+
+def causes_of(verdicts: Verdicts, confidence: float) -> Iterator[NamedCauses]:
+    """Yield the causes that detectors name, where there are faults.
+
+    A record with a leak and another fault is left out; one that failed is `cannot tell`.
+    """
+    for name, own in verdicts.items():
+        single = [judged for judged in own if not (judged.size > 0 and judged.row.fault)]
+        others = sorted({cause_of(judged.row.fault) for judged in single if judged.row.fault})
+        if not others or not any(name in judged.row.statements for judged in single):
+            continue
+        truth = [_true_cause(judged) for judged in single]
+        causes = [cause for cause in (NO_CAUSE, PISTON_LEAK) if cause in truth] + others
+        named = [CANNOT_TELL if judged.statement is None else named_cause(judged.statement) for judged in single]
+        causes += sorted(set(named) - set(causes) - {CANNOT_TELL})
+        covered = proportion(sum(map(covers, named, truth)), len(truth), confidence)
+        yield NamedCauses(name, confusion_matrix(truth, named, causes, confidence), covered)
+
+
+def _true_cause(judged: JudgedRow) -> str:
+    if judged.size > 0:
+        return PISTON_LEAK
+    return cause_of(judged.row.fault) if judged.row.fault else NO_CAUSE
