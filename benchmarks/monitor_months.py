@@ -40,9 +40,9 @@ from scipy.special import gammaincinv
 from threadpoolctl import threadpool_limits
 
 import sealscope as ss
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.live.balance import BlockConductance, LiveBalance, NotJudged, size_error
 from sealscope.diagnosis.live.joining import SampleRun
+from sealscope.diagnosis.priors import priors
 
 RESULTS = Path(__file__).parent / "results" / "monitor_months.csv"
 SHIFT_S, DAY_S = 16 * 3600.0, 24 * 3600.0
@@ -60,7 +60,7 @@ COLUMNS = (
     *("delay_h", "delay_watched_h", "test", "true_lpm", "stated_lpm", "stated_low_lpm", "stated_high_lpm"),
 )
 Libraries = dict[tuple[float, float] | str, list[BlockConductance]]
-WARMEST = beliefs("inference")["oil"]["warmest"]
+WARMEST = priors("inference")["oil"]["warmest"]
 
 
 def libraries(seed: int) -> tuple[ss.Recording, Libraries, float]:

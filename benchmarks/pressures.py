@@ -21,7 +21,7 @@ import numpy as np
 
 from sealscope.campaigns.cases.machines import sized_once
 from sealscope.diagnosis.inference.pressures.detector import PressureResponse
-from sealscope.diagnosis.inference.pressures.evidence import BELIEVED
+from sealscope.diagnosis.inference.pressures.evidence import PRIORS
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.bench.machines import draw
@@ -77,7 +77,7 @@ def main() -> None:
             low, high = answers[-1].interval
             holds += bool(lpm) and low <= simulated.truth.mean_leak_lpm <= high
         detected = [answer for answer in answers if answer.leak]
-        dated = sum(abs(answer.onset - ONSET) <= SECONDS / BELIEVED["blocks"]["most"] for answer in detected)
+        dated = sum(abs(answer.onset - ONSET) <= SECONDS / PRIORS["blocks"]["most"] for answer in detected)
         ratio = np.median([answer.flow / lpm for answer in detected]) if lpm and detected else np.nan
         print(
             f"{lpm:g} L/min {given.fault}: {len(detected)} of {given.machines} a leak; interval holds {holds}, dated "

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, Weighting, information, solve
 from sealscope.diagnosis.inference.row_weights import HUBER, SUPPORT, weighted
 from sealscope.diagnosis.inference.terms import LEAK, Equation, Term
 from sealscope.diagnosis.inference.weak_form import OVERLAP, rows
+from sealscope.diagnosis.priors import priors
 
 FIELDS = tuple(Blocks.__dataclass_fields__)
 STROKE, OIL, ZERO, TESTED, OTHER, LEFT = range(6)
@@ -55,7 +55,7 @@ def blocks(values: np.ndarray, seconds: float = 3.0) -> Blocks:
 
 def oracle(values: np.ndarray, seconds: float = 3.0) -> tuple[np.ndarray, np.ndarray]:
     """Estimates (K,) and covariance (K, K) of the tested coefficient by dense least squares: other columns with every
-    drift and its belief as a row, the tested one free in each block, the variance a fixed point."""
+    drift and its prior as a row, the tested one free in each block, the variance a fixed point."""
     count, each, _ = values.shape
     own, others = columns(), [STROKE, OIL, ZERO]
     flat = values.reshape(-1, values.shape[2])
@@ -66,7 +66,7 @@ def oracle(values: np.ndarray, seconds: float = 3.0) -> tuple[np.ndarray, np.nda
     drifting = np.hstack([flat[:, [k]] * shapes for k in others])
     free = np.where(block[:, None] == np.arange(count), flat[:, [TESTED]], 0.0)
     level = np.linalg.lstsq(flat[:, others], flat[:, LEFT], rcond=None)[0]
-    width = np.abs(level) * np.array([beliefs("inference")["drift"][name] for name in ("compliance", "air", "bias")])
+    width = np.abs(level) * np.array([priors("inference")["drift"][name] for name in ("compliance", "air", "bias")])
     width *= length / 60.0
     assert own.nuisance == (STROKE, OIL, ZERO, TESTED)
     variance = float(np.var(flat[:, LEFT]))

@@ -9,7 +9,7 @@ import pytest
 
 from sealscope.diagnosis.inference.other_steps.step import OtherStep
 from sealscope.diagnosis.judgement import ORDER, combined, deciding
-from sealscope.diagnosis.verdict.evidence import LEAST_SPECIFIC, Evidence
+from sealscope.diagnosis.verdict.evidence import RMS_CHANGE, Evidence
 
 LEAK = Evidence("leak", "it leaks", 9.0, 3.0, onset_s=40.0)
 NONE = Evidence("no leak", "it does not", 1.0, 3.0)
@@ -28,7 +28,7 @@ def test_the_first_with_a_verdict_judges_in_any_order() -> None:
     for turn in permutations(evidences):
         verdict = combined(turn)
         assert (verdict.detector, verdict.verdict, verdict.score) == (BALANCE, "no leak", 1.0)
-        assert [own.detector for own in verdict.parts] == [BALANCE, RESPONSE, "my own", LEAST_SPECIFIC]
+        assert [own.detector for own in verdict.parts] == [BALANCE, RESPONSE, "my own", RMS_CHANGE]
     assert combined(of(volume_balance=UNFIT, pressure_response=LEAK, rms_change=NONE)).detector == RESPONSE
 
 

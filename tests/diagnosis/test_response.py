@@ -21,8 +21,8 @@ from sealscope.diagnosis.inference.pressures.response import (
     SIDE,
     G,
     Machine,
-    beliefs_of,
     evidence,
+    priors_of,
     response,
 )
 from sealscope.parameters import load_rig
@@ -37,7 +37,7 @@ def step_of(information: Information, onset: float) -> tuple[float, float]:
 
 
 THESIS = load_rig("thesis")
-BELIEFS = beliefs_of(THESIS)
+BELIEFS = priors_of(THESIS)
 RATE, UNITS = 500.0, {"u": "V", "p_A": "Pa", "p_B": "Pa"}
 
 
@@ -74,7 +74,7 @@ def test_a_path_that_made_the_record_is_followed() -> None:
     own = response(recording, THESIS)
     assert own is not None
     assert np.sqrt(own.variance) == pytest.approx(4e3, rel=0.03)
-    followed = own.theta + own.mean.reshape(blocks, -1) * own.beliefs.unit
+    followed = own.theta + own.mean.reshape(blocks, -1) * own.priors.unit
     assert np.diff(followed[:, G].reshape(2, -1).mean(axis=1))[0] == pytest.approx(step, rel=0.4)
     np.testing.assert_allclose(followed[:, K_OIL], BELIEFS.centre[K_OIL], rtol=0.02)
 

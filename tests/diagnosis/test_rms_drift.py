@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.diagnose import diagnose
+from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.rms_change.blocks import DUTY, RmsBlocks
 from sealscope.diagnosis.rms_change.detector import RmsChange, within
 from sealscope.diagnosis.rms_change.ringing import beyond_noise, rises
@@ -79,11 +79,11 @@ def test_the_rise_against_recordings_is_students() -> None:
     random = np.random.default_rng(1)
     known = np.c_[np.full(6, -5.0), random.standard_normal((6, 4))]
     own = np.array([-5.0, 1.0, 2.0, 3.0, 4.0])
-    belief = beliefs("rms_change")["recordings"]
-    freedom = belief["freedom"] + 5
+    prior = priors("rms_change")["recordings"]
+    freedom = prior["freedom"] + 5
     stated, weight = rises(own, np.zeros(4), known, np.zeros((6, 4)))
     assert weight[1:] == pytest.approx(1.0, abs=1e-3)
-    squares = belief["freedom"] * belief["scatter"] ** 2 + np.sum((known[:, 1] - known[:, 1].mean()) ** 2)
+    squares = prior["freedom"] * prior["scatter"] ** 2 + np.sum((known[:, 1] - known[:, 1].mean()) ** 2)
     deviation = np.sqrt(squares / freedom * (1 + 1 / 6))
     assert stated[1].value == pytest.approx(1.0 - known[:, 1].mean(), abs=1e-2)
     assert stated[1].chance == pytest.approx(student.sf(stated[1].value / deviation, freedom), rel=0.05)

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.stats import binom, kstest, norm
 
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.blocks import Blocks, Columns
-from sealscope.diagnosis.inference.scatter import Among, RecordingSums, Rise, rise
+from sealscope.diagnosis.inference.scatter import Population, RecordingSums, Rise, rise
 from sealscope.diagnosis.inference.terms import LEAK, Equation, Term
+from sealscope.diagnosis.priors import priors
 
 PRESSURE, FLOW = 1e5, 1e-5
 #: What is believed of the scatter of the leak's coefficient [m^3/(s Pa)].
-BELIEVED = beliefs("inference")["scatter"]["leak"] * FLOW / PRESSURE
+PRIORS = priors("inference")["scatter"]["leak"] * FLOW / PRESSURE
 
 
 def nothing(_: object) -> np.ndarray:
@@ -56,7 +56,7 @@ def recording(random: np.random.Generator, leak: float, noise: float = 1e-5, shi
 
 def risen(random: np.random.Generator, count: int, scatter: float, leak: float = 0.0, **kind: float) -> Rise:
     """The rise of a recording beyond `count` healthy ones, in a fleet whose leakage scatters."""
-    level = 20.0 * BELIEVED
+    level = 20.0 * PRIORS
     healthy = [recording(random, level + scatter * random.normal(), **kind) for _ in range(count)]
     return beyond(recording(random, level + scatter * random.normal() + leak, **kind), healthy)
 
@@ -74,7 +74,7 @@ DAY = 86400.0
 def fleet(random: np.random.Generator, days: Sequence[int], viscosity: float, within: float) -> list[RecordingSums]:
     """Recordings of these days: leakage goes with the inverse of each day's viscosity (deviation of its logarithm)."""
     thin = dict(zip(dict.fromkeys(days), np.exp(viscosity * random.standard_normal(len(days))), strict=False))
-    level = 20.0 * BELIEVED
+    level = 20.0 * PRIORS
     return [
         RecordingSums.of(recording(random, level * thin[day] + within * random.normal()), (COLUMNS,), DAY * day)
         for day in days
@@ -85,10 +85,10 @@ def fleet(random: np.random.Generator, days: Sequence[int], viscosity: float, wi
 def test_a_day_of_other_oil_is_no_leak(days: Sequence[int]) -> None:
     """Between two days the viscosity differs as far as it is believed to."""
     random, draws = np.random.default_rng(len(days)), 100
-    viscosity = 0.5 * np.log(beliefs("inference")["oil"]["warmest"]) / np.sqrt(2.0)
+    viscosity = 0.5 * np.log(priors("inference")["oil"]["warmest"]) / np.sqrt(2.0)
     chances = []
     for _ in range(draws):
-        *healthy, judged = fleet(random, days, viscosity, BELIEVED)
+        *healthy, judged = fleet(random, days, viscosity, PRIORS)
         chances.append(rise(judged, healthy, (COLUMNS,)).chance)
     for level in (0.1, 0.01):
         assert np.sum(np.array(chances) < level) <= binom.ppf(0.999, draws, level)
@@ -96,7 +96,7 @@ def test_a_day_of_other_oil_is_no_leak(days: Sequence[int]) -> None:
 
 def test_recordings_without_a_date_are_of_one_day() -> None:
     random = np.random.default_rng(3)
-    *healthy, judged = fleet(random, (1, 1, 1, 1), 0.0, BELIEVED)
+    *healthy, judged = fleet(random, (1, 1, 1, 1), 0.0, PRIORS)
     undated = [own._replace(start_s=None) for own in (*healthy, judged)]
     alike, later = rise(judged, healthy, (COLUMNS,)), judged._replace(start_s=DAY * 2)
     assert rise(undated[-1], undated[:-1], (COLUMNS,))[:2] == alike[:2]
@@ -106,8 +106,8 @@ def test_recordings_without_a_date_are_of_one_day() -> None:
 
 def test_a_known_temperature_of_the_oil_takes_off_what_it_makes_of_the_level() -> None:
     """Twice the leakage in oil that is 17 K warmer is no leak, and as much at the same temperature is."""
-    random, level = np.random.default_rng(5), 20.0 * BELIEVED
-    twice = np.exp(beliefs("inference")["oil"]["per_kelvin"] * 17.3)
+    random, level = np.random.default_rng(5), 20.0 * PRIORS
+    twice = np.exp(priors("inference")["oil"]["per_kelvin"] * 17.3)
     healthy = [RecordingSums.of(recording(random, level), (COLUMNS,), DAY * 1, 40.0) for _ in range(4)]
 
     def risen(day: int, warm: float) -> Rise:
@@ -124,7 +124,7 @@ def test_days_that_are_known_narrow_what_another_day_may_be() -> None:
     random = np.random.default_rng(4)
 
     def deviation(days: int) -> float:
-        made = [fleet(random, [*np.repeat(range(days), 2), days], 0.01, BELIEVED) for _ in range(10)]
+        made = [fleet(random, [*np.repeat(range(days), 2), days], 0.01, PRIORS) for _ in range(10)]
         return float(np.median([rise(judged, healthy, (COLUMNS,)).deviation for *healthy, judged in made]))
 
     assert deviation(1) > 1.2 * deviation(6) > 1.2**2 * deviation(30)
@@ -132,8 +132,8 @@ def test_days_that_are_known_narrow_what_another_day_may_be() -> None:
 
 def believed_scatter(random: np.random.Generator) -> float:
     """A machine's scatter, drawn from what is believed of it: scaled inverse chi square."""
-    freedom = beliefs("inference")["scatter"]["freedom"]
-    return float(BELIEVED * np.sqrt(freedom / random.chisquare(freedom)))
+    freedom = priors("inference")["scatter"]["freedom"]
+    return float(PRIORS * np.sqrt(freedom / random.chisquare(freedom)))
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 6])
@@ -149,13 +149,13 @@ def test_the_chance_is_uniform_over_machines_as_they_are_believed(count: int) ->
 @pytest.mark.parametrize("count", [1, 2, 3, 6, 12])
 @pytest.mark.parametrize("scatter", [0.2, 1.0, 6.0])
 def test_level_at_a_scatter_that_was_not_expected(count: int, scatter: float) -> None:
-    """A machine that scatters six times as much as believed: the belief counts as one degree of freedom, no more, so
+    """A machine that scatters six times as much as believed: the prior counts as one degree of freedom, no more, so
     the level is at most that of Student's t with one degree less at a score sqrt(n / (n - 1)) smaller."""
     from scipy.stats import t
 
     draws, level = 400, 0.01
     random = np.random.default_rng(count)
-    made = sum(risen(random, count, scatter * BELIEVED).chance < level for _ in range(draws))
+    made = sum(risen(random, count, scatter * PRIORS).chance < level for _ in range(draws))
     freedom = count - 1.0
     worst = 0.03 if count == 1 else float(t.sf(t.isf(level, freedom + 1.0) * np.sqrt(freedom / count), freedom))
     assert made <= binom.ppf(0.999, draws, worst if scatter > 1.0 else level)
@@ -163,9 +163,9 @@ def test_level_at_a_scatter_that_was_not_expected(count: int, scatter: float) ->
 
 def test_the_rise_is_the_leak_that_was_added() -> None:
     random = np.random.default_rng(0)
-    for leak in (0.0, 5.0 * BELIEVED, 100.0 * BELIEVED):
-        made = risen(random, 4, 1e-3 * BELIEVED, leak)
-        assert made.value == pytest.approx(leak, abs=0.05 * BELIEVED)
+    for leak in (0.0, 5.0 * PRIORS, 100.0 * PRIORS):
+        made = risen(random, 4, 1e-3 * PRIORS, leak)
+        assert made.value == pytest.approx(leak, abs=0.05 * PRIORS)
 
 
 def machine(random: np.random.Generator, count: int, differs: float) -> Rise:
@@ -176,7 +176,7 @@ def machine(random: np.random.Generator, count: int, differs: float) -> Rise:
         x = random.standard_normal((8, 30, 3)) * [1.0, 0.0, PRESSURE] + [0.0, 1.0, 0.0]
         x[..., 2] += 3.0 * PRESSURE * x[..., 0]
         oil = 0.5 * FLOW * (1.0 + differs * random.standard_normal())
-        y = x @ [oil, 0.0, 20.0 * BELIEVED] + 1e-2 * FLOW * random.standard_normal((8, 30))
+        y = x @ [oil, 0.0, 20.0 * PRIORS] + 1e-2 * FLOW * random.standard_normal((8, 30))
         values = np.concatenate([x, y[..., None]], axis=2)
         start = 3.0 * np.arange(8)
         gram = np.einsum("kri,krj->kij", values, values)[:, None]
@@ -200,23 +200,23 @@ def test_one_healthy_recording_tells_little() -> None:
     random = np.random.default_rng(1)
 
     def half_width(count: int) -> float:
-        low, high = risen(random, count, 0.3 * BELIEVED).interval(0.99)
+        low, high = risen(random, count, 0.3 * PRIORS).interval(0.99)
         return 0.5 * (high - low)
 
     alone, few, many = (np.median([half_width(count) for _ in range(20)]) for count in (1, 3, 12))
     assert alone > 5.0 * few > 5.0 * many
     # never odds of one in ten thousand from two recordings: a leak of ten believed deviations is no proof
-    assert risen(random, 1, 0.3 * BELIEVED, 10.0 * BELIEVED).chance > 1e-2
-    assert risen(random, 12, 0.3 * BELIEVED, 10.0 * BELIEVED).chance < 1e-4
+    assert risen(random, 1, 0.3 * PRIORS, 10.0 * PRIORS).chance > 1e-2
+    assert risen(random, 12, 0.3 * PRIORS, 10.0 * PRIORS).chance < 1e-4
 
 
 def test_a_zero_of_the_flow_or_of_a_sensor_is_no_rise() -> None:
     """Each recording has a zero of its own; the judged one's pressure difference is off by five times its size."""
     for shift in (-5.0 * PRESSURE, 2.0 * PRESSURE):
         random = np.random.default_rng(2)
-        healthy = [recording(random, 20.0 * BELIEVED) for _ in range(4)]
-        made = beyond(recording(random, 20.0 * BELIEVED, shift=shift), healthy)
-        assert abs(made.value) < 0.1 * BELIEVED
+        healthy = [recording(random, 20.0 * PRIORS) for _ in range(4)]
+        made = beyond(recording(random, 20.0 * PRIORS, shift=shift), healthy)
+        assert abs(made.value) < 0.1 * PRIORS
 
 
 def test_chance_threshold_and_interval_agree() -> None:
@@ -229,7 +229,7 @@ def test_chance_threshold_and_interval_agree() -> None:
 @pytest.mark.parametrize("scale", [0.0, 1e-200, 1.0, 1e150])
 def test_recordings_of_any_size_have_a_rise_and_a_threshold(scale: float) -> None:
     random = np.random.default_rng(6)
-    *healthy, judged = fleet(random, (1, 1, 2, 3), 0.1, BELIEVED)
+    *healthy, judged = fleet(random, (1, 1, 2, 3), 0.1, PRIORS)
     scaled = [own._replace(sums=own.sums * scale, flow=own.flow * scale) for own in (*healthy, judged)]
     with np.errstate(all="ignore"):
         made = rise(scaled[-1], scaled[:-1], (COLUMNS,))
@@ -256,7 +256,7 @@ def test_what_others_let_expect_is_that_of_dense_algebra(seed: int) -> None:
         logs[-1] -= 0.5 * freedom * (np.log(variance) + usual**2 / variance)
     weights = np.exp(np.array(logs) - max(logs))
     weights /= weights.sum()
-    result = Among(covariance[None], np.zeros(1)).rise(values[None, n], values[None, :n], usual, freedom)
+    result = Population(covariance[None], np.zeros(1)).rise(values[None, n], values[None, :n], usual, freedom)
     assert result.value == pytest.approx(values[n] - weights @ centres, abs=0.02)
     chance = weights @ norm.sf((values[n] - np.array(centres)) / deviations)
     assert result.chance == pytest.approx(chance, rel=0.02)

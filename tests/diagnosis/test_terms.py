@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from sealscope.control.drive import Drive
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.inference.balance import BlockStream, blocks_of, commanded
 from sealscope.diagnosis.inference.blocks import information, zero_of
 from sealscope.diagnosis.inference.onset import StepTest, step_test
 from sealscope.diagnosis.inference.terms import equations
+from sealscope.diagnosis.priors import priors
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.channels import CHANNEL_UNITS
 from sealscope.recordings.recording import Array, Recording
@@ -111,7 +111,7 @@ def test_connections_change_nothing(rig: Rig, leaking: dict[str, Array]) -> None
 def test_the_zero_of_a_pressure_changes_neither_leak_nor_chance(rig: Rig, leaking: dict[str, Array]) -> None:
     """p_A reads too much by one prior width: the leak is the same, and its flow's change tells the zero."""
     read = {name: leaking[name] for name in ("x", "p_A", "p_B", "theta")}
-    width = beliefs("inference")["zero"]["pressure"]
+    width = priors("inference")["zero"]["pressure"]
     shifted = {**read, "p_A": read["p_A"] + width}
     assert step_of(shifted, rig).fitted[0] == pytest.approx(LEAK, rel=0.05)
     blocks, _, columns = blocks_of(recording(shifted), rig) or pytest.fail("no blocks")

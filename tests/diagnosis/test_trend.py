@@ -14,7 +14,7 @@ from scipy.integrate import quad
 from scipy.stats import halfnorm, multivariate_normal
 
 import sealscope as ss
-from sealscope.diagnosis.beliefs import beliefs
+from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.trend.reading import LeakReading, reading_of
 from sealscope.diagnosis.trend.trend import Trend
 from sealscope.diagnosis.trend.trend import trend as trend_of
@@ -76,7 +76,7 @@ def oracle(levels: Levels, prior: DayToDay, known: int) -> float:
     reach = max(prior.scale, 0.3 * float(np.ptp(levels.value)))
     grid = np.geomspace(0.1 * prior.scale, 10.0 * reach, 3)
     nodes = [(tau, 0.5, -prior.freedom * (math.log(tau) + 0.5 * (prior.scale / tau) ** 2)) for tau in grid]
-    change = beliefs("trend")["change"]
+    change = priors("trend")["change"]
     kinds = [("step", scale) for scale in change["steps"]] + [("growth", every) for every in change["intervals"]]
     joint, null = dict.fromkeys(itertools.product(range(known, n), kinds), 0.0), 0.0
     for tau, share, log_prior in nodes:
@@ -105,8 +105,8 @@ def oracle(levels: Levels, prior: DayToDay, known: int) -> float:
 
 def test_the_statistic_is_the_ratio_of_the_likelihoods(monkeypatch: pytest.MonkeyPatch) -> None:
     """The sums of one factorisation against integrals of multivariate normal densities, unequal errors and waits."""
-    monkeypatch.setitem(beliefs("trend")["between"], "nodes", 3)  # type: ignore[arg-type]
-    monkeypatch.setitem(beliefs("trend")["between"], "lasts", [0.5])  # type: ignore[arg-type]
+    monkeypatch.setitem(priors("trend")["between"], "nodes", 3)  # type: ignore[arg-type]
+    monkeypatch.setitem(priors("trend")["between"], "lasts", [0.5])  # type: ignore[arg-type]
     levels = levels_at(np.array([0.0, 1.0, 3.0, 4.0]), np.array([5.0, 5.5, 6.2, 6.9]), np.array([0.1, 0.5, 0.2, 0.3]))
     assert not np.any(beyond(levels))
     assert search(levels, 2).log_R[-1] == pytest.approx(math.log(oracle(levels, PRIOR, 2)), abs=2e-3)

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.detector import Detector, checked, failure, unusable
 from sealscope.diagnosis.inference.other_steps.step import other_step
 from sealscope.diagnosis.inspection import comparable, inspected
 from sealscope.diagnosis.judgement import ORDER, combined, deciding, rank
 from sealscope.diagnosis.learnt import Healthy, Learnt
+from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import RAREST, Evidence
@@ -27,7 +27,7 @@ from sealscope.recordings.motion import does_not_move
 from sealscope.recordings.recording import Recording
 
 #: Probability of `leak` on a leak-free recording, unless the caller asks for another.
-_ALLOWED = beliefs("verdict")["false_alarm"]
+_ALLOWED = priors("verdict")["false_alarm"]
 FALSE_ALARM_PROBABILITY: float = _ALLOWED["probability"]
 
 

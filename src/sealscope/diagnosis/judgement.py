@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from sealscope.diagnosis.inference.other_steps.step import OtherStep
-from sealscope.diagnosis.verdict.evidence import LEAKS, LEAST_SPECIFIC, Evidence
+from sealscope.diagnosis.verdict.evidence import LEAKS, RMS_CHANGE, Evidence
 
 #: Detectors that state a size or a bound: by every litre, then by a model of the pressures.
 ORDER = ("volume balance", "pressure response")
@@ -19,7 +19,7 @@ ORDER = ("volume balance", "pressure response")
 
 def rank(detector: str) -> int:
     """Return when a detector is asked, 0 first; a user's own are all alike, and the least specific is the last."""
-    if detector == LEAST_SPECIFIC:
+    if detector == RMS_CHANGE:
         return len(ORDER) + 1
     return ORDER.index(detector) if detector in ORDER else len(ORDER)
 
@@ -27,7 +27,7 @@ def rank(detector: str) -> int:
 def deciding(evidences: Sequence[Evidence]) -> Evidence | None:
     """Return the evidence that judges, of those asked so far; None where another detector is to be asked."""
     usable = [own for own in sorted(evidences, key=lambda own: rank(own.detector)) if own.usable]
-    able = [own for own in usable if own.detector != LEAST_SPECIFIC]
+    able = [own for own in usable if own.detector != RMS_CHANGE]
     return next((own for own in able or usable if not own.abstains), None)
 
 
@@ -42,7 +42,7 @@ def combined(evidences: Sequence[Evidence], other: OtherStep | None = None, refu
     if judge is None:
         return replace(_nobody(ranked), detector="", parts=tuple(ranked), usable=True)
     verdict, cause, reasons = judge.verdict, judge.cause, [judge.reason]
-    by_change = judge.detector == LEAST_SPECIFIC and judge.onset_s is not None
+    by_change = judge.detector == RMS_CHANGE and judge.onset_s is not None
     if other is not None and (by_change or (verdict != "leak" and cause is None)):
         verdict, cause = "cannot tell" if verdict == "leak" else verdict, other.cause
         reasons.append(other.text)
@@ -77,5 +77,5 @@ def _nobody(ranked: Sequence[Evidence]) -> Evidence:
     usable = [own for own in ranked if own.usable]
     if usable:
         return usable[0]
-    built_in = [own for own in ranked if own.detector in (*ORDER, LEAST_SPECIFIC)] or ranked
+    built_in = [own for own in ranked if own.detector in (*ORDER, RMS_CHANGE)] or ranked
     return Evidence("cannot tell", built_in[-1].reason if built_in else "there is no detector")

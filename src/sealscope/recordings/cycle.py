@@ -8,9 +8,9 @@ from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.channels import Array
 from sealscope.recordings.motion import moves
 from sealscope.recordings.recording import Recording, remembered
-from sealscope.storage.toml_file import beliefs_of
+from sealscope.storage.toml_file import priors_of
 
-_CYCLE = beliefs_of("sealscope.recordings")["cycle"]
+_CYCLE = priors_of("sealscope.recordings")["cycle"]
 
 
 def find_cycle(recording: Recording) -> float | None:

@@ -8,9 +8,9 @@ from sealscope.recordings.chambers import CHAMBERS, chambers_of
 from sealscope.recordings.channels import UNUSED, Array
 from sealscope.recordings.motion import constant
 from sealscope.recordings.recording import Recording
-from sealscope.storage.toml_file import beliefs_of
+from sealscope.storage.toml_file import priors_of
 
-_BELIEFS = beliefs_of("sealscope.recordings")["readings"]
+_PRIORS = priors_of("sealscope.recordings")["readings"]
 #: Share of its swing by which a copy differs, of rounding.
 _COPY = 1e-6
 
@@ -28,17 +28,17 @@ def no_readings(recording: Recording) -> str | None:
         if np.std(difference) <= _COPY * max(np.std(signals[name]) for name in CHAMBERS):
             return "p_B is a copy of p_A, but chambers on either side of a piston move against each other"
     if {"theta", "omega"} <= {name for name, unit in recording.units.items() if unit != "count"}:
-        every = max(1, round(recording.rate / _BELIEFS["rate"]))
+        every = max(1, round(recording.rate / _PRIORS["rate"]))
         theta, omega = (_means(recording[name], every) for name in ("theta", "omega"))
-        if theta.size >= _BELIEFS["samples"] and np.isfinite(theta + omega).all():
+        if theta.size >= _PRIORS["samples"] and np.isfinite(theta + omega).all():
             turned = np.gradient(theta, every / recording.rate)
             product, square = abs(float(turned @ omega)), float(turned @ turned)
             factor = product / max(square, np.finfo(float).tiny)
-            correlated = product >= _BELIEFS["correlation"] * np.sqrt(square * float(omega @ omega)) > 0.0
-            if correlated and not 1.0 / _BELIEFS["misfit"] <= factor <= _BELIEFS["misfit"]:
+            correlated = product >= _PRIORS["correlation"] * np.sqrt(square * float(omega @ omega)) > 0.0
+            if correlated and not 1.0 / _PRIORS["misfit"] <= factor <= _PRIORS["misfit"]:
                 return f"the speed is {factor:.3g} times that at which the angle turns: is the unit of the time right?"
     for name, values in signals.items():
-        if not np.mean(np.diff(values, 3) ** 2) <= 20.0 * _BELIEFS["noise"] * np.var(values):
+        if not np.mean(np.diff(values, 3) ** 2) <= 20.0 * _PRIORS["noise"] * np.var(values):
             return f"{name} is noise: the machine's motion does not show in it"
     return None
 

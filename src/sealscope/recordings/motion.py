@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.channels import Array
 from sealscope.recordings.recording import Recording
-from sealscope.storage.toml_file import beliefs_of
+from sealscope.storage.toml_file import priors_of
 
 #: A change of at most this share of a reading's largest value is rounding of the arithmetic: the reading does not move.
 ROUNDING = 1e-9
-_HOLD = beliefs_of("sealscope.recordings")["hold"]
+_HOLD = priors_of("sealscope.recordings")["hold"]
 _SHORTEST_STUCK = 5
 _NEIGHBOURHOOD = 100
 _STUCK_CHANCE = 1e-6

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sealscope.recordings.formats.headings.preamble import stated_oil_temperature
 from sealscope.recordings.recording import Recording
-from sealscope.storage.toml_file import beliefs_of
+from sealscope.storage.toml_file import priors_of
 
 
 def oil_temperature(recording: Recording) -> float | None:
@@ -13,7 +13,7 @@ def oil_temperature(recording: Recording) -> float | None:
     Values that are no temperature of oil (`priors.toml`) count as missing.
     """
     if "T_oil" in recording and recording.units["T_oil"] == "K":
-        oil = beliefs_of("sealscope.recordings")["oil"]
+        oil = priors_of("sealscope.recordings")["oil"]
         known = recording["T_oil"][(recording["T_oil"] > oil["coldest"]) & (recording["T_oil"] < oil["hottest"])]
         if known.size:
             return float(known.mean()) - 273.15

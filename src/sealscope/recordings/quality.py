@@ -19,7 +19,7 @@ from sealscope.recordings.channels import COUNTS, SLOW, Array
 from sealscope.recordings.formats.columns import counted
 from sealscope.recordings.motion import constant, runs_of, spacing, stuck
 from sealscope.recordings.recording import Recording
-from sealscope.storage.toml_file import beliefs_of
+from sealscope.storage.toml_file import priors_of
 
 Severity = Literal["note", "warning", "fatal"]
 
@@ -30,8 +30,8 @@ _GAP = 1.5
 _CROWDED = 0.5
 _FEWEST_AT_RAIL = 5
 _LONG_RUN = 20
-_BELIEFS = beliefs_of("sealscope.recordings")
-_CLOCK, _HUM, _CREEP = (_BELIEFS[table] for table in ("clock", "hum", "creep"))
+_PRIORS = priors_of("sealscope.recordings")
+_CLOCK, _HUM, _CREEP = (_PRIORS[table] for table in ("clock", "hum", "creep"))
 
 
 @dataclass(frozen=True)

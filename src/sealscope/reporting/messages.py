@@ -12,7 +12,7 @@ from textwrap import shorten
 from typing import Any
 
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
-from sealscope.diagnosis.verdict.evidence import LEAKS, LEAST_SPECIFIC
+from sealscope.diagnosis.verdict.evidence import LEAKS, RMS_CHANGE
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.errors import printable
 from sealscope.paragraphs import WIDTH, paragraphs
@@ -280,7 +280,7 @@ def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
         steps = [diagnosis.next_check, say("next.resolved")]
     elif diagnosis.verdict == "leak":
         steps = [*map(say, ("next.repeat", "next.bypass", "next.creep")), confirmed]
-    elif diagnosis.verdict == "no leak" and judge == LEAST_SPECIFIC:
+    elif diagnosis.verdict == "no leak" and judge == RMS_CHANGE:
         steps = [say("next.ringing"), say("next.longer")]
     elif diagnosis.verdict == "no leak":
         steps = [diagnosis.next_check, say("next.longer")]

@@ -1,4 +1,4 @@
-"""Read TOML: a file from outside, bounded and with one line for whatever is wrong with it, or a package's beliefs."""
+"""Read TOML: a file from outside, bounded and with one line for whatever is wrong with it, or a package's priors."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def read_model(
 
 
 @cache
-def beliefs_of(package: str) -> Mapping[str, Mapping[str, Any]]:
+def priors_of(package: str) -> Mapping[str, Mapping[str, Any]]:
     """Return the values of a package's `priors.toml` by table and name; each states its unit and source beside it.
 
     Raises KeyError where a row lacks unit or source.

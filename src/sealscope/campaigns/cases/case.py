@@ -21,7 +21,7 @@ from sealscope.simulation.bench.profile import load_profile
 #: The factor whose levels are families of the plan's profile.
 FAMILY = "family"
 #: Parameters of a rig that a verdict is held against, and no record depends on.
-_BELIEFS = frozenset({"pump.G_healthy"})
+_PRIORS = frozenset({"pump.G_healthy"})
 _PACKAGE = Path(__file__).resolve().parents[2]
 #: Parts of the package that no row depends on; the sources of all others are in the code key.
 _NOT_IN_ROWS = (
@@ -76,7 +76,7 @@ def profile_key(name: str) -> str:
 def world(plan: SimulatedPlan) -> dict[str, Any]:
     """Return what all cases of a plan share and a record depends on: rig, bench, length, onset and base seed."""
     return {
-        "rig": digest({name: repr(value) for name, value in plan.rig.present().items() if name not in _BELIEFS}),
+        "rig": digest({name: repr(value) for name, value in plan.rig.present().items() if name not in _PRIORS}),
         "profile": profile_key(plan.profile) if plan.profile else "",
         "duration_s": plan.duration_s,
         "onset_s": plan.onset_s,

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY
 from sealscope.diagnosis.inference.blocks import Columns, solve
 from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.inference.terms import equations
 from sealscope.diagnosis.inspection import Inspection
+from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.machine import unstated
 from sealscope.paragraphs import paragraphs
 from sealscope.recordings.oil import oil_temperature
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from sealscope.diagnosis.learnt import Learnt
     from sealscope.parameters import Rig
 
-_BALANCE, _ASKED = VolumeBalance.name, beliefs("commissioned")["smallest"]
+_BALANCE, _ASKED = VolumeBalance.name, priors("commissioned")["smallest"]
 
 
 class TermEstimate(NamedTuple):

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.control.drive import Drive
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, Weighting, solve
 from sealscope.diagnosis.inference.distribution import distribution
 from sealscope.diagnosis.inference.onset import FEWEST
@@ -24,6 +23,7 @@ from sealscope.diagnosis.inference.terms import (
 )
 from sealscope.diagnosis.inference.weak_form import OVERLAP, SPAN, STRIDE, rows, stride_samples
 from sealscope.diagnosis.inference.zero import about_zero
+from sealscope.diagnosis.priors import priors
 from sealscope.recordings.channels import flow_source
 from sealscope.recordings.gaps import long_gaps
 from sealscope.recordings.quality import clipped
@@ -34,7 +34,7 @@ from sealscope.units import P_ATM
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-_BLOCKS = beliefs("inference")["blocks"]
+_BLOCKS = priors("inference")["blocks"]
 LONGEST: float = _BLOCKS["longest"]
 SHORTEST: float = _BLOCKS["shortest"]
 #: Turns by which the terms are taken about a zero of p_A - p_B, and how near to it they are, as a share of what is
@@ -226,7 +226,7 @@ def _odds(z: float, what: str) -> float:
     """Return the logarithm of the odds that a sign is right."""
     from scipy.special import ndtr
 
-    other = 0.5 * beliefs("inference")["sense"][what]
+    other = 0.5 * priors("inference")["sense"][what]
     return float(np.log((ndtr(z) + other) / (ndtr(-z) + other)))
 
 
@@ -318,7 +318,7 @@ def blocks_of(recording: Recording, rig: Rig) -> tuple[Blocks, Blocks, tuple[Col
         plain = blocks if plain is None else plain
         blocks = about_zero(blocks, stream.columns)
         zero, before = float(blocks.zero[0]), zero
-        if abs(zero - before) < NEAR * beliefs("inference")["zero"]["pressure"]:
+        if abs(zero - before) < NEAR * priors("inference")["zero"]["pressure"]:
             break
     return None if blocks is None or plain is None else (blocks.merged(), plain.merged(), stream.columns)
 

@@ -9,7 +9,7 @@ are a level with a slow drift, c_j(t) = sum_p c_jp P_p(t), whose size is believe
 
     Lambda = (diag N - B M^-1 B') / s^2,    eta = (n - B M^-1 m) / s^2,
 
-with the sums N_k of d^2 and n_k of d y, B_k of d o, M of o o' (plus the beliefs) and m of o y over the rows of block
+with the sums N_k of d^2 and n_k of d y, B_k of d o, M of o o' (plus the priors) and m of o y over the rows of block
 k (d the column of g, o the others with their drifts, y the left side); its likelihood is exp(eta' g - g' Lambda g/2).
 """
 
@@ -23,11 +23,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Information
 from sealscope.diagnosis.inference.row_weights import MOST_TURNS, RIDGE, SUPPORT, TOLERANCE, weighted
 from sealscope.diagnosis.inference.terms import BIAS, LEAK, Equation
 from sealscope.diagnosis.inference.weak_form import OVERLAP
+from sealscope.diagnosis.priors import priors
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 from sealscope.storage.plain_state import array_of, part_of, plain_array
@@ -36,7 +36,7 @@ from sealscope.storage.plain_state import array_of, part_of, plain_array
 MOST_BLOCKS = 240
 #: Degree of the drifts.
 DRIFT_DEGREE = 2
-#: Beliefs of the coefficients that are free in each block while its rows are weighted.
+#: Priors of the coefficients that are free in each block while its rows are weighted.
 UNSTEADY = ("leak", "pump", "bias", "outside")
 _TURNS = 3
 
@@ -123,19 +123,19 @@ class Columns:
         self.nuisance = tuple(k for k, term in enumerate(equation.terms) if term.nuisance)
         self.compared = tuple(k for k, term in enumerate(equation.terms) if term.nuisance or term.compared)
         self.leak = self.names.index(LEAK)
-        believed = beliefs("inference")["drift"]
+        believed = priors("inference")["drift"]
         self.drift = np.array([believed[term.drift] if term.nuisance else 0.0 for term in equation.terms])
-        differs = beliefs("inference")["between"]
+        differs = priors("inference")["between"]
         self.between = np.zeros(len(equation.terms))
         self.between[list(self.compared)] = [differs[equation.terms[k].drift] for k in self.compared]
-        levels = beliefs("inference")["level"]
+        levels = priors("inference")["level"]
         self.levels = np.array([levels.get(term.drift, np.inf) for term in equation.terms])
         self.motion = tuple(k for k in self.nuisance if equation.terms[k].drift in ("motion", "edge"))
         self.support = tuple(k for k in self.nuisance if equation.terms[k].drift not in UNSTEADY)
         self.fast = tuple(k for k in self.nuisance if k not in self.support)
         self.bias = self.names.index(BIAS) if BIAS in self.names else None
         self.driven = tuple(term.driven for term in equation.terms)
-        self.healthy = beliefs("inference")["healthy"][equation.healthy] if equation.healthy else float("inf")
+        self.healthy = priors("inference")["healthy"][equation.healthy] if equation.healthy else float("inf")
 
     def level_deviation(self, test: int, blocks: Blocks) -> float:
         """Return the standard deviation of a healthy machine's coefficient of a column; infinite for other columns."""
@@ -153,7 +153,7 @@ class Columns:
         driven = self.driven[test] if test < self.left and self.bias is not None else ""
         root = float(np.mean(blocks.driving(root=True)))
         slope = {"": 0.0, "pressure": 1.0, "root": 0.5 / root if root > 0.0 else 0.0}[driven]
-        return float(min(beliefs("inference")["zero"]["pressure"], np.mean(blocks.driving()))) * slope
+        return float(min(priors("inference")["zero"]["pressure"], np.mean(blocks.driving()))) * slope
 
 
 class Weighting:
@@ -270,7 +270,7 @@ def _normal(gram: Array, powers: Array, others: list[int], test: int, left: int)
     )
 
 
-class _Belief(NamedTuple):
+class _Prior(NamedTuple):
     """What is believed of the other coefficients.
 
     Standard deviations of each one's `level` and of its `drift`, (c,); `zero`, that of the last one; `at`: what it is
@@ -295,7 +295,7 @@ class _Fitted(NamedTuple):
     variance: float
 
 
-def _fitted(normal: _Normal, believed: _Belief, degrees: int, rows: float) -> _Fitted:
+def _fitted(normal: _Normal, believed: _Prior, degrees: int, rows: float) -> _Fitted:
     """Return the fit of the other coefficients; the tested column's coefficient is free in each block."""
     energy = np.maximum(normal.energy, np.finfo(float).tiny)
     cross = normal.cross - (normal.along / energy[:, None]).T @ normal.along
@@ -304,14 +304,14 @@ def _fitted(normal: _Normal, believed: _Belief, degrees: int, rows: float) -> _F
     least = 1e-14 * normal.square / rows
     variance = max(square / rows, least)
     for _ in range(MOST_TURNS):
-        belief, mean = np.zeros((2, len(believed.drift), degrees))
+        prior, mean = np.zeros((2, len(believed.drift), degrees))
         with np.errstate(divide="ignore", over="ignore"):
-            belief[:, 0] = OVERLAP * variance / believed.level**2
-            belief[:, 1:] = (OVERLAP * variance / believed.drift**2)[:, None]
+            prior[:, 0] = OVERLAP * variance / believed.level**2
+            prior[:, 1:] = (OVERLAP * variance / believed.drift**2)[:, None]
         if believed.zero > 0.0:
-            belief[-1, 0], mean[-1, 0] = OVERLAP * variance / believed.zero**2, -believed.at
+            prior[-1, 0], mean[-1, 0] = OVERLAP * variance / believed.zero**2, -believed.at
         # a coefficient that is zero drifts by nothing
-        precision = np.minimum(belief.ravel(), 1e9 * np.diag(normal.cross))
+        precision = np.minimum(prior.ravel(), 1e9 * np.diag(normal.cross))
         lead = precision * mean.ravel()
         coefficients = solve(cross + np.diag(precision), left + lead)
         before, variance = variance, max(square - float(left @ coefficients), least) / rows
@@ -341,7 +341,7 @@ def _fit(gram: Array, blocks: Blocks, columns: Columns, test: int, others: list[
     total = gram.sum(axis=0)
     level = solve(total[np.ix_(others, others)], total[others, columns.left])
     size = np.append(np.minimum(np.abs(level), columns.levels[others]) * columns.drift[others] * minutes, 0.0)
-    believed = _Belief(np.append(columns.levels[others], np.inf), size, width)
+    believed = _Prior(np.append(columns.levels[others], np.inf), size, width)
     chosen, slope = [*others, gram.shape[1]], np.zeros(len(blocks))
     for turn in range(_TURNS + 1):
         normal = _normal(_about(gram, columns, test, slope, zero), powers, chosen, test, columns.left)
@@ -385,7 +385,7 @@ def _beside(columns: Columns) -> list[int]:
 
 def cost_of_zero(zero: float) -> float:
     """Return minus twice the logarithm of what is believed of a zero of the pressures [Pa], over that of none."""
-    usual, far, odds = (beliefs("inference")["zero"][name] for name in ("pressure", "far", "odds"))
+    usual, far, odds = (priors("inference")["zero"][name] for name in ("pressure", "far", "odds"))
     return float(min((zero / usual) ** 2, (zero / far) ** 2 + 2.0 * np.log(far / usual / odds)))
 
 
@@ -417,10 +417,10 @@ def pair(blocks: Blocks, columns: Columns) -> tuple[Array, Array, Array]:
     others = [k for k in columns.nuisance if k not in (leak, bias)]
     at = _beside(columns).index(bias)
     powers, _ = _drifts(blocks)
-    belief = np.delete(fit.fitted.precision.reshape(-1, powers.shape[1])[:-1], at, axis=0).ravel()
+    prior = np.delete(fit.fitted.precision.reshape(-1, powers.shape[1])[:-1], at, axis=0).ravel()
     of_leak, of_bias = (_normal(gram, powers, others, k, columns.left) for k in (leak, bias))
     along = np.vstack([of_leak.along, of_bias.along])
-    solved = solve(of_leak.cross + np.diag(belief), np.column_stack([along.T, of_leak.left]))
+    solved = solve(of_leak.cross + np.diag(prior), np.column_stack([along.T, of_leak.left]))
     precision = np.diag(np.concatenate([of_leak.energy, of_bias.energy])) - along @ solved[:, :-1]
     vector = np.concatenate([of_leak.lead, of_bias.lead]) - along @ solved[:, -1]
     return 0.5 * (precision + precision.T) / fit.fitted.variance, vector / fit.fitted.variance, middle

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.balance import blocks_of, shortest
 from sealscope.diagnosis.inference.blocks import Columns
 from sealscope.diagnosis.inference.circuit.store import lost_beside
@@ -19,6 +18,7 @@ from sealscope.diagnosis.inference.scatter import RecordingSums, Rise, motion_ch
 from sealscope.diagnosis.inference.terms import CYLINDER, LOCKED, circulation, equations, locked
 from sealscope.diagnosis.inference.weak_form import STRIDE, stride_samples
 from sealscope.diagnosis.learnt import Healthy, Lesson, lessons_of
+from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Recording, remembered
@@ -39,7 +39,7 @@ RESOLVED = 2
 
 def made_good(balance: RecordedBalance) -> bool:
     """Whether the pump surely delivers what any pump loses: a loop brings the piston back, or holds it."""
-    least: float = beliefs("inference")["held"]["share"]
+    least: float = priors("inference")["held"]["share"]
     return balance.level.low * balance.mean_pressure() > least * balance.mean_flow
 
 

@@ -7,12 +7,12 @@ recordings differ; whatever the model does not describe is in it, once. With r_j
 the n - 1 others, y_j = r_j (n - 1)/n; for the judged one y is its rise.
 
 How far the other coefficients differ is believed to within a factor only: a machine held at one temperature repeats
-them to a thousandth, another's change by a tenth from run to run. A narrow belief makes every rise precise where it is
+them to a thousandth, another's change by a tenth from run to run. A narrow prior makes every rise precise where it is
 true and scatter where it is not, so y is formed by several widths, each weighted by what is believed of it and the
 evidence of the healthy ones, p(y_1 .. y_n).
 
 All y of a width are normal about an unknown mean, with the variance sigma^2 of each by itself and a covariance between
-them of which there are several candidates (`Among`). sigma^2 has a scaled inverse chi square prior (s_0, nu_0): the
+them of which there are several candidates. sigma^2 has a scaled inverse chi square prior (s_0, nu_0): the
 rise, y beyond what the others let expect, follows a mixture over all of these. Recordings of one session, by their
 dates, share oil and set-up: a deviation tau of sessions, half-normal beforehand, of leakage in proportion to its level,
 for it goes with the inverse of the oil's viscosity. Recordings without a date are of one session. Where the oil's
@@ -30,9 +30,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, solve, total
 from sealscope.diagnosis.inference.weak_form import LARGEST
+from sealscope.diagnosis.priors import priors
 from sealscope.recordings.recording import Array
 
 #: Nodes of a deviation, and the largest one between sessions over what is believed; most recordings that are compared.
@@ -132,7 +132,7 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
     All are of `columns`, one of each equation.
     """
     everything, count = np.sum([own.sums for own in baseline], axis=0), len(baseline)
-    believed, by_flow = beliefs("inference")["scatter"], judged.flow / judged.pressure if judged.pressure > 0.0 else 0.0
+    believed, by_flow = priors("inference")["scatter"], judged.flow / judged.pressure if judged.pressure > 0.0 else 0.0
     decades = np.linspace(-FARTHEST, FARTHEST, SCALES)
     widths = believed["between"] ** decades
     beyond = np.zeros((SCALES, count))
@@ -140,7 +140,7 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
         beyond = np.array([_rises(own.sums, everything - own.sums, columns, widths) for own in baseline]).T
     *by_oil, warmer, oil = _of_oil([*baseline, judged], *_level(everything, columns))
     values = _rises(judged.sums, everything, columns, widths) - warmer
-    starts, pause = [own.start_s for own in (*baseline, judged)], 3600.0 * beliefs("inference")["oil"]["shift"]
+    starts, pause = [own.start_s for own in (*baseline, judged)], 3600.0 * priors("inference")["oil"]["shift"]
     sessions = np.array(sessions_of(starts, pause))
     usual, apart = believed["leak"] * by_flow, float(np.hypot(oil, believed["session"] * by_flow))
     nodes = WIDEST * ((np.arange(NODES) + 0.5) / NODES) ** 2  # closer near zero
@@ -148,11 +148,13 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
     if len(set(sessions)) == 1:
         nodes, believed_of = np.zeros(1), np.zeros(1)
     alike = np.equal.outer(sessions, sessions)
-    among = Among(((apart * nodes) ** 2)[:, None, None] * alike, believed_of)
-    return among.rise(values, beyond * ((count - 1) / count) - by_oil, usual, believed["freedom"], -0.5 * decades**2)
+    population = Population(((apart * nodes) ** 2)[:, None, None] * alike, believed_of)
+    return population.rise(
+        values, beyond * ((count - 1) / count) - by_oil, usual, believed["freedom"], -0.5 * decades**2
+    )
 
 
-class Among:
+class Population:
     """Values that are normal about an unknown mean, the last of them the judged one.
 
     Parameters
@@ -218,7 +220,7 @@ def _of_oil(recordings: Sequence[RecordingSums], level: float, error: float) -> 
 
     Last the deviation of the last one's: what may still differ, as far as the `level` within its `error` goes.
     """
-    believed = beliefs("inference")["oil"]
+    believed = priors("inference")["oil"]
     known = [own.oil_degC for own in recordings if own.oil_degC is not None]
     if len(known) < len(recordings):  # the difference of two sessions has twice the variance of each
         return [0.0] * len(recordings) + [0.5**1.5 * (believed["warmest"] - 1.0) * (level + error)]
@@ -257,7 +259,7 @@ def motion_change(judged: Array, baseline: Sequence[Array], columns: Columns) ->
 
     at = [chosen.index(k) for k in motion]
     apart = [logarithm(own, everything - own) for own in baseline] if len(baseline) > 1 else [0.0]
-    return student(logarithm(judged, everything), apart, beliefs("inference")["between"]["motion"])
+    return student(logarithm(judged, everything), apart, priors("inference")["between"]["motion"])
 
 
 def student(value: float, deviations: Sequence[float] | Array, believed: float) -> Rise:
@@ -265,7 +267,7 @@ def student(value: float, deviations: Sequence[float] | Array, believed: float) 
 
     `believed`: what is believed of the scatter beforehand.
     """
-    width, count = beliefs("inference")["scatter"], len(deviations)
+    width, count = priors("inference")["scatter"], len(deviations)
     squares = width["freedom"] * believed * believed
     freedom = width["freedom"] + count - 1
     if count > 1:
@@ -299,11 +301,11 @@ def _rises(own: Array, reference: Array, columns: Sequence[Columns], widths: Arr
         others = [k for k in chosen if k != column.leak]
         size = np.abs(coefficients[[chosen.index(k) for k in others]])
         with np.errstate(divide="ignore", over="ignore"):
-            belief = 1.0 / (size * column.between[others]) ** 2
+            prior = 1.0 / (size * column.between[others]) ** 2
         matrix, along = own[e][np.ix_(others, others)], own[e][others, column.leak]
         right = np.column_stack([along, residual[others]])
         for s, width in enumerate(widths):
-            tied = matrix + np.diag(np.minimum(belief / width**2, 1e9 * np.diag(matrix)))
+            tied = matrix + np.diag(np.minimum(prior / width**2, 1e9 * np.diag(matrix)))
             solved = solve(tied, right)
             precision[s] += float(own[e][column.leak, column.leak] - along @ solved[:, 0])
             vector[s] += float(residual[column.leak] - along @ solved[:, 1])

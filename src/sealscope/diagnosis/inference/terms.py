@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.beliefs import beliefs
+from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.recordings.channels import flow_source
 from sealscope.recordings.recording import Array
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 #: The least absolute pressure that the terms of air are computed for [Pa].
-LEAST_ABSOLUTE: float = beliefs("inference")["pressure"]["least"]
+LEAST_ABSOLUTE: float = priors("inference")["pressure"]["least"]
 #: Half the time over which speed and direction of motion are taken [s]: a few counts of an encoder at slow motion.
 HALF_DIFFERENCE = 0.025
 

@@ -23,9 +23,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, cost_of_zero, pair
 from sealscope.diagnosis.inference.onset import FEWEST, RANK, WALKS
+from sealscope.diagnosis.priors import priors
 from sealscope.recordings.recording import Array
 
 #: Zeros that are tried at first, within three times what is believed of one that is far off.
@@ -41,11 +41,11 @@ def about_zero(blocks: Blocks, columns: Sequence[Columns]) -> Blocks:
 
     if len(blocks) < FEWEST or len(columns) != 1 or columns[0].bias is None:
         return blocks
-    effects = _effects(blocks.merged(beliefs("inference")["blocks"]["coarse"]), columns[0])
+    effects = _effects(blocks.merged(priors("inference")["blocks"]["coarse"]), columns[0])
     if effects is None:
         return blocks
     within, offset, z = effects
-    usual, far = (beliefs("inference")["zero"][name] for name in ("pressure", "far"))
+    usual, far = (priors("inference")["zero"][name] for name in ("pressure", "far"))
     width = columns[0].zero_deviation(columns[0].leak, blocks)
     walks = WALKS[: int(_likelihoods(within, z, WALKS).argmax()) + 1]
 

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sealscope.compiled import kernel
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.balance import BlockStream
 from sealscope.diagnosis.inference.blocks import Blocks, Columns
 from sealscope.diagnosis.inference.terms import Equation, equations
 from sealscope.diagnosis.inference.weak_form import stride_samples
 from sealscope.diagnosis.live.joining import SampleRun
 from sealscope.diagnosis.live.known import STANDSTILL, Known, add, begin, known_shapes, motion, says, take
+from sealscope.diagnosis.priors import priors
 from sealscope.errors import InputError
 from sealscope.storage.plain_state import array_of, part_of, recall, saved
 from sealscope.units import LITRE_PER_MINUTE
@@ -29,14 +29,14 @@ from sealscope.units import LITRE_PER_MINUTE
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-_BELIEVED = beliefs("live")["block"]
+_PRIORS = priors("live")["block"]
 #: About how long a block is [s], and blocks before anything is said.
-BLOCK_SECONDS: float = _BELIEVED["seconds"]
-LEARNED: int = _BELIEVED["learned"]
+BLOCK_SECONDS: float = _PRIORS["seconds"]
+LEARNED: int = _PRIORS["learned"]
 #: A block at standstill counts all the same where it tells of the leak more than so much of what the usual one does,
 #: and after so many that move so much more, all before were of a machine at standstill.
-TELLS: float = _BELIEVED["tells"]
-WAKES: int = _BELIEVED["wakes"]
+TELLS: float = _PRIORS["tells"]
+WAKES: int = _PRIORS["wakes"]
 
 
 @dataclass(frozen=True)
@@ -241,7 +241,7 @@ def _valved(rig: Rig) -> bool:
 
 def size_error(rig: Rig) -> float:
     """Return how far a flow by the rig's size is known, relative."""
-    return float(beliefs("inference")["size"]["area" if _valved(rig) else "displacement"])
+    return float(priors("inference")["size"]["area" if _valved(rig) else "displacement"])
 
 
 def live_equations(rig: Rig, names: Sequence[str]) -> list[Equation]:

@@ -8,9 +8,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.live.sequential import StepEstimate
+from sealscope.diagnosis.priors import priors
 
 Interval = tuple[float, float]
 Duty = tuple[float, float]
@@ -106,7 +106,7 @@ class WatchBaseline:
         """
         from scipy.special import ndtri
 
-        warmest = beliefs("inference")["oil"]["warmest"]
+        warmest = priors("inference")["oil"]["warmest"]
         ceiling = warmest * max(self.low, 0.0)
         score, threshold = (g - ceiling) / deviation, -float(ndtri(probability))
         if score <= threshold:
@@ -125,7 +125,7 @@ class WatchBaseline:
 
 def within(duty: Duty, low: Duty, high: Duty) -> bool:
     """Return whether a duty lies between two others, give or take; a leak may take more of the pressure."""
-    believed = beliefs("live")["watch"]
+    believed = priors("live")["watch"]
     margin = believed["margin"]
     below = (low[0] - believed["damped"], low[1] - margin)
     return all(least <= own <= most + margin for own, least, most in zip(duty, below, high, strict=True))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.beliefs import beliefs
+from sealscope.diagnosis.priors import priors
 from sealscope.errors import InputError
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
 from sealscope.storage.plain_state import recall, saved
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 #: Channels of an actuator that are kept: those that it may be watched by, and beside the estimates the oil's.
 CHANNELS = ("x", "theta", "omega", "p_A", "p_B", "p_1", "p_2", "u", "T_oil")
-_BELIEVED = beliefs("live")["samples"]
-_NEAREST, _FARTHEST = _BELIEVED["follows"]
-_CLOCKS: float = _BELIEVED["rate"]
+_PRIORS = priors("live")["samples"]
+_NEAREST, _FARTHEST = _PRIORS["follows"]
+_CLOCKS: float = _PRIORS["rate"]
 
 
 def ways_to_watch(rig: Rig) -> tuple[tuple[str, ...], ...]:

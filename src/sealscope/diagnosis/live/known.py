@@ -18,14 +18,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sealscope.compiled import large_law, law
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.row_weights import eliminate
 from sealscope.diagnosis.inference.weak_form import OVERLAP
+from sealscope.diagnosis.priors import priors
 
-JUMP: float = beliefs("live")["coefficients"]["jump"]
-STANDSTILL: float = beliefs("live")["block"]["standstill"]
+JUMP: float = priors("live")["coefficients"]["jump"]
+STANDSTILL: float = priors("live")["block"]["standstill"]
 #: What is left after a block of what those before said, and of how far the series stands from the present level.
-_KEEP, _RETURNS = (math.exp(-1.0 / beliefs("live")["coefficients"][name]) for name in ("memory", "returns"))
+_KEEP, _RETURNS = (math.exp(-1.0 / priors("live")["coefficients"][name]) for name in ("memory", "returns"))
 TINY = float(np.finfo(float).tiny)
 
 #: Places in `Known.numbers`: rows and motion that the sums are of, variance of a row, energy of the leak's column, how

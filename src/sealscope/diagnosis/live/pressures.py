@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sealscope.diagnosis.beliefs import beliefs
-from sealscope.diagnosis.inference.pressures.evidence import BELIEVED, flow_scale, states_flow, unusable
-from sealscope.diagnosis.inference.pressures.response import LAWS, Follower, G, Machine, beliefs_of
+from sealscope.diagnosis.inference.pressures.evidence import PRIORS, flow_scale, states_flow, unusable
+from sealscope.diagnosis.inference.pressures.response import LAWS, Follower, G, Machine, priors_of
 from sealscope.diagnosis.live.balance import BlockConductance, NotJudged, Shown
 from sealscope.diagnosis.live.joining import SampleRun
+from sealscope.diagnosis.priors import priors
 from sealscope.errors import InputError
 from sealscope.recordings.motion import moves
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
@@ -28,9 +28,9 @@ from sealscope.units import LITRE_PER_MINUTE
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-_BELIEVED = beliefs("live")["response"]
-_SETTLING, _RESUMING, _PAUSE = _BELIEVED["settling"], _BELIEVED["resuming"], beliefs("live")["watch"]["pause"]
-_SLOWEST, _READ = BELIEVED["blocks"]["slowest"], ("p_A", "p_B", "u")
+_PRIORS = priors("live")["response"]
+_SETTLING, _RESUMING, _PAUSE = _PRIORS["settling"], _PRIORS["resuming"], priors("live")["watch"]["pause"]
+_SLOWEST, _READ = PRIORS["blocks"]["slowest"], ("p_A", "p_B", "u")
 
 
 class PressureEstimator:
@@ -43,9 +43,9 @@ class PressureEstimator:
     """
 
     method, levels, cause = "pressures", False, "leak inside or outside"
-    size_error, orifice = flow_scale(), BELIEVED["conductance"]["orifice"]
-    inside: float = beliefs("live")["watch"]["inside"]
-    block_seconds: float = _BELIEVED["seconds"]
+    size_error, orifice = flow_scale(), PRIORS["conductance"]["orifice"]
+    inside: float = priors("live")["watch"]["inside"]
+    block_seconds: float = _PRIORS["seconds"]
     states_flow = staticmethod(states_flow)
 
     def __init__(self, rig: Rig, litres: bool | None = None) -> None:
@@ -65,7 +65,7 @@ class PressureEstimator:
         """Take the next samples; return what each block shows that they complete."""
         before = self._kept if run.follows else self._kept[:, :0]
         kept = np.hstack([before, [run.t, *(run.channels[name] for name in _READ)]])
-        first, length = (round(seconds * run.rate) for seconds in (_BELIEVED["begins"], self.block_seconds))
+        first, length = (round(seconds * run.rate) for seconds in (_PRIORS["begins"], self.block_seconds))
         shown: list[Shown] = []
         while self._follower is None and run.rate >= _SLOWEST and kept.shape[1] >= first:
             beginning = _recording(kept[:, :first], run.rate)
@@ -93,20 +93,20 @@ class PressureEstimator:
         own = follower.take(block)
         variance = float(own.gram[0, 0]) / max(own.samples, 1.0)
         settling, self._settling = self._settling > 0, max(self._settling - 1, 0)
-        described = bool(np.isfinite(follower.theta).all()) and follower.excess < _BELIEVED["described"]
+        described = bool(np.isfinite(follower.theta).all()) and follower.excess < _PRIORS["described"]
         ratio = float(np.clip(max(variance, 1.0) / follower.variance, 0.1, 10.0)) if math.isfinite(variance) else 1.0
-        follower.variance *= ratio ** (1.0 / (_BELIEVED["usual"] if described and not settling else _RESUMING))
+        follower.variance *= ratio ** (1.0 / (_PRIORS["usual"] if described and not settling else _RESUMING))
         if not described:  # after some of them the machine is lost
             self._lost += 1
-            if self._lost < _BELIEVED["lost"] and np.isfinite(follower.theta).all():
+            if self._lost < _PRIORS["lost"] and np.isfinite(follower.theta).all():
                 self._settling = self._settling if settling else _RESUMING
                 return _passed_over(end, "settling" if settling else "not described by the model", apart)
             follower.interrupt(math.inf)
             self._lost, self._settling = 0, _SETTLING
             return _passed_over(end, "not described by the model", True)
         self._lost = 0
-        width = BELIEVED["response"]["G"][1]
-        g, sd = float(follower.theta[G]), math.sqrt(follower.covariance[G, G]) * float(follower.beliefs.unit[G])
+        width = PRIORS["response"]["G"][1]
+        g, sd = float(follower.theta[G]), math.sqrt(follower.covariance[G, G]) * float(follower.priors.unit[G])
         if settling:
             return _passed_over(end, "settling", apart)
         if sd > width:
@@ -155,7 +155,7 @@ class PressureEstimator:
             raise InputError(f"saved state's rate must be > 0 Hz, got {rate}")
         if (law := part_of(known, "law", str)) not in LAWS:
             raise InputError(f"saved state's law must be {' or '.join(LAWS)}, got {law!r}")
-        self._follower = Follower(Machine.of(self._rig, rate, law), beliefs_of(self._rig, law), sense)
+        self._follower = Follower(Machine.of(self._rig, rate, law), priors_of(self._rig, law), sense)
         recall(self._follower, _FOLLOWED, known)
 
 

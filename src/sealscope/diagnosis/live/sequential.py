@@ -30,18 +30,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.compiled import kernel
-from sealscope.diagnosis.beliefs import beliefs
+from sealscope.diagnosis.priors import priors
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 from sealscope.storage.plain_state import recall, saved
 
-_BELIEVED = beliefs("live")["step"]
-WALKS = np.array(_BELIEVED["walks"])[:, None]
-SIZES = np.array(_BELIEVED["sizes"])
-PARTS = np.array(_BELIEVED["parts"])
-JUMP, MEMORY = beliefs("live")["coefficients"]["jump"], _BELIEVED["memory"]
+_PRIORS = priors("live")["step"]
+WALKS = np.array(_PRIORS["walks"])[:, None]
+SIZES = np.array(_PRIORS["sizes"])
+PARTS = np.array(_PRIORS["parts"])
+JUMP, MEMORY = priors("live")["coefficients"]["jump"], _PRIORS["memory"]
 #: Onsets are all kept for `RECENT` blocks, then `RECENT / 4` of every doubling of age, up to `HORIZON` blocks.
-RECENT, HORIZON = _BELIEVED["recent"], _BELIEVED["horizon"]
+RECENT, HORIZON = _PRIORS["recent"], _PRIORS["horizon"]
 #: What is kept of each onset and walk, and of each onset.
 _FIELDS = ("answer", "along", "square", "total", "lead")
 _PLACES = ("number", "born", "onset", "begin")
@@ -112,7 +112,7 @@ class StepDetector:
 
     def _begin_onset(self, begin: float, end: float) -> None:
         fresh = np.zeros((len(_FIELDS), len(WALKS), len(PARTS)))
-        weight = np.logaddexp(np.log1p(-_BELIEVED["changes"]) + self._weight, np.log(_BELIEVED["changes"] / len(WALKS)))
+        weight = np.logaddexp(np.log1p(-_PRIORS["changes"]) + self._weight, np.log(_PRIORS["changes"] / len(WALKS)))
         # p_q(e_j..e_k) = lead T_k^(-n/2) prod S^(-1/2) times what is the same for all q
         fresh[3], fresh[4] = self._total, weight + 0.5 * (self._known * np.log(self._total) + self._widths)
         places = np.array([[self._known, self._blocks, end - part * (end - begin), begin] for part in PARTS])
@@ -185,7 +185,7 @@ class StepDetector:
     @property
     def noise(self) -> float:
         """Variance of a block's estimate over what was stated of it, beside a walk of a tenth."""
-        return float((self._total[3, 0] + _BELIEVED["stated"]) / (self._known + _BELIEVED["stated"]))
+        return float((self._total[3, 0] + _PRIORS["stated"]) / (self._known + _PRIORS["stated"]))
 
     def state(self) -> dict[str, Any]:
         """Return all of it as plain values."""

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.live.balance import LEARNED, BlockConductance, LiveBalance, NotJudged, Shown
 from sealscope.diagnosis.live.estimates import BaselineLearning, BlockEstimate, WatchBaseline, WatchedLeak, within
 from sealscope.diagnosis.live.joining import SampleJoiner, ways_to_watch
 from sealscope.diagnosis.live.pressures import PressureEstimator
 from sealscope.diagnosis.live.sequential import RECENT, StepDetector, StepEstimate
+from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
 #: Format of the saved state.
 STATE_VERSION = 11
-_BELIEVED = beliefs("live")["watch"]
+_PRIORS = priors("live")["watch"]
 #: Blocks of one mean that is compared with the baseline, and of the mean that is the leak after an alarm.
-GROUP, _OF_NOW = _BELIEVED["group"], _BELIEVED["recent"]
+GROUP, _OF_NOW = _PRIORS["group"], _PRIORS["recent"]
 #: What is kept of the last blocks: end, conductance, deviation, flow of a unit of it, and the duty's logarithms; and of
 #: those whose mean is not whole yet, with what all conductances are off by.
 _LAST = np.dtype([(name, float) for name in ("end", "g", "sd", "flow", "pressure", "motion")])
@@ -102,7 +102,7 @@ class Watch:
         Raises InputError where no threshold can be set for it.
         """
         rate: float = self.false_alarms_per_1000_h
-        looks: float = 1000.0 / _BELIEVED[test] * 3600.0 / seconds
+        looks: float = 1000.0 / _PRIORS[test] * 3600.0 / seconds
         least, most = 1e-12 * looks, 0.05 * looks
         if not least <= rate <= most:
             raise InputError(f"false_alarms_per_1000_h must be {least:.2g} to {most:.3g}, got {rate:g}")
@@ -147,7 +147,7 @@ class Watch:
         last = self._last[-1]
         bound, pump = own.orifice * bound * float(last["flow"]), math.exp(last["motion"]) / LITRE_PER_MINUTE
         limit = f"{bound:.2g} L/min" if own.litres else f"{100.0 * bound / pump:.2g} % of the pump's flow"
-        enough = bound <= beliefs("inference")["worth"]["share"] * pump
+        enough = bound <= priors("inference")["worth"]["share"] * pump
         return Evidence(
             "no leak" if enough else "cannot tell",
             f"no leak above {limit} (95 %)" if enough else f"a leak of up to {limit} would not show (95 %)",
@@ -237,7 +237,7 @@ class Watch:
         if self.baseline is not None and not within(block.duty, self.baseline.duty_low, self.baseline.duty_high):
             self._samples.count("blocks: another duty")
             return BlockEstimate(self.blocks, block.end, "another duty")
-        if len(self._last) and not 0.0 <= block.end - self._last["end"][-1] <= _BELIEVED["pause"]:
+        if len(self._last) and not 0.0 <= block.end - self._last["end"][-1] <= _PRIORS["pause"]:
             self._forget()
         self._detector.take(block.begin, block.end, block.g, block.sd)
         row = np.array((block.end, block.g, block.sd, block.flow, *block.duty), _LAST)
@@ -298,7 +298,7 @@ class Watch:
         if self.leak is not None or self.baseline is None:
             return
         # what all conductances are off by is in the ceiling that many times
-        deviation = math.hypot(sd, offset * (beliefs("inference")["oil"]["warmest"] - 1.0))
+        deviation = math.hypot(sd, offset * (priors("inference")["oil"]["warmest"] - 1.0))
         rise = self.baseline.rise(at, g, deviation, self._probability("level", GROUP * self.block_seconds))
         if rise is not None:
             self._raise(own, rise, block, self.baseline.level)
@@ -348,7 +348,7 @@ class Watch:
         """Return the conductance since the onset of a leak, and its interval, in which the oil may have warmed."""
         since = self._last["end"] - self.block_seconds >= leak.onset_interval_s[1]
         recent = self._last["g"][since][-_OF_NOW:]
-        now, oil = float(np.mean(recent)) if recent.size else block.g, beliefs("inference")["oil"]
+        now, oil = float(np.mean(recent)) if recent.size else block.g, priors("inference")["oil"]
         hours = max(0.0, block.end - leak.onset_s) / 3600.0
         warmed = oil["warmest"] ** min(1.0, hours / oil["shift"])
         before, rise = max(leak.conductance_before, 0.0), now - leak.conductance_before

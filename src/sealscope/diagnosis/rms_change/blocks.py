@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sealscope.diagnosis.beliefs import beliefs
+from sealscope.diagnosis.priors import priors
 from sealscope.recordings.chambers import CHAMBERS, chambers_of
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.gaps import touched
@@ -65,7 +65,7 @@ class RmsBlocks:
 
     def settled(self) -> RmsBlocks:
         """Return the blocks after the machine's start: without 10 s or three cycles, at most an eighth of them."""
-        n, believed = len(self.log_rms), beliefs("rms_change")["blocks"]
+        n, believed = len(self.log_rms), priors("rms_change")["blocks"]
         start = max(believed["settling"], believed["settling_cycles"] * (self.cycle or 0.0))
         first = min(n // 8, int(np.ceil(start / self.seconds))) if n else 0
         return replace(self, edges=self.edges[first:], log_rms=self.log_rms[first:], duty=self.duty[first:])
@@ -100,7 +100,7 @@ def _columns(recording: Recording, transformed: list[Details], bounds: IntArray)
     command = recording.channels.get("u", np.zeros(len(recording)))
     squares = np.stack([command, np.gradient(command) * recording.rate, load]) ** 2
     rest = np.maximum(
-        beliefs("rms_change")["blocks"]["standstill"] ** 2 * squares.mean(axis=1, keepdims=True), np.finfo(float).tiny
+        priors("rms_change")["blocks"]["standstill"] ** 2 * squares.mean(axis=1, keepdims=True), np.finfo(float).tiny
     )
     with np.errstate(divide="ignore", over="ignore"):
         energies = np.concatenate([mean_squares(own, bounds) for own in transformed], axis=1)
@@ -110,7 +110,7 @@ def _columns(recording: Recording, transformed: list[Details], bounds: IntArray)
 
 def cut(recording: Recording) -> RmsBlocks:
     """Cut a uniformly sampled recording without missing samples into blocks, edges of the transform dropped."""
-    chambers, rate, believed = judged_chambers(recording), recording.rate, beliefs("rms_change")["blocks"]
+    chambers, rate, believed = judged_chambers(recording), recording.rate, priors("rms_change")["blocks"]
     transformed = [details(recording[chamber]) for chamber in chambers]
     inside, cycle = transformed[0].inside(), find_cycle(recording)
     wanted = max(believed["seconds"], believed["samples"] / rate)

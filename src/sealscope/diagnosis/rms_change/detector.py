@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Interval, step_tests
 from sealscope.diagnosis.learnt import Healthy, Lesson, lessons_of
+from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.rms_change.blocks import JUDGED, RmsBlocks, columns_of, cut, judged_chambers, whole
 from sealscope.diagnosis.rms_change.ringing import information, rises
 from sealscope.diagnosis.verdict.evidence import Evidence, Verdict
@@ -83,7 +83,7 @@ class RmsChange:
 
     def examine(self, recording: Recording, baseline: Sequence[Healthy], false_alarm_probability: float) -> Evidence:
         """Return the evidence on a recording that is `usable`, within it or against the baseline."""
-        rates = beliefs("rms_change")["rate"]
+        rates = priors("rms_change")["rate"]
         if recording.rate < rates["slowest"]:
             least = f"needs {rates['slowest']:g} Hz or more to see the ringing that a leak damps"
             return Evidence("cannot tell", f"{least}, got {recording.rate:g} Hz: is the unit of the time right?")
@@ -100,7 +100,7 @@ class RmsChange:
 def _within(blocks: RmsBlocks, probability: float) -> Evidence:
     if blocks.still is not None:
         return Evidence("cannot tell", f"the pressures cannot be trusted: {blocks.still}")
-    if len(blocks.log_rms) < (fewest := beliefs("rms_change")["blocks"]["fewest"]):
+    if len(blocks.log_rms) < (fewest := priors("rms_change")["blocks"]["fewest"]):
         short = f"too short to be its own baseline: {len(blocks.log_rms)} blocks, {fewest} are needed"
         return Evidence("cannot tell", f"{short}; give leak-free recordings as --baseline")
     return within(blocks.settled(), probability)
@@ -169,7 +169,7 @@ def _evidence(changes: Sequence[_Change], share: float, where: str, onset: Inter
         at = "" if onset is None else f" at {onset.value:.1f} s"
         moved = [own.text for own in judged if own.score > own.threshold][:3]
         reason = f"{', '.join(moved)}{at} {where} ({figures}){note}"
-    elif bound > beliefs("rms_change")["recordings"]["worth"]:
+    elif bound > priors("rms_change")["recordings"]["worth"]:
         verdict = "cannot tell"
         reason = f"a fall of the ringing by {limit} {where} would not show (95 %; {figures}){note}"
     else:

@@ -14,9 +14,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Information
-from sealscope.diagnosis.inference.scatter import Among, Rise, sessions_of
+from sealscope.diagnosis.inference.scatter import Population, Rise, sessions_of
+from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.rms_change.blocks import DUTY, RmsBlocks
 from sealscope.recordings.recording import Array
 from sealscope.signals.details import QUANTITIES
@@ -25,7 +25,7 @@ from sealscope.signals.details import QUANTITIES
 def beyond_noise(log_rms: Array, known: Array) -> tuple[Array, Array]:
     """Return y and w (n, 5 per chamber) of log RMS (n, 5 per chamber), the machine's own energy that of `known`."""
     left, weight = np.array(log_rms), np.ones_like(log_rms)
-    least = beliefs("rms_change")["walk"]["least"]
+    least = priors("rms_change")["walk"]["least"]
     for first in range(0, log_rms.shape[1], len(QUANTITIES)):
         noise = np.exp(2.0 * log_rms[:, first])
         for column in range(first + 1, first + QUANTITIES.index("d3d4")):
@@ -44,7 +44,7 @@ def information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
     error = np.mean(np.diff(left, axis=0) ** 2, axis=0) / 2.0
     explaining = DUTY[:-1]  # the direction is that of the phase
     duty = (blocks.duty - blocks.duty.mean(axis=0))[:, : len(explaining)]
-    exponents, walks = (beliefs("rms_change")[table] for table in ("duty", "walk"))
+    exponents, walks = (priors("rms_change")[table] for table in ("duty", "walk"))
     believed = np.array([float(exponents[name]) for name in explaining])
     time = blocks.edges[:-1] + 0.5 * blocks.seconds
     over_all = float(np.sqrt(len(time) * blocks.seconds / walks["time"]))
@@ -69,22 +69,22 @@ def rises(
     an Ornstein-Uhlenbeck process: it grows as a walk of a rate nobody knows, up to what sessions differ by; a session
     begins anew after a pause. `times` (n + 1,) of these and of the recording [s], None where they are not known.
     """
-    belief, walk, n = beliefs("rms_change")["recordings"], beliefs("rms_change")["walk"], len(known)
-    exponents = np.array([float(beliefs("rms_change")["duty"][name]) for name in DUTY])
+    prior, walk, n = priors("rms_change")["recordings"], priors("rms_change")["walk"], len(known)
+    exponents = np.array([float(priors("rms_change")["duty"][name]) for name in DUTY])
     apart = (np.vstack([known_duty, duty]) - duty) * exponents
     quantiles = (np.arange(walk["tried"]) + 0.5) / walk["tried"]
     gained = walk["machine"] * np.tan(0.5 * np.pi * quantiles)
-    rates = (gained / belief["session"]) ** 2 / (2.0 * walk["time"])
+    rates = (gained / prior["session"]) ** 2 / (2.0 * walk["time"])
     since, alike = np.zeros((n + 1, n + 1)), np.ones((n + 1, n + 1))
     if times is not None:
-        sessions = sessions_of(list(times), belief["pause"])
+        sessions = sessions_of(list(times), prior["pause"])
         since, alike = np.abs(np.subtract.outer(times, times)), np.equal.outer(sessions, sessions).astype(float)
-    fading = belief["session"] ** 2 * np.exp(-rates[:, None, None] * since) * alike
-    among = Among(fading + apart @ apart.T, np.zeros(len(rates)))
+    fading = prior["session"] ** 2 * np.exp(-rates[:, None, None] * since) * alike
+    population = Population(fading + apart @ apart.T, np.zeros(len(rates)))
     values, weights = beyond_noise(np.vstack([log_rms, known]), known)
     weight = weights[1:].mean(axis=0)
     stated = []
     for own, others, w in zip(values[0] / weight, values[1:].T / weight[:, None], weight, strict=True):
-        scatter = float(np.hypot(belief["scatter"], belief["error"] / w))
-        stated.append(among.rise(own[None], others[None], scatter, belief["freedom"]))
+        scatter = float(np.hypot(prior["scatter"], prior["error"] / w))
+        stated.append(population.rise(own[None], others[None], scatter, prior["freedom"]))
     return stated, weight

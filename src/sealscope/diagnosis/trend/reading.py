@@ -11,12 +11,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.detector import unusable
 from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.inference.pressures.detector import PressureResponse
 from sealscope.diagnosis.inspection import inspected
+from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.rms_change.blocks import JUDGED, whole
 from sealscope.diagnosis.trend.wear import DayToDay
 from sealscope.diagnosis.verdict.machine import AssumedMachine, assumed_rig
@@ -114,16 +114,16 @@ def _stated(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[str, Any
     log_rms = whole(part)[0].reshape(-1, len(QUANTITIES))
     ringing = float(-np.mean(log_rms[:, [QUANTITIES.index(name) for name in JUDGED]]))
     if np.isfinite(ringing):
-        return {"basis": BASES[2], "level": ringing, "error": beliefs("trend")["own"]["ringing"]}
+        return {"basis": BASES[2], "level": ringing, "error": priors("trend")["own"]["ringing"]}
     why = dict.fromkeys(reason for reason in (lack, lacks) if reason) or ["the pressures do not ring"]
     return {"problem": "no detector states a level: " + "; ".join(why)}
 
 
 def scatter_of(basis: Basis, usual: float) -> DayToDay:
     """Return the prior on the scatter of a level between recordings, for a machine of that usual level."""
-    believed = beliefs("trend")["between"]
+    believed = priors("trend")["between"]
     if basis == "pressure response":
-        return DayToDay(beliefs("inference.pressures")["conductance"]["level"], believed["freedom"])
+        return DayToDay(priors("inference.pressures")["conductance"]["level"], believed["freedom"])
     size = abs(usual) if basis == "volume balance" else 1.0
     return DayToDay(max(believed[basis] * size, float(np.finfo(float).tiny)), believed["freedom"])
 
@@ -167,7 +167,7 @@ def timeline(readings: Sequence[LeakReading], every: float | None = None) -> tup
         notes.append(reading.problem or ("" if copy == reading.file else f"the same samples as {copy}"))
     kept = [reading.basis for reading, note in zip(ordered, notes, strict=True) if not note]
     basis: Basis | None = max(BASES, key=kept.count) if kept else None
-    points, scales, most = [], list[float | None](), beliefs("trend")["own"]["scale"]
+    points, scales, most = [], list[float | None](), priors("trend")["own"]["scale"]
     for reading, problem in zip(ordered, notes, strict=True):
         other = "" if reading.basis == basis else f"its channels allow the {reading.basis}, not the {basis}"
         note = problem or other

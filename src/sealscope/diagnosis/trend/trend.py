@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import WITHIN_95, Interval
+from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.trend.reading import (
     Basis,
     LeakReading,
@@ -322,7 +322,7 @@ def _levels(trend: Trend) -> tuple[Levels, float | None]:
     warmer, slope_sd = np.zeros(t.size), 0.0
     temperatures = [own.temperature for own in kept if own.temperature is not None]
     if trend.basis != "ringing" and len(temperatures) == t.size:
-        slope, deviation = (beliefs("inference")["oil"][name] for name in ("per_kelvin", "per_kelvin_deviation"))
+        slope, deviation = (priors("inference")["oil"][name] for name in ("per_kelvin", "per_kelvin_deviation"))
         warmer, slope_sd = np.array(temperatures) - temperatures[0], deviation * abs(usual)
         value, error = (own * np.exp(-slope * warmer) for own in (value, error))
     flows = trend.pressure is not None
@@ -360,7 +360,7 @@ def _verdict(trend: Trend) -> tuple[Verdict, str]:
     count = last.end - last.begin
     if count < 3:
         return "cannot tell", f"{count} comparable recordings are too few, 3 are needed"
-    detectable = beliefs("trend")["course"]["detectable"] * max(
+    detectable = priors("trend")["course"]["detectable"] * max(
         wear.scatter, (wear.healthy.high - wear.healthy.low) / (2.0 * WITHIN_95)
     )
     if trend.limit is not None and wear.healthy.value + detectable > trend.limit:

@@ -35,8 +35,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Interval
+from sealscope.diagnosis.priors import priors
 from sealscope.recordings.recording import Array
 from sealscope.signals.filters import IntArray
 from sealscope.units import DAYS_PER_MONTH, DAYS_PER_YEAR
@@ -108,7 +108,7 @@ def beyond(levels: Levels) -> tuple[Array, Array]:
 
     That is what lies beyond some deviations of the three before it, unless its neighbour lies as far out.
     """
-    (last, later), outlier = np.zeros((2, len(levels))), beliefs("trend")["course"]["outlier"]
+    (last, later), outlier = np.zeros((2, len(levels))), priors("trend")["course"]["outlier"]
     for k in range(1, len(levels)):
         same = np.flatnonzero(levels.group == levels.group[k])
         place = int(np.searchsorted(same, k))
@@ -140,7 +140,7 @@ class _Changes(NamedTuple):
     @classmethod
     def after(cls, levels: Levels, known: int, *, steps_only: bool = False) -> _Changes:
         """Return the changes that may begin after the first `known` recordings."""
-        believed = beliefs("trend")["change"]
+        believed = priors("trend")["change"]
         begin = np.arange(max(known, 1), len(levels))
         step = (np.arange(len(levels))[:, None] >= begin).astype(float)
         growth = np.maximum(levels.t[:, None] - levels.t[begin - 1], 0.0) / DAYS_PER_MONTH
@@ -182,7 +182,7 @@ def _nodes(levels: Levels, shapes: Array, *, sloping: bool = False) -> list[_Nod
     """Return every node of the grid, for changes (n, m); `sloping`: the level may have grown evenly before."""
     from scipy.linalg import solve_triangular
 
-    believed, prior = beliefs("trend")["between"], levels.prior
+    believed, prior = priors("trend")["between"], levels.prior
     last, later = beyond(levels)
     values = levels.value - levels.value[0] - later
     reach = max(prior.scale, 0.3 * float(np.ptp(levels.value)))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sealscope.diagnosis.verdict.evidence import LEAKS, LEAST_SPECIFIC, Evidence
+from sealscope.diagnosis.verdict.evidence import LEAKS, RMS_CHANGE, Evidence
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.severity import RepairLimit, Severity, beside_the_pump, severity
 from sealscope.diagnosis.verdict.states import MachineState, state_of
@@ -161,7 +161,7 @@ class Diagnosis(Evidence):
         """The condition of `states.toml` that the verdict is."""
         if self.verdict != "no leak" or self.known_healthy:
             return self.verdict
-        return "no change of RMS" if self.detector == LEAST_SPECIFIC else "no change"
+        return "no change of RMS" if self.detector == RMS_CHANGE else "no change"
 
     @property
     def next_check(self) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from sealscope.diagnosis.beliefs import beliefs
+from sealscope.diagnosis.priors import priors
 from sealscope.recordings.recording import Array
 
 Verdict = Literal["leak", "no leak", "cannot tell"]
@@ -27,9 +27,9 @@ Figure = Literal["onset_s", "leak_lpm"]
 #: The causes for which the verdict is `leak`: piston and pump lie in parallel, and often no channel tells them apart.
 LEAKS: tuple[Cause, ...] = ("piston leak", "piston or pump leak")
 #: Smallest chance that is stated.
-RAREST: float = beliefs("verdict")["false_alarm"]["rarest"]
+RAREST: float = priors("verdict")["false_alarm"]["rarest"]
 #: The detector that judges where no other can: it sees that something changed, and states no size.
-LEAST_SPECIFIC = "rms change"
+RMS_CHANGE = "rms change"
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sealscope.diagnosis.beliefs import beliefs
+from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.evidence import Evidence, RelativeLeak
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.errors import InputError
@@ -39,7 +39,7 @@ class RepairLimit:
     def of(cls, text: str | None) -> RepairLimit:
         """Return the limit that a text states as a flow or a speed with its unit, the default one for None."""
         if text is None:
-            return cls(beliefs("verdict")["repair"]["creep"] * MM_PER_MINUTE, "creep", stated=False)
+            return cls(priors("verdict")["repair"]["creep"] * MM_PER_MINUTE, "creep", stated=False)
         for kind, unit in (("flow", "m^3/s"), ("creep", "m/s")):
             try:
                 value = parse_quantity(text, unit, name="limit")

@@ -8,8 +8,8 @@ import math
 
 import numpy as np
 
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Interval
+from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.trend.trend import Trend
 from sealscope.paragraphs import paragraph, paragraphs
 from sealscope.recordings.formats.columns import counted
@@ -98,7 +98,7 @@ def _figure(interval: Interval, unit: str) -> str:
 def _reach(trend: Trend, limit: float, reach: Interval) -> str:
     """Return when the level reaches its limit, `reach` days after the last recording."""
     named, first, last = f"{number(limit, 2)} {trend.unit}", trend.points[0].day, trend.points[-1].day
-    furthest = beliefs("trend")["course"]["furthest"]
+    furthest = priors("trend")["course"]["furthest"]
     value, low, high = (moment(trend, last + days) if days <= furthest else "later" for days in reach)
     if reach.value == 0.0:
         return f"{named} is reached"

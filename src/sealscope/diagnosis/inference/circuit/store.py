@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.balance import whole_samples
 from sealscope.diagnosis.inference.onset import FEWEST, Information, StepTest, step_test
 from sealscope.diagnosis.inference.terms import Signals
+from sealscope.diagnosis.priors import priors
 from sealscope.recordings.cycle import cycle_of, fundamental
 from sealscope.recordings.recording import Array, Recording
 from sealscope.units import P_ATM
@@ -71,7 +71,7 @@ def lost_oil(signals: Signals, rig: Rig, cycle: float | None, begin: float) -> d
         return {}
     unit = 1.0 / signals.rate if cycle is None else cycle
     seconds = len(signals.time_step) / signals.rate
-    length = unit * max(1, round(seconds / (beliefs("inference")["blocks"]["coarse"] * unit)))
+    length = unit * max(1, round(seconds / (priors("inference")["blocks"]["coarse"] * unit)))
     ends = np.round(np.arange(int(seconds / length) + 1) * length * signals.rate).astype(int)
     if len(ends) <= FEWEST:
         return {}
@@ -102,9 +102,9 @@ def _information(level: Array, pressure: Array, length: float, begin: float) -> 
     time = (np.arange(count) + 0.5) * length
     flows = (np.tril(np.ones((count, count)), -1) + 0.5 * np.eye(count)) * pressure * length
     noise = float(np.mean(np.diff(level, 2) ** 2)) / 6.0
-    warmth = beliefs("inference")["level"]["gas"] * np.column_stack([time, time**2 / time[-1]])
+    warmth = priors("inference")["level"]["gas"] * np.column_stack([time, time**2 / time[-1]])
     weight = np.linalg.inv(max(noise, np.finfo(float).tiny) * np.eye(count) + warmth @ warmth.T)
     weight -= np.outer(weight.sum(axis=0), weight.sum(axis=1)) / weight.sum()
-    healthy = beliefs("inference")["healthy"]["outside"]
+    healthy = priors("inference")["healthy"]["outside"]
     precision, vector = flows.T @ weight @ flows, flows.T @ weight @ level
     return Information(np.asarray(begin + time, dtype=float), 0.5 * (precision + precision.T), vector, healthy, healthy)

@@ -23,7 +23,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.balance import LONGEST, commanded, whole_samples
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, Weighting
 from sealscope.diagnosis.inference.circuit.store import cycle_length, lost_oil
@@ -38,13 +37,14 @@ from sealscope.diagnosis.inference.terms import (
     circulation,
     locked,
 )
+from sealscope.diagnosis.priors import priors
 from sealscope.recordings.recording import Array, Recording
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-_BELIEVED = beliefs("inference")["held"]
-HELD: float = _BELIEVED["half"]
+_PRIORS = priors("inference")["held"]
+HELD: float = _PRIORS["half"]
 _READ = ("u", "omega", "theta", "q_pump", "x", "p_A", "p_B")
 
 
@@ -107,10 +107,10 @@ def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
 
 def _held(speed: Array, rate: float, area: float = 0.0) -> NDArray[np.bool_]:
     """Return in which samples the piston is held, after it has settled; with an `area`, creep is a standstill."""
-    size, settles = max(1, round(_BELIEVED["averaged"] * rate)), max(1, round(_BELIEVED["settles"] * rate))
+    size, settles = max(1, round(_PRIORS["averaged"] * rate)), max(1, round(_PRIORS["settles"] * rate))
     slow = np.abs(np.convolve(speed, np.full(size, 1.0 / size), "same"))
     finite = np.isfinite(slow)
-    limit = max(_BELIEVED["slow"] * slow[finite].max(initial=0.0), _BELIEVED["creep"] * area)
+    limit = max(_PRIORS["slow"] * slow[finite].max(initial=0.0), _PRIORS["creep"] * area)
     moves = ~finite | (slow > limit)
     return np.asarray(np.convolve(moves, np.ones(settles))[: speed.size] == 0)
 
@@ -133,7 +133,7 @@ def _blocks(
     _less_the_zero(rows.values, [term.name for term in equation.terms])
     if carries:
         side = _rows([signals.carried_by_A[1:] / rate], counts, half, rate).values[:, 0]
-        one_side = np.minimum(side, 1.0 - side) < _BELIEVED["elsewhere"]
+        one_side = np.minimum(side, 1.0 - side) < _PRIORS["elsewhere"]
         rows = rows._replace(whole=rows.whole & one_side)
     each = 2 if half > HELD else round(2.0 * LONGEST / half)
     parts = [slice(k * each, (k + 1) * each) for k in range(len(rows.time) // each)]
@@ -172,7 +172,7 @@ def _rows(increments: list[Array], counts: NDArray[np.bool_], half: float, rate:
 
 def _less_the_zero(values: Array, names: list[str]) -> None:
     """Take from the mean pressure difference of each row what zeros of the sensors may have made."""
-    zero = WITHIN_95 * beliefs("inference")["zero"]["pressure"]
+    zero = WITHIN_95 * priors("inference")["zero"]["pressure"]
     mean = values[:, names.index(LEAK)]
     share = np.maximum(1.0 - (zero / np.maximum(np.abs(mean), zero)) ** 2, 0.0)
     for name in (LEAK, ORIFICE):

@@ -17,7 +17,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.decision.questions import (
     AGAINST,
     LEVEL,
@@ -34,6 +33,7 @@ from sealscope.diagnosis.inference.other_steps.causes import probabilities
 from sealscope.diagnosis.inference.other_steps.causes import stepped as stepped_cause
 from sealscope.diagnosis.inference.other_steps.step import other_step
 from sealscope.diagnosis.inference.scatter import RecordingSums, Rise, rise
+from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.evidence import (
     LEAKS,
     NO_RIG,
@@ -122,7 +122,7 @@ def _flow(balance: RecordedBalance, evidence: Evidence, value: float, deviation:
     """Return the evidence with the flow [m^3/s] of a leak and its deviation, as far as the machine's size is known."""
     size = balance.size
     pump = balance.mean_flow
-    deviations = [deviation, value * size.deviation, value * beliefs("inference")["size"]["law"]]
+    deviations = [deviation, value * size.deviation, value * priors("inference")["size"]["law"]]
     half = WITHIN_95 * float(np.linalg.norm(deviations))
     low, high = max(value - half, 0.0), value + half
     relative = RelativeLeak(
@@ -147,7 +147,7 @@ def bound_of(balance: RecordedBalance, against: Rise | None) -> float:
     shown = balance.test if against is None else against
     if shown is None:
         return np.inf
-    size = float(np.hypot(balance.size.deviation, beliefs("inference")["size"]["law"]))
+    size = float(np.hypot(balance.size.deviation, priors("inference")["size"]["law"]))
     return shown.bound() * balance.mean_pressure() * (1.0 + BELOW_95 * size)
 
 
@@ -242,7 +242,7 @@ def _reason(
     size = balance.size
     if size.ratio is not None and size.disagrees:
         text += f"; displacement over area is {size.ratio.value:.3g} times the assumed one: flows lie between both"
-    if abs(balance.zero) > 2.0 * WITHIN_95 * beliefs("inference")["zero"]["pressure"]:
+    if abs(balance.zero) > 2.0 * WITHIN_95 * priors("inference")["zero"]["pressure"]:
         text += f"; p_A - p_B reads {abs(balance.zero) / 1e5:.2g} bar too {'much' if balance.zero > 0.0 else 'little'}"
     if (late := balance.delay) is not None and abs(late[0]) > 1.0 / balance.recording.rate + WITHIN_95 * late[1]:
         text += f"; x is recorded {1e3 * abs(late[0]):.3g} ms {'later' if late[0] > 0.0 else 'earlier'} than the flow"

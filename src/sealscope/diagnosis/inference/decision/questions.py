@@ -6,12 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import StepTest
 from sealscope.diagnosis.inference.scatter import Rise
+from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.evidence import LEAKS, RAREST, Cause, Evidence, Verdict
 
-SECOND: float = beliefs("inference")["verdict"]["second"]
+SECOND: float = priors("inference")["verdict"]["second"]
 #: The three questions, by name.
 WITHIN, AGAINST, LEVEL = "within the recording", "against the baseline", "against the rig's file"
 
@@ -52,7 +52,7 @@ def answer(
 
 def bounds_enough(bound: float, flow: float) -> bool:
     """Whether the bound of a leak is small beside the flow of the pump: a larger leak than it shows without it."""
-    return flow > 0.0 and bound <= beliefs("inference")["worth"]["share"] * flow
+    return flow > 0.0 and bound <= priors("inference")["worth"]["share"] * flow
 
 
 def bound_text(verdict: Verdict, limit: str, possible: Sequence[Question]) -> str:
@@ -97,7 +97,7 @@ def is_leak(causes: dict[Cause, float]) -> bool:
 
 def may_be_leak(causes: dict[Cause, float]) -> bool:
     """Whether a change that has one of these causes may as well be a leak past the piston."""
-    sure: float = beliefs("inference")["verdict"]["sure"]
+    sure: float = priors("inference")["verdict"]["sure"]
     return sum(causes.get(own, 0.0) for own in LEAKS) >= 1.0 - sure
 
 

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, information, mean_of, zero_of
 from sealscope.diagnosis.inference.onset import WITHIN_95, Course, Information, Interval, StepTest, course, step_test
 from sealscope.diagnosis.inference.other_steps.causes import StepHypothesis, hypotheses
 from sealscope.diagnosis.inference.scatter import RecordingSums
 from sealscope.diagnosis.inference.terms import LAG, ORIFICE, PUMP, Equation
+from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.evidence import RAREST
 from sealscope.diagnosis.verdict.machine import measures_flow
 from sealscope.recordings.joining import start_seconds
@@ -170,7 +170,7 @@ def _size(balance: RecordedBalance) -> Size:
     directly, a stated area by that ratio; where both are stated and disagree the flow lies between what either says.
     """
     column, rig, meter = balance.columns[0], balance.rig, measures_flow(balance.recording.units)
-    believed = beliefs("inference")["size"]
+    believed = priors("inference")["size"]
     with_unit = not {("theta", "count"), ("omega", "count"), ("u", "count")} & balance.units
     pressures = not {("p_A", "count"), ("p_B", "count")} & balance.units
     states_displacement = rig.states("pump.q_b") and with_unit

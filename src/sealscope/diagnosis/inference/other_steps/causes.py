@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.blocks import (
     Blocks,
     Columns,
@@ -26,6 +25,7 @@ from sealscope.diagnosis.inference.blocks import (
 from sealscope.diagnosis.inference.onset import StepTest, step_test
 from sealscope.diagnosis.inference.other_steps.step import OtherStep
 from sealscope.diagnosis.inference.terms import AIR, BIAS, LEAK, MADE_UP, ORIFICE, PUMP, Equation
+from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause
 
 #: A change of the scale of the left side: displacement, angle, speed, or the position behind a valve.
@@ -62,7 +62,7 @@ def hypotheses(
     A leak is tested about the zero of p_A - p_B that its change shows, what else may have stepped in the `plain`
     blocks, whose zero is that of the sensors. Oil that leaves the circuit empties the accumulator as well (`lost`).
     """
-    about, recorded = (own.merged(beliefs("inference")["blocks"]["coarse"]) for own in (blocks, plain))
+    about, recorded = (own.merged(priors("inference")["blocks"]["coarse"]) for own in (blocks, plain))
     tested = []
     for index, term in enumerate(balances[0].terms):
         if term.drift == "motion" and index in columns[0].motion and term.name.startswith("motion"):
@@ -105,7 +105,7 @@ def _unlikely(table: str, step: float, above: bool = False) -> float:
 
     `above`: smaller ones are as likely.
     """
-    size, spread = (beliefs("inference")[table][name] for name in ("size", "spread"))
+    size, spread = (priors("inference")[table][name] for name in ("size", "spread"))
     away = float(np.log(max(abs(step), np.finfo(float).tiny) / size)) / spread
     return float(max(away, 0.0) ** 2 if above else away**2)
 
@@ -151,11 +151,11 @@ def probabilities(
     """
     if not tested:
         return {}
-    believed = beliefs("inference")["causes"]
+    believed = priors("inference")["causes"]
     terms = [(own.cause, own.test.score, own.beside) for own in tested]
     if other is not None and _coincides(tested[0].test, other):
         with_it = [score for cause, score, _ in terms if other.cause in (cause, "changed duty")]
-        slowed = min(max(share, 0.0) / beliefs("inference")["worth"]["share"], 1.0)
+        slowed = min(max(share, 0.0) / priors("inference")["worth"]["share"], 1.0)
         own = other.score * (1.0 - slowed if other.cause == "friction change" else 1.0)
         terms.append((other.cause, max(*with_it, 0.0, 0.0) + own, 0.0))
     temper = 2.0 * (1.0 + believed["model"] * max(score for _, score, _ in terms))

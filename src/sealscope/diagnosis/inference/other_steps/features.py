@@ -11,17 +11,17 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import Information, StepTest, two_sided
+from sealscope.diagnosis.priors import priors
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording
 
-_BELIEVED = beliefs("inference.other_steps")["features"]
-BLOCKS, ORDER = _BELIEVED["blocks"], _BELIEVED["order"]
+_PRIORS = priors("inference.other_steps")["features"]
+BLOCKS, ORDER = _PRIORS["blocks"], _PRIORS["order"]
 #: What commands the motion, and what moves, in the order of preference.
 COMMANDS, MOTIONS = ("u", "omega", "theta"), ("x", "theta", "omega", "u")
 #: Bins of a spectrum beyond the main lobe of a line, by a Hann window.
-_BESIDE: list[float] = _BELIEVED["beside"]
+_BESIDE: list[float] = _PRIORS["beside"]
 
 
 def duty_tests(recording: Recording) -> list[StepTest]:
@@ -77,8 +77,8 @@ def _features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[str, A
     length = p_A.shape[1] // 2
     values = (p_A + p_B)[:, : 2 * length].reshape(-1, 2, length)
     bins = np.array([0.0, *_BESIDE, *np.negative(_BESIDE)])
-    for hertz in _BELIEVED["mains"]:
-        if hertz + _BESIDE[-1] * rate / length < _BELIEVED["highest"] * rate:
+    for hertz in _PRIORS["mains"]:
+        if hertz + _BESIDE[-1] * rate / length < _PRIORS["highest"] * rate:
             turns = np.outer(np.arange(length), hertz / rate + bins / length)
             window = np.hanning(length)[:, None] * np.exp(-2j * np.pi * turns)
             power = np.log((np.abs((values - values.mean(axis=2, keepdims=True)) @ window) ** 2).mean(axis=1))
@@ -91,5 +91,5 @@ def _test(recording: Recording, values: Array, length: int) -> StepTest | None:
     if not np.isfinite(values).all() or not np.ptp(values) > 0.0:
         return None
     time = recording.t[0] + (np.arange(len(values)) + 0.5) * length / recording.rate
-    wander = beliefs("inference")["features"]["wander"]
+    wander = priors("inference")["features"]["wander"]
     return two_sided(Information(time, np.eye(len(values)), values, slope=wander, walk=wander))

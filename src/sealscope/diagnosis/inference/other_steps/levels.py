@@ -24,9 +24,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import RANK, Information, two_sided
 from sealscope.diagnosis.inference.terms import HALF_DIFFERENCE
+from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording
@@ -95,7 +95,7 @@ def levels(recording: Recording) -> tuple[Array, Array] | None:
         return None
     pressures = np.column_stack([recording["p_A"], recording["p_B"]])
     means, motion = pressures.mean(axis=0), _motion(recording)
-    believed = beliefs("inference.other_steps")["levels"]
+    believed = priors("inference.other_steps")["levels"]
     if motion is None:
         motion, moving = np.zeros((len(recording), 0)), np.ones(len(recording))
         columns = np.column_stack([moving, pressures - means])

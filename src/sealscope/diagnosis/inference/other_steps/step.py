@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import StepTest
 from sealscope.diagnosis.inference.other_steps.features import BLOCKS, ORDER, duty_tests, sensor_tests
 from sealscope.diagnosis.inference.other_steps.levels import level_tests
+from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.recordings.recording import Recording, remembered
 
@@ -44,7 +44,7 @@ def other_step(recording: Recording, chance: float) -> OtherStep | None:
 @np.errstate(all="ignore")
 def _other_steps(recording: Recording) -> list[tuple[OtherStep, float]]:
     """Return what may have stepped, in the order in which it is asked for, with its chance."""
-    shortest = beliefs("inference.other_steps")["features"]["shortest"]
+    shortest = priors("inference.other_steps")["features"]["shortest"]
     if len(recording) < BLOCKS * max(ORDER + 2, shortest * recording.rate):
         return []
     steps: list[tuple[OtherStep, float]] = []

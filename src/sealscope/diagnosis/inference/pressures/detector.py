@@ -18,7 +18,7 @@ from sealscope.diagnosis.inference.other_steps.causes import StepHypothesis, pro
 from sealscope.diagnosis.inference.other_steps.causes import stepped as stepped_cause
 from sealscope.diagnosis.inference.other_steps.step import OtherStep, other_step
 from sealscope.diagnosis.inference.pressures import response
-from sealscope.diagnosis.inference.pressures.evidence import BELIEVED, PressureEvidence, flow_scale, unusable
+from sealscope.diagnosis.inference.pressures.evidence import PRIORS, PressureEvidence, flow_scale, unusable
 from sealscope.diagnosis.inference.scatter import Rise, student
 from sealscope.diagnosis.learnt import Healthy, Lesson, lessons_of
 from sealscope.diagnosis.verdict.evidence import LEAKS, NO_RIG, RAREST, Cause, Evidence, LeakCourse, TotalLeakage
@@ -109,7 +109,7 @@ def _rise(own: PressureEvidence, levels: Sequence[float]) -> Rise:
     """Return how far the level of g is above those of healthy recordings."""
     total, count = sum(levels), len(levels)
     apart = [level - (total - level) / (count - 1) for level in levels] if count > 1 else [0.0]
-    return student(own.level[0] - total / count, apart, BELIEVED["conductance"]["level"])
+    return student(own.level[0] - total / count, apart, PRIORS["conductance"]["level"])
 
 
 def _begun(own: PressureEvidence, test: StepTest) -> Evidence:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.beliefs import beliefs
 from sealscope.diagnosis.inference.onset import FEWEST, WITHIN_95, Information, StepTest, step_test
+from sealscope.diagnosis.priors import priors
 from sealscope.recordings.quality import mostly_clipped
 from sealscope.recordings.recording import Array, Recording
 from sealscope.units import LITRE_PER_MINUTE
@@ -20,7 +20,7 @@ from sealscope.units import LITRE_PER_MINUTE
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-BELIEVED = beliefs("inference.pressures")
+PRIORS = priors("inference.pressures")
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class PressureEvidence:
     @property
     def orifice(self) -> float:
         """Mean flow over g times `pressure` of an orifice; that of a worn seal is 1."""
-        return float(BELIEVED["conductance"]["orifice"])
+        return float(PRIORS["conductance"]["orifice"])
 
     def flow(self, step: float, deviation: float) -> tuple[float, tuple[float, float]]:
         """Return the mean flow [L/min] of a step of g [m^3/(s Pa)] with its `deviation`, and the 95 % interval.
@@ -87,7 +87,7 @@ class PressureEvidence:
 
 def flow_scale() -> float:
     """Return the standard deviation of the factor that all conductances share [1]: M/A^2 is not known closer."""
-    known = BELIEVED["scale"]
+    known = PRIORS["scale"]
     return math.hypot(known["mass"], 2.0 * known["area"])
 
 
@@ -98,7 +98,7 @@ def states_flow(rig: Rig) -> bool:
 
 def wander_of_conductance(seconds: float) -> float:
     """Return how far a healthy machine's conductance wanders in so many seconds [m^3/(s Pa)]."""
-    return float(BELIEVED["conductance"]["wander"]) * math.sqrt(seconds / BELIEVED["blocks"]["wander"])
+    return float(PRIORS["conductance"]["wander"]) * math.sqrt(seconds / PRIORS["blocks"]["wander"])
 
 
 def unusable(recording: Recording, rig: Rig) -> str | None:
@@ -106,7 +106,7 @@ def unusable(recording: Recording, rig: Rig) -> str | None:
 
     Else why not, in words.
     """
-    blocks = BELIEVED["blocks"]
+    blocks = PRIORS["blocks"]
     if rig.valve.spool != "absent":
         return "behind a servo valve a position is needed"
     if rig.cylinder.single_rod:
@@ -131,7 +131,7 @@ def unusable(recording: Recording, rig: Rig) -> str | None:
 
 def block_edges(recording: Recording) -> NDArray[np.int64]:
     """Return the samples (K + 1,) between which the blocks of a recording lie."""
-    count = max(1, min(BELIEVED["blocks"]["most"], int(recording.duration / BELIEVED["blocks"]["shortest"])))
+    count = max(1, min(PRIORS["blocks"]["most"], int(recording.duration / PRIORS["blocks"]["shortest"])))
     return np.round(np.linspace(0, len(recording), count + 1)).astype(np.int64)
 
 
@@ -144,7 +144,7 @@ def mains_waves(total: Array, rate: float) -> Array:
     """Return waves (2 m, n) of the mains' lines, whose frequencies p_A + p_B (n,) shows, where the ring cancels."""
     spectrum = np.abs(np.fft.rfft((total - total.mean()) * np.hanning(total.size), 4 * total.size))
     frequency = np.fft.rfftfreq(4 * total.size, 1.0 / rate)
-    mains, lines = BELIEVED["mains"], []
+    mains, lines = PRIORS["mains"], []
     for grid in mains["lines"]:
         near = np.flatnonzero(np.abs(frequency - grid) <= mains["within"] * grid)
         lines += [frequency[near[np.argmax(spectrum[near])]]] if near.size else []

@@ -17,8 +17,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve
 
-from sealscope.diagnosis.beliefs import beliefs as believed_of
 from sealscope.diagnosis.inference.onset import Information
+from sealscope.diagnosis.priors import priors as believed_of
 from sealscope.recordings.recording import Array
 
 #: Differences as a share of what is believed; most steps of a fit, shares of one that are tried, and the gain of twice
@@ -27,13 +27,13 @@ _NUDGE, STEPS, _SHARES, _ENOUGH = 0.05, 12, np.array([1.0, *np.geomspace(0.5, 0.
 
 
 class Normal(NamedTuple):
-    """Normal belief on the parameters: mean (p,) and precision (p, p) in units."""
+    """Normal prior on the parameters: mean (p,) and precision (p, p) in units."""
 
     mean: Array
     precision: Array
 
 
-class Beliefs(NamedTuple):
+class Priors(NamedTuple):
     """What is believed of the parameters (p,): centre and `width` of their mean, and how far they `wander` in 90 s."""
 
     centre: Array
@@ -67,10 +67,10 @@ class Look(NamedTuple):
     rows: Array = np.empty(0)
     ends: Array = np.empty(0)
 
-    def cost(self, variance: float, belief: Normal, unit: Array) -> float:
+    def cost(self, variance: float, prior: Normal, unit: Array) -> float:
         """Return minus twice the logarithm of the posterior, beside a noise's variance [Pa^2]."""
-        off = (self.theta - belief.mean) / unit
-        return float(self.gram[0, 0] / variance + off @ belief.precision @ off)
+        off = (self.theta - prior.mean) / unit
+        return float(self.gram[0, 0] / variance + off @ prior.precision @ off)
 
 
 class Model(Protocol):
@@ -92,7 +92,7 @@ class Model(Protocol):
         ...
 
 
-def descend(model: Model, look: Look, belief: Normal, steps: int, variance: float | None = None) -> Look:
+def descend(model: Model, look: Look, prior: Normal, steps: int, variance: float | None = None) -> Look:
     """Return the look about likelier parameters; their noise's variance [Pa^2] is fitted where it is not given.
 
     A whole step is run with its Jacobian, beside shares of it; where none of them gains, it is damped. A step is not
@@ -101,16 +101,16 @@ def descend(model: Model, look: Look, belief: Normal, steps: int, variance: floa
     unit, damping = model.unit, 0.0
     for _ in range(steps):
         noise = variance or model.spread(float(look.gram[0, 0]))
-        H = look.gram[1:, 1:] / noise + belief.precision
-        rise = look.gram[0, 1:] / noise - belief.precision @ ((look.theta - belief.mean) / unit)
+        H = look.gram[1:, 1:] / noise + prior.precision
+        rise = look.gram[0, 1:] / noise - prior.precision @ ((look.theta - prior.mean) / unit)
         move = np.linalg.solve(H + damping * np.diag(np.diag(H)), rise)
         if not float(rise @ move) >= _ENOUGH:
             break
         paths = np.clip(look.theta + _SHARES[:, None] * move * unit, *model.bounds(look.theta))
         whole, squares = model.look(paths)
-        off = (paths - belief.mean) / unit
-        costs = squares / noise + np.sum(off @ belief.precision * off, axis=1)
-        gains = np.nan_to_num(look.cost(noise, belief, unit) - costs, nan=-np.inf)
+        off = (paths - prior.mean) / unit
+        costs = squares / noise + np.sum(off @ prior.precision * off, axis=1)
+        gains = np.nan_to_num(look.cost(noise, prior, unit) - costs, nan=-np.inf)
         best = int(np.argmax(gains))
         if not gains[best] > 0.0:
             damping = max(10.0 * damping, 0.1)
@@ -141,7 +141,7 @@ class Joint:
     residual [Pa^2].
     """
 
-    beliefs: Beliefs
+    priors: Priors
     theta: Array
     mean: Array
     covariance: Array
@@ -149,11 +149,11 @@ class Joint:
     variance: float
 
     @staticmethod
-    def of(blocks: Sequence[Block], beliefs: Beliefs, seconds: float, asked: int) -> Joint:
+    def of(blocks: Sequence[Block], priors: Priors, seconds: float, asked: int) -> Joint:
         """Return it for blocks of so many seconds; the noise has its long-run variance in the score of `asked`."""
         theta = np.array([block.theta for block in blocks])
-        strain = _strain(len(blocks), beliefs, seconds)
-        pull = strain @ ((theta - beliefs.centre) / beliefs.unit).ravel()
+        strain = _strain(len(blocks), priors, seconds)
+        pull = strain @ ((theta - priors.centre) / priors.unit).ravel()
         normal = block_diag(*(block.gram[1:, 1:] for block in blocks))
         vector = np.concatenate([block.gram[0, 1:] for block in blocks])
         white, inflation = _noise(blocks, np.zeros(theta.size), asked)[0], 1.0
@@ -162,7 +162,7 @@ class Joint:
             mean = cho_solve(factor, vector / (white * inflation) - pull, check_finite=False)
             white, inflation = _noise(blocks, mean, asked)
         covariance = cho_solve(factor, np.eye(theta.size), check_finite=False)
-        return Joint(beliefs, theta, mean, covariance, strain, white)
+        return Joint(priors, theta, mean, covariance, strain, white)
 
     def information(self, parameter: int, time: Array, reach: float) -> Information:
         """Return what the blocks at `time` (K,) [s] say of a parameter, all others eliminated.
@@ -172,19 +172,19 @@ class Joint:
         """
         own = slice(parameter, None, self.theta.shape[1])
         inverse = np.linalg.inv(self.covariance[own, own])
-        believed, unit = self.strain[own, own], self.beliefs.unit[parameter]
+        believed, unit = self.strain[own, own], self.priors.unit[parameter]
         at, precision = self.theta[:, parameter] / unit, inverse - believed
-        off = at - self.beliefs.centre[parameter] / unit
+        off = at - self.priors.centre[parameter] / unit
         vector = inverse @ self.mean[own] + believed @ off + precision @ at
         precision = 0.5 * (precision + precision.T) / unit**2
         return Information(time, precision, vector / unit, slope=reach, walk=reach)
 
 
-def _strain(count: int, beliefs: Beliefs, seconds: float) -> Array:
+def _strain(count: int, priors: Priors, seconds: float) -> Array:
     """Return the precision (K p, K p), in units, of what is believed of the parameters of K blocks."""
     steps = np.diff(np.eye(count), axis=0)
-    walk = np.kron(steps.T @ steps, np.diag(1.0 / beliefs.spread(seconds)))
-    return np.asarray(walk + np.kron(np.full((count, count), 1.0 / count**2), beliefs.normal.precision))
+    walk = np.kron(steps.T @ steps, np.diag(1.0 / priors.spread(seconds)))
+    return np.asarray(walk + np.kron(np.full((count, count), 1.0 / count**2), priors.normal.precision))
 
 
 def _noise(blocks: Sequence[Block], off: Array, asked: int) -> tuple[float, float]:

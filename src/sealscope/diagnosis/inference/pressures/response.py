@@ -31,7 +31,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from sealscope.compiled import contracted, kernel
 from sealscope.diagnosis.inference.pressures.evidence import (
-    BELIEVED,
+    PRIORS,
     PressureEvidence,
     block_edges,
     mains_waves,
@@ -39,7 +39,7 @@ from sealscope.diagnosis.inference.pressures.evidence import (
     unusable,
     wander_of_conductance,
 )
-from sealscope.diagnosis.inference.pressures.fit import STEPS, Beliefs, Block, Joint, Look, Normal, descend
+from sealscope.diagnosis.inference.pressures.fit import STEPS, Block, Joint, Look, Normal, Priors, descend
 from sealscope.physics.cylinder import piston_acceleration, pressure_rate
 from sealscope.physics.friction import coulomb_friction, stribeck_level
 from sealscope.physics.lanes import SINGLE_WIDTH, load, select, store
@@ -69,7 +69,7 @@ Parameters = tuple[float, float, float, float, float, float, float, float, float
 Reduced = namedtuple("Reduced", "A_A V M_eq v_th q_b k_p K_i V_max C_m B_M J_M R_c L_c C_e i_max")
 #: Laws of the friction, two hypotheses: Stribeck's of the rig; and LuGre's, whose contact does not creep.
 LAWS = STRIBECK, BRISTLES = "stribeck", "bristles"
-_FOLLOW = BELIEVED["follow"]
+_FOLLOW = PRIORS["follow"]
 _UNCENTRED = 1.0 / _FOLLOW["centring"]
 #: Longest step of the solver [s]: RK4 is within 100 Pa there, far under the noise of transducers; least give [m/N] and
 #: lag [s]; length of spectra [samples].
@@ -168,20 +168,20 @@ def simulate_response(
     store(states, 7, read)
 
 
-def beliefs_of(rig: Rig, law: str = STRIBECK) -> Beliefs:
-    """Return the beliefs on machines of a rig at its charge pressure: zeros of the transducers change nothing."""
+def priors_of(rig: Rig, law: str = STRIBECK) -> Priors:
+    """Return the priors on machines of a rig at its charge pressure: zeros of the transducers change nothing."""
     friction, gain = rig.friction, rig.motor.omega_per_volt
     of_difference = friction.coulomb_pressure == "difference"
     coulomb = coulomb_friction(rig.fluid.p_charge, rig.fluid.p_charge, friction.F_pr, friction.F_cfr, of_difference)
     own = {"gain": gain, "bias": gain, "K": rig.fluid.K_oil, "F_C": coulomb}
     own |= {name: getattr(friction, name) for name in ("F_v", "K_brk", "C_c")}
-    known = {**BELIEVED["response"], "give": BELIEVED[law]["give"]}
-    return Beliefs(*np.array([own.get(name, 1.0) * np.array(known[name]) for name in PARAMETERS]).T)
+    known = {**PRIORS["response"], "give": PRIORS[law]["give"]}
+    return Priors(*np.array([own.get(name, 1.0) * np.array(known[name]) for name in PARAMETERS]).T)
 
 
 def _tried(table: str, parameter: int, count: int) -> Array:
     """Return values (count,) of a parameter at which a fit is begun."""
-    middle, times = BELIEVED[table][PARAMETERS[parameter]]
+    middle, times = PRIORS[table][PARAMETERS[parameter]]
     return np.asarray(middle * np.geomspace(1.0 / times, times, count))
 
 
@@ -197,7 +197,7 @@ class Machine(NamedTuple):
     def of(rig: Rig, rate: float, law: str = STRIBECK) -> Machine:
         """Return that of a rig's kind."""
         whole = rig_numbers(rig)
-        own = whole._replace(A_A=0.5 * (whole.A_A + whole.A_B), v_th=BELIEVED[law].get("creep", whole.v_th))
+        own = whole._replace(A_A=0.5 * (whole.A_A + whole.A_B), v_th=PRIORS[law].get("creep", whole.v_th))
         reduced = Reduced(*(getattr(own, name) for name in Reduced._fields))
         return Machine(reduced, rate, math.ceil(1.0 / rate / _STEP), law)
 
@@ -220,23 +220,23 @@ class Machine(NamedTuple):
         m = self.numbers
         return float(2.0 * math.pi * self.rate * math.sqrt(m.V * m.M_eq / (2.0 * stiffness)) / m.A_A)
 
-    def ringing(self, dp: Array, total: Array, beliefs: Beliefs) -> Array:
+    def ringing(self, dp: Array, total: Array, priors: Priors) -> Array:
         """Return the stiffnesses (2,) [Pa] at which p_A - p_B rings most, beyond noise and hum of p_A + p_B.
 
         They are the rig's where no frequency that the recording holds is believed of the machine.
         """
-        share = beliefs.width[K_OIL] / beliefs.centre[K_OIL]
-        middle = 4 * _SEGMENT / self.period(beliefs.centre[K_OIL])
+        share = priors.width[K_OIL] / priors.centre[K_OIL]
+        middle = 4 * _SEGMENT / self.period(priors.centre[K_OIL])
         k = np.arange(math.ceil(middle * math.exp(-2.0 * share)), min(2 * _SEGMENT, int(middle * math.exp(share))))
         if not k.size:
-            return np.full(2, beliefs.centre[K_OIL])
+            return np.full(2, priors.centre[K_OIL])
         segments = sliding_window_view([dp, total], min(_SEGMENT, dp.size), axis=1)[:, :: _SEGMENT // 2]
         spectra = np.fft.rfft(segments * np.hanning(segments.shape[2] + 1)[:-1], 4 * _SEGMENT)
         powers = np.mean(np.abs(spectra) ** 2, axis=1)  # Welch's
         beyond = np.pad((powers[0] - powers[1])[k], 1, constant_values=-np.inf)
         peaks = np.flatnonzero((beyond[1:-1] > beyond[:-2]) & (beyond[1:-1] >= beyond[2:]))
         chosen = np.resize(peaks[np.argsort(-beyond[1 + peaks])], 2)
-        return np.asarray(beliefs.centre[K_OIL] * (k[chosen] / middle) ** 2)
+        return np.asarray(priors.centre[K_OIL] * (k[chosen] / middle) ** 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,7 +249,7 @@ class Stretch:
     """
 
     machine: Machine
-    beliefs: Beliefs
+    priors: Priors
     command: Array
     dp: Array
     states: Array
@@ -260,7 +260,7 @@ class Stretch:
     @cached_property
     def unit(self) -> Array:
         """Units of the parameters."""
-        return self.beliefs.unit
+        return self.priors.unit
 
     @cached_property
     def samples(self) -> float:
@@ -345,7 +345,7 @@ def first_fit(stretch: Stretch, total: Array, noise: float) -> Look:
     gains; then the whole, from stiffnesses by which it rings where the spectra of p_A - p_B and of the sum p_A + p_B,
     `total` (n,), in which nothing rings, say, and from several breakaway forces.
     """
-    beliefs = stretch.beliefs
+    priors = stretch.priors
 
     def ranked(of: Stretch, theta: Array, groups: int, changes: dict[int, Array]) -> Array:
         """Return the groups that 16 sets with `changes` make, the best of each first: (16/groups, groups, p)."""
@@ -355,27 +355,27 @@ def first_fit(stretch: Stretch, total: Array, noise: float) -> Look:
         order = of.squares(sets).reshape(groups, -1).argsort(axis=1).T
         return sets.reshape(groups, -1, len(PARAMETERS))[range(groups), order]
 
-    slow = replace(stretch, smooth=_FOLLOW["slow"] * stretch.machine.period(beliefs.centre[K_OIL]))
-    gains = beliefs.centre[GAIN] * _tried("start", GAIN, 8)
-    springs = beliefs.centre[SPRING] + beliefs.width[SPRING] * np.array([0.0, 1.0])
-    first = ranked(slow, beliefs.centre, 1, {GAIN: np.tile(gains, 2), SPRING: np.repeat(springs, 8)})
-    theta = descend(slow, slow.look(first[0])[0], beliefs.normal, STEPS // 2).theta
-    ringing = stretch.machine.ringing(stretch.dp, total, beliefs)
-    stiffnesses = np.append(ringing, beliefs.centre[K_OIL] * _tried("start", K_OIL, 2))
+    slow = replace(stretch, smooth=_FOLLOW["slow"] * stretch.machine.period(priors.centre[K_OIL]))
+    gains = priors.centre[GAIN] * _tried("start", GAIN, 8)
+    springs = priors.centre[SPRING] + priors.width[SPRING] * np.array([0.0, 1.0])
+    first = ranked(slow, priors.centre, 1, {GAIN: np.tile(gains, 2), SPRING: np.repeat(springs, 8)})
+    theta = descend(slow, slow.look(first[0])[0], priors.normal, STEPS // 2).theta
+    ringing = stretch.machine.ringing(stretch.dp, total, priors)
+    stiffnesses = np.append(ringing, priors.centre[K_OIL] * _tried("start", K_OIL, 2))
     breakaways = theta[K_BRK] * _tried("start", K_BRK, 4)
     starts = ranked(stretch, theta, 4, {K_OIL: np.repeat(stiffnesses, 4), K_BRK: np.tile(breakaways, 4)})
     look = fitted(stretch, starts[0], noise, 2)
-    if not stretch.explained(look.cost(noise, beliefs.normal, beliefs.unit)):
+    if not stretch.explained(look.cost(noise, priors.normal, priors.unit)):
         look = fitted(stretch, [look.theta, *starts[1]], noise, 2)
     return look
 
 
 def fitted(stretch: Stretch, starts: Sequence[Array] | Array, noise: float, kept: int) -> Look:
     """Return the likeliest look that steps from several starts lead to, few from all and more from the best `kept`."""
-    looks, belief = [stretch.look(start[None])[0] for start in starts], stretch.beliefs.normal
+    looks, prior = [stretch.look(start[None])[0] for start in starts], stretch.priors.normal
     for steps, number in ((STEPS // 6, kept), (STEPS, 1)):
-        looks = [descend(stretch, look, belief, steps, noise) for look in looks]
-        costs = np.nan_to_num([look.cost(noise, belief, stretch.unit) for look in looks], nan=np.inf)
+        looks = [descend(stretch, look, prior, steps, noise) for look in looks]
+        costs = np.nan_to_num([look.cost(noise, prior, stretch.unit) for look in looks], nan=np.inf)
         looks = [looks[place] for place in np.argsort(costs)[:number]]
     return looks[0]
 
@@ -383,15 +383,15 @@ def fitted(stretch: Stretch, starts: Sequence[Array] | Array, noise: float, kept
 class Follower:
     """Leads the response along a machine, block by block: an iterated Kalman filter of its parameters.
 
-    `machine`, `beliefs`; `sense`: sign of p_A - p_B that goes with the command; then what changes from block to block:
+    `machine`, `priors`; `sense`: sign of p_A - p_B that goes with the command; then what changes from block to block:
     parameters `theta` (p,) and their `covariance` (p, p) in units, `variance` of the noise [Pa^2], `states` (8, 12) and
     `last`, the command at the last sample [V]; `excess` of the last block's chi square, in deviations.
     """
 
-    def __init__(self, machine: Machine, beliefs: Beliefs, sense: float) -> None:
-        self.machine, self.beliefs, self.sense = machine, beliefs, sense
-        self.theta, self.variance, self.last = beliefs.centre, math.nan, math.nan
-        self.covariance = np.diag((beliefs.width / beliefs.unit) ** 2)
+    def __init__(self, machine: Machine, priors: Priors, sense: float) -> None:
+        self.machine, self.priors, self.sense = machine, priors, sense
+        self.theta, self.variance, self.last = priors.centre, math.nan, math.nan
+        self.covariance = np.diag((priors.width / priors.unit) ** 2)
         self.states, self.excess = np.zeros((8, SPRING + 2)), 0.0
 
     @staticmethod
@@ -402,16 +402,16 @@ class Follower:
         beginning = recording.samples(slice(0, math.ceil(_FOLLOW["window"] * recording.rate)))
         total = beginning["p_A"] + beginning["p_B"]
         noise = max(float(np.var(np.diff(total, 3))) / 20.0, 1.0)
-        follower = Follower(Machine.of(rig, recording.rate), beliefs_of(rig), sense)
+        follower = Follower(Machine.of(rig, recording.rate), priors_of(rig), sense)
         window = follower.stretch(beginning)
         look = first_fit(window, total, noise)
-        cost = look.cost(noise, follower.beliefs.normal, window.unit)
+        cost = look.cost(noise, follower.priors.normal, window.unit)
         if not window.explained(cost):
-            other = Follower(Machine.of(rig, recording.rate, BRISTLES), beliefs_of(rig, BRISTLES), sense)
-            starts = np.array([look.theta, other.beliefs.centre])
-            starts[:, GIVE] = other.beliefs.centre[GIVE]
+            other = Follower(Machine.of(rig, recording.rate, BRISTLES), priors_of(rig, BRISTLES), sense)
+            starts = np.array([look.theta, other.priors.centre])
+            starts[:, GIVE] = other.priors.centre[GIVE]
             giving = fitted(other.stretch(beginning), starts, noise, 1)
-            if giving.cost(noise, other.beliefs.normal, other.beliefs.unit) < cost:
+            if giving.cost(noise, other.priors.normal, other.priors.unit) < cost:
                 follower, look = other, giving
         follower.theta, follower.variance = look.theta, window.spread(float(look.gram[0, 0]))
         covariance, states = follower.covariance, follower.states
@@ -425,15 +425,15 @@ class Follower:
     def at(self, rig: Rig, rate: float) -> Follower:
         """Return it about to take samples at another rate [Hz]: what is known of the machine stays."""
         machine = Machine.of(rig, rate, self.machine.law)
-        follower = Follower(machine, self.beliefs, self.sense)
+        follower = Follower(machine, self.priors, self.sense)
         follower.theta, follower.covariance = self.theta, self.covariance
         follower.variance, follower.states = self.variance, self.states
         return follower
 
     def interrupt(self, seconds: float) -> None:
         """Go on after so many seconds without samples, the parameters at most as little known as at first."""
-        beliefs = self.beliefs
-        spread = np.minimum(beliefs.spread(seconds), (beliefs.width / beliefs.unit) ** 2)
+        priors = self.priors
+        spread = np.minimum(priors.spread(seconds), (priors.width / priors.unit) ** 2)
         self.covariance = self.covariance + np.diag(spread)
         self.last = math.nan
 
@@ -447,44 +447,44 @@ class Follower:
             known[: round(_FOLLOW["settling"] * block.rate)] = 0.0
         apart = mains_waves(block["p_A"] + block["p_B"], block.rate) * known
         dp = self.sense * (block["p_A"] - block["p_B"])
-        return Stretch(self.machine, self.beliefs, np.append(self.last, u), dp, self.states, apart, known)
+        return Stretch(self.machine, self.priors, np.append(self.last, u), dp, self.states, apart, known)
 
-    def _belief(self, seconds: float, jumped: int | None = None) -> Normal:
+    def _prior(self, seconds: float, jumped: int | None = None) -> Normal:
         """Return what is believed of a block so long beforehand; a parameter that `jumped` as widely as at first."""
-        beliefs = self.beliefs
-        wander = beliefs.spread(seconds)
+        priors = self.priors
+        wander = priors.spread(seconds)
         if jumped is not None:
-            wander[jumped] += (beliefs.width[jumped] / beliefs.unit[jumped]) ** 2
+            wander[jumped] += (priors.width[jumped] / priors.unit[jumped]) ** 2
         return Normal(self.theta, np.asarray(np.linalg.inv(self.covariance + np.diag(wander))))
 
     def _updated(self, stretch: Stretch, seconds: float) -> tuple[Look, Normal]:
-        """Return the likeliest look and the belief beside it.
+        """Return the likeliest look and the prior beside it.
 
         Where wandering does not explain the block, a jump is looked for: of the conductance, or of the stiffness.
         """
 
-        def candidate(start: Array, belief: Normal) -> tuple[float, Look, Normal]:
-            look = descend(stretch, stretch.look(start[None])[0], belief, STEPS, self.variance)
-            return look.cost(self.variance, belief, stretch.unit), look, belief
+        def candidate(start: Array, prior: Normal) -> tuple[float, Look, Normal]:
+            look = descend(stretch, stretch.look(start[None])[0], prior, STEPS, self.variance)
+            return look.cost(self.variance, prior, stretch.unit), look, prior
 
-        candidates = [candidate(self.theta, self._belief(seconds))]
+        candidates = [candidate(self.theta, self._prior(seconds))]
         if not stretch.explained(candidates[0][0]):
             for parameter, unit in ((G, 1.0), (K_OIL, self.theta[K_OIL])):
                 sets = np.tile(self.theta, (SINGLE_WIDTH, 1))
                 sets[:, parameter] = unit * _tried("jump", parameter, SINGLE_WIDTH)
                 best = int(stretch.squares(sets).argmin())
-                candidates.append(candidate(sets[best], self._belief(seconds, parameter)))
+                candidates.append(candidate(sets[best], self._prior(seconds, parameter)))
         return min(candidates, key=lambda own: own[0])[1:]
 
     def take(self, block: Recording) -> Block:
         """Return the sums of the next block."""
         stretch = self.stretch(block)
-        look, belief = self._updated(stretch, block.duration)
-        excess = look.cost(self.variance, belief, stretch.unit) - stretch.samples
+        look, prior = self._updated(stretch, block.duration)
+        excess = look.cost(self.variance, prior, stretch.unit) - stretch.samples
         self.excess = excess / math.sqrt(2.0 * max(stretch.samples, 1.0))
-        off = (look.theta - belief.mean) / stretch.unit
-        self.covariance = np.asarray(np.linalg.inv(look.gram[1:, 1:] / self.variance + belief.precision))
-        move = self.covariance @ (look.gram[0, 1:] / self.variance - belief.precision @ off)
+        off = (look.theta - prior.mean) / stretch.unit
+        self.covariance = np.asarray(np.linalg.inv(look.gram[1:, 1:] / self.variance + prior.precision))
+        move = self.covariance @ (look.gram[0, 1:] / self.variance - prior.precision @ off)
         self.theta = np.clip(look.theta + move * stretch.unit, *stretch.bounds(look.theta))
         self.states, self.last = look.ends, float(block["u"][-1])
         return stretch.block(look)
@@ -499,7 +499,7 @@ def response(recording: Recording, rig: Rig) -> Joint | None:
             try:
                 follower = Follower.begun(recording, rig)
                 parts = [follower.take(recording.samples(slice(*map(int, pair)))) for pair in pairwise(edges)]
-                own = Joint.of(parts, follower.beliefs, recording.duration / len(parts), G)
+                own = Joint.of(parts, follower.priors, recording.duration / len(parts), G)
             except np.linalg.LinAlgError:
                 return None
         whole = np.all(np.isfinite(own.mean)) and np.all(np.isfinite(own.covariance))
@@ -515,7 +515,7 @@ def evidence(recording: Recording, rig: Rig) -> PressureEvidence | None:
     if own is None:
         return None
     time = middles(recording, block_edges(recording))
-    reach = np.sqrt(recording.duration / BELIEVED["blocks"]["wander"]) * own.beliefs.wander
+    reach = np.sqrt(recording.duration / PRIORS["blocks"]["wander"]) * own.priors.wander
     reach[G] = wander_of_conductance(recording.duration)
     said = {name: own.information(k, time, float(reach[k])) for k, name in enumerate(PARAMETERS)}
     return PressureEvidence.of(recording, rig, said)
