@@ -150,18 +150,19 @@ class BlockStream:
     def _oriented(self, rows: Sequence[Array]) -> tuple[float, ...]:
         """Return the sign of each left side: an encoder, or the sides, may be connected the other way round.
 
-        Friction takes work, so that p_A - p_B goes with the flow into A; and oil leaks from the higher pressure to the
-        lower. Either is a number z in its deviations, whose sign is right with probability Phi(z) but for the share of
-        machines where something else makes it.
+        Friction takes work, so that p_A - p_B goes with the flow into A; oil leaks from the higher pressure to the
+        lower; and where x grows with the flow into A, as it should, the sides are seldom exchanged. Each is a number z
+        in its deviations, whose sign is right with probability Phi(z) but for the share of machines where something
+        else makes it.
         """
         signs = []
         for balance, columns, own in zip(self._balances, self.columns, rows, strict=True):
-            gram = own.T @ own
-            pressure, left = own[:, columns.leak], own[:, columns.left]
-            parts = (pressure - pressure.mean()) * left if len(own) else np.zeros(1)
-            size = max(float(np.linalg.norm(parts)) * np.sqrt(OVERLAP), np.finfo(float).tiny)
-            work = balance.takes * float(parts.sum()) / size
-            odds = _odds(work, "work") + _odds(_leaks(gram, columns, len(own)), "leak")
+            pressure, left = own[:, columns.leak], balance.takes * own[:, columns.left]
+            moved = own[:, [k for k in columns.motion if columns.names[k].startswith("motion")]].sum(axis=1)
+            odds = _odds(_leaks(own.T @ own, columns, len(own)), "leak")
+            odds += _odds(_agree((pressure - pressure.mean()) * left), "work") if len(own) else 0.0
+            if (along := _agree(moved * left)) > 0.0:  # else either may be the other way round
+                odds += _odds(along, "sides")
             signs.append(-1.0 if odds < 0.0 else 1.0)
         return tuple(signs)
 
@@ -220,6 +221,12 @@ class _Cut(NamedTuple):
     whole: NDArray[np.bool_]
     flow: Array
     pressures: Array
+
+
+def _agree(products: Array) -> float:
+    """Return the sum of products of two numbers a row over its deviation, were they independent."""
+    size = float(np.linalg.norm(products) * np.sqrt(OVERLAP))
+    return float(products.sum()) / max(size, float(np.finfo(float).tiny))
 
 
 def _odds(z: float, what: str) -> float:
