@@ -143,15 +143,6 @@ class CommissionedMachine:
             file=None if isinstance(recording, Recording) else recording,
         )
 
-    def diagnose_all(self, paths: Iterable[str | os.PathLike[str]] | str | os.PathLike[str]) -> list[Diagnosis]:
-        """Return the diagnoses of several files, or of those of a folder, in the order of their dates.
-
-        Raises UnreadableFile for a file that cannot be read.
-        """
-        recordings = [(path, self.read(path)) for path in recordings_in(paths)]
-        recordings.sort(key=lambda own: (start_seconds(own[1]) or 0.0, str(own[0])))
-        return [replace(self.diagnose(recording), file=os.fspath(path)) for path, recording in recordings]
-
     def with_healthy(self, recording: Recording, *, file: str = "recording", checksum: str = "") -> CommissionedMachine:
         """Return the machine with one more healthy recording.
 

@@ -120,16 +120,16 @@ def _step(balance: RecordedBalance, causes: dict[Cause, float]) -> Evidence:
 
 def _flow(balance: RecordedBalance, evidence: Evidence, value: float, deviation: float) -> Evidence:
     """Return the evidence with the flow [m^3/s] of a leak and its deviation, as far as the machine's size is known."""
-    size = balance.size
-    pump = balance.mean_flow
-    deviations = [deviation, value * size.deviation, value * priors("inference")["size"]["law"]]
-    half = WITHIN_95 * float(np.linalg.norm(deviations))
+    size, pump = balance.size, balance.mean_flow
+    of_law = float(np.hypot(deviation, value * priors("inference")["size"]["law"]))
+    half = WITHIN_95 * float(np.hypot(of_law, value * size.deviation))
     low, high = max(value - half, 0.0), value + half
+    ends = (value - WITHIN_95 * of_law, value + WITHIN_95 * of_law)  # the same displacement is in what they are over
     relative = RelativeLeak(
         pump_share=value / pump if pump > 0.0 else None,
-        pump_share_interval=_over((value - WITHIN_95 * deviation, value + WITHIN_95 * deviation), pump),
+        pump_share_interval=_over(ends, pump),
         creep=None if size.area is None else value / size.area,
-        creep_interval=_over((value - WITHIN_95 * deviation, value + WITHIN_95 * deviation), size.area),
+        creep_interval=_over(ends, size.area),
     )
     evidence = replace(evidence, relative=relative)
     if not size.stated:
