@@ -8,6 +8,7 @@ from scipy.stats import t as student
 
 import sealscope as ss
 from sealscope.diagnosis.live.balance import LiveBalance, NotJudged, size_error
+from sealscope.diagnosis.live.joining import SampleRun
 from sealscope.errors import InputError
 from sealscope.fmu.sensor import COLUMNS, INPUTS, WALK, WINDOW, SensorChoice, memory_of
 from sealscope.fmu.variables import SENSOR_RESULTS as RESULTS
@@ -24,7 +25,7 @@ def recording():
 def in_python(recording):
     """The results by the blocks of the live balance."""
     live = LiveBalance(RIG, INPUTS)
-    shown = live.take(recording.t, {name: recording[name] for name in INPUTS}, recording.rate)
+    shown = live.take(SampleRun(recording.t, {name: recording[name] for name in INPUTS}, recording.rate, False))
     blocks = [block for part in shown if not isinstance(part, NotJudged) for block in part]
     total, g, variance, offset = np.array([[own.total, own.g, own.sd**2, own.offset**2] for own in blocks]).T
     # the live balance takes the sensors' noise off the mean pressure difference, for which a unit keeps no samples

@@ -9,11 +9,12 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, given, reject, settings
 from hypothesis import strategies as st
 from scipy.integrate import cumulative_simpson, simpson
 from scipy.interpolate import CubicSpline
 
+from sealscope.errors import SimulationFailed
 from sealscope.parameters import load_rig
 from sealscope.units import P_ATM
 
@@ -232,15 +233,18 @@ def test_nothing_is_lost(drive, variant, count):
         assert rig.cylinder.volumes == "fixed"
         assert rig.motor.C_e == rig.motor.C_m  # else the motor itself makes or eats energy
         volts, omega, phase = wave
-        run = drive(
-            rig,
-            DURATION + STEP,
-            u=lambda t: volts * (np.sin(omega * t + phase) - np.sin(phase)),
-            G=leak[0],
-            C=leak[1],
-            rate=1 / STEP,
-            step=STEP,
-        )
+        try:
+            run = drive(
+                rig,
+                DURATION + STEP,
+                u=lambda t: volts * (np.sin(omega * t + phase) - np.sin(phase)),
+                G=leak[0],
+                C=leak[1],
+                rate=1 / STEP,
+                step=STEP,
+            )
+        except SimulationFailed:  # a chamber reaches vacuum: no machine of the model
+            reject()
         account = Account(rig, run, *leak)
         moved = account.total(np.abs(run["Q_1"]))
         assert np.abs(account.missing_oil()).max() <= 1e-9 * moved
