@@ -114,7 +114,7 @@ class Watch:
 
     @property
     def learned_with(self) -> tuple[Rig, Mapping[str, bool], float]:
-        """What the baseline depends on: the rig's values, whether they state L/min, and the hours."""
+        """Rig, whether its values state L/min, and hours, by which the baseline was learnt."""
         return self._rig, self._litres, self.learn_hours
 
     @property
