@@ -86,7 +86,7 @@ def cut(seconds: float, size: int, stop: int) -> None:
     assert json.dumps(again.state()) == json.dumps(whole(seconds)[0].state())
 
 
-@pytest.mark.parametrize("stop", [20_000, 47_000])  # before the first fit, and after
+@pytest.mark.parametrize("stop", [20_000, pytest.param(47_000, marks=pytest.mark.slow)])  # before the first fit, after
 def test_cuts_and_restarts_change_nothing(stop: int):
     cut(130.0, 7_001, stop)
 

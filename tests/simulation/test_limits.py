@@ -19,7 +19,9 @@ def hold(volts: float):
 
 @pytest.mark.parametrize("throttled", [False, True], ids=["free", "throttled"])
 @pytest.mark.parametrize("volumes", ["fixed", "position"])
-@pytest.mark.parametrize("side", [1.0, -1.0], ids=["cap A-side out", "cap B-side out"])
+@pytest.mark.parametrize(
+    "side", [pytest.param(1.0, id="cap A-side out"), pytest.param(-1.0, id="cap B-side out", marks=pytest.mark.slow)]
+)
 def test_both_caps_hold_the_piston(check_rig, drive, throttled, volumes, side):
     rig = check_rig(throttled, volumes=volumes, **FULL_CHARGE)
     run = drive(rig, 3.0, u=hold(10.0 * side), x_0=0.27 * side)

@@ -159,6 +159,7 @@ def test_an_impossible_table_is_refused(t, share):
         Leak(coefficient=1e-13, opening=tabulated(np.array(t, dtype=float), np.array(share, dtype=float)))
 
 
+@pytest.mark.slow
 def test_a_leak_is_sized_where_friction_sticks_under_a_controller():
     """Runs of nearly the same leak scatter by over 0.1 % there, and the search never ended."""
     machine = draw(
