@@ -22,10 +22,9 @@ from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.motion import runs_of
 from sealscope.recordings.quality import even_steps, uniform_segments
 from sealscope.recordings.recording import Recording
+from sealscope.storage.toml_file import priors_of
 
 Flags = NDArray[np.bool_]
-#: Longest gap of a motion that is filled by a line [s]: a mass moves on meanwhile.
-MOTION_SECONDS = 0.05
 
 #: Longest gaps that are bridged: by a spline [samples], by a line [s], by other cycles (share of the recording); and
 #: largest share of a recording that all gaps together may be.
@@ -83,15 +82,16 @@ def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
 def filled(recording: Recording, needed: Sequence[str]) -> Recording:
     """Return the recording with short gaps filled by a line where a channel is none of the `needed`; the same for none.
 
-    Those of positions, angles, speeds and flows up to `MOTION_SECONDS`, as a slower sensor leaves between its samples;
-    those of pressures up to `SPLINE` samples.
+    Those of positions, angles, speeds and flows while a mass moves on evenly, as a slower sensor leaves between its
+    samples; those of pressures up to `SPLINE` samples.
     """
+    motion = priors_of("sealscope.recordings")["gaps"]["motion"] * recording.rate
     channels: dict[str, Array] = {}
     for name, values in recording.channels.items():
         missing = ~np.isfinite(values)
         if name in needed or not missing.any() or missing.all():
             continue
-        most = SPLINE if name.startswith("p_") else MOTION_SECONDS * recording.rate
+        most = SPLINE if name.startswith("p_") else motion
         short = np.zeros(len(values), dtype=bool)
         for first, length in runs_of(missing).tolist():
             short[first : first + length] = first > 0 and first + length < len(values) and length <= most
