@@ -160,8 +160,8 @@ class BlockStream:
             pressure, left = own[:, columns.leak], balance.takes * own[:, columns.left]
             moved = own[:, [k for k in columns.motion if columns.names[k].startswith("motion")]].sum(axis=1)
             odds = _odds(_leaks(own.T @ own, columns, len(own)), "leak")
-            odds += _odds(_agree((pressure - pressure.mean()) * left), "work") if len(own) else 0.0
-            if (along := _agree(moved * left)) > 0.0:  # else either may be the other way round
+            odds += _odds(_in_deviations((pressure - pressure.mean()) * left), "work") if len(own) else 0.0
+            if (along := _in_deviations(moved * left)) > 0.0:  # else either may be the other way round
                 odds += _odds(along, "sides")
             signs.append(-1.0 if odds < 0.0 else 1.0)
         return tuple(signs)
@@ -223,7 +223,7 @@ class _Cut(NamedTuple):
     pressures: Array
 
 
-def _agree(products: Array) -> float:
+def _in_deviations(products: Array) -> float:
     """Return the sum of products of two numbers a row over its deviation, were they independent."""
     size = float(np.linalg.norm(products) * np.sqrt(OVERLAP))
     return float(products.sum()) / max(size, float(np.finfo(float).tiny))
