@@ -19,9 +19,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, solve
-from sealscope.diagnosis.inference.decision.questions import SECOND
 from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.inference.terms import PUMP
+from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.machine import healthy_leakage
 from sealscope.errors import InputError, SealscopeError
 from sealscope.parameters import Rig
@@ -177,7 +177,8 @@ def _detectable_in(recording: Recording, rig: Rig, false_alarm: float, detection
     balance = detector.balance(recording)
     if balance is None or balance.test is None:
         raise InputError("no balance: too short, or no block says anything of a leak")
-    share = false_alarm * (1.0 - SECOND if healthy_leakage(rig) > 0.0 else 1.0)
+    within: float = priors("decision")["questions"]["within"]
+    share = false_alarm * (1.0 - within if healthy_leakage(rig) > 0.0 else 1.0)
     size = balance.size.scale
     step = balance.test.findable(share, detection) * size
     ratio = _free_over_known(balance.blocks, balance.columns)

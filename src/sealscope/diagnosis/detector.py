@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Any, Protocol, get_args
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from sealscope.diagnosis.verdict.evidence import Cause, Evidence, Verdict
+from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.recordings.recording import Recording
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ _log = logging.getLogger(__name__)
 
 
 class Detector(Protocol):
-    """A detector: states evidence at a false-alarm probability, and says `cannot tell` rather than guess.
+    """A detector: follows numbers over a recording and tests them for a change; it states no verdict.
 
     The recordings it is given are uniformly sampled, and their chamber pressures and command have no missing sample
     (what was missing is bridged, and marked in `Recording.bridged`); any other channel may be absent or hold NaN.
@@ -34,11 +35,11 @@ class Detector(Protocol):
         """Return None when the recording has what the detector needs, else the reason why not, in one line."""
         ...
 
-    def examine(self, recording: Recording, baseline: Sequence[Any], false_alarm_probability: float) -> Evidence:
-        """Return the evidence on a recording that is `usable`.
+    def observe(self, recording: Recording, baseline: Sequence[Any] = ()) -> Observed:
+        """Return what the detector observes of a recording that is `usable`: numbers, no verdict.
 
         `baseline`: leak-free recordings of the same machine, at any duty, no two of them copies; where
-        there is none, the recording's own beginning is the baseline.
+        there is none, changes within the recording are looked for.
         """
         ...
 
@@ -57,19 +58,22 @@ def unusable(detector: Detector, recording: Recording) -> str | None:
     return " ".join(reason.split()) or "the recording cannot be used"
 
 
-def checked(evidence: Any) -> Evidence:
-    """Return what a detector's `examine` gave; raises TypeError or ValueError where it is no valid Evidence."""
-    if not isinstance(evidence, Evidence):
-        raise TypeError(f"examine must give Evidence, got {type(evidence).__name__}")
-    if evidence.verdict not in get_args(Verdict):
-        raise ValueError(f"a verdict must be one of {', '.join(get_args(Verdict))}, got {evidence.verdict!r}")
-    if evidence.cause is not None and evidence.cause not in get_args(Cause):
-        raise ValueError(f"a cause must be one of {', '.join(get_args(Cause))}, got {evidence.cause!r}")
-    if not isinstance(evidence.reason, str) or "\n" in evidence.reason:
-        raise ValueError("a reason must be one line")
-    if evidence.verdict != "cannot tell" and (evidence.score is None or evidence.threshold is None):
-        raise ValueError("a verdict must come with its score and threshold")
-    return evidence
+def checked(report: Any, name: str) -> Observed:
+    """Return what a detector's `observe` gave, or raise TypeError or ValueError where it is no valid report."""
+    if isinstance(report, Observable):
+        report = Observed(name, (report,))
+    if not isinstance(report, Observed):
+        raise TypeError(f"observe must give Observed, got {type(report).__name__}")
+    for observable in report.observables:
+        if not isinstance(observable, Observable):
+            raise TypeError(f"observables must be of Observable, got {type(observable).__name__}")
+        if not 0.0 <= observable.chance <= 1.0:
+            raise ValueError(f"a chance must be 0 to 1, got {observable.chance!r} ({observable.name})")
+        if not np.isfinite(observable.score):
+            raise ValueError(f"a score must be finite, got {observable.score!r} ({observable.name})")
+    if "\n" in report.lack:
+        raise ValueError("what a detector lacks must be one line")
+    return replace(report, provider=name)
 
 
 def failure(name: str, distribution: str | None, error: Exception) -> str:

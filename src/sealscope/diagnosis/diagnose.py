@@ -5,25 +5,29 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.detector import Detector, checked, failure, unusable
-from sealscope.diagnosis.inference.other_steps.step import other_step
 from sealscope.diagnosis.inspection import comparable, inspected
-from sealscope.diagnosis.judgement import ORDER, combined, deciding, rank
+from sealscope.diagnosis.inference.changes.signals import SIGNALS, observe_signals
+from sealscope.diagnosis.inference.observable import Observed
+from sealscope.diagnosis.decision.case import Context
+from sealscope.diagnosis.decision.combination import ORDER, combine, is_decided, rank
+from sealscope.diagnosis.decision.decide import decide
+from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.learnt import Healthy, Learnt
+from sealscope.diagnosis.observation import null_of, run_detector
 from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
-from sealscope.diagnosis.verdict.evidence import RAREST, Evidence
+from sealscope.diagnosis.verdict.evidence import RMS_CHANGE, Evidence
 from sealscope.diagnosis.verdict.machine import assumed_rig
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
-from sealscope.parameters import Rig, load_rig
-from sealscope.recordings.motion import does_not_move
+from sealscope.parameters import Rig
 from sealscope.recordings.recording import Recording
 
 #: Probability of `leak` on a leak-free recording, unless the caller asks for another.
@@ -55,72 +59,62 @@ class Examination:
     distrust: str | None = None
     refusal: str | None = None
     share: float = 1.0
-    _detectors: dict[str, Detector] = field(default_factory=dict)
-    _evidence: dict[tuple[str, frozenset[str]], Evidence] = field(default_factory=dict)
+    _reports: dict[str, Observed] = field(default_factory=dict)
 
     def through(self, channels: Iterable[str]) -> Examination:
         """Return the same recording with these channels alone."""
         wanted = set(channels)
         recording, *baseline = (
-            own.only(name for name in own.channels if name in wanted)
-            for own in (self.recording, *self.baseline)
-            if isinstance(own, Recording)
+            healthy.only(name for name in healthy.channels if name in wanted)
+            for healthy in (self.recording, *self.baseline)
+            if isinstance(healthy, Recording)
         )
-        return replace(self, recording=recording, baseline=baseline)
+        return replace(self, recording=recording, baseline=baseline, _reports={})
 
-    def evidence(self, name: str) -> Evidence:
-        """Return a detector's evidence, `cannot tell` where the recording lacks what it needs or where it fails.
+    def report(self, name: str) -> Observed:
+        """Return what a detector observes, and why it observes nothing where it cannot.
 
         Raises KeyError for a detector that is not registered.
         """
-        from threadpoolctl import threadpool_limits
+        if name not in self._reports:
+            self._reports[name] = run_detector(name, self.recording, self.baseline, self.rig, self.distrust)
+        return self._reports[name]
 
-        factory, visible = detectors()[name], frozenset(self.recording.channels)
-        try:
-            if name not in self._detectors:
-                self._detectors[name] = factory(load_rig(self.rig))
-            detector = self._detectors[name]
-            key = (name, visible)
-            if key not in self._evidence:
-                # small matrices: threads would cost more than they give, and how they share the work may not repeat to
-                # the bit
-                with np.errstate(all="ignore"), threadpool_limits(limits=1):
-                    self._evidence[key] = self._run(name, detector)
-            return self._evidence[key]
-        except Exception as error:
-            why = failure(name, getattr(factory, "distribution", None), error)
-            return Evidence("cannot tell", why, detector=name, usable=False)
+    @cached_property
+    def signals(self) -> Observed:
+        """What no detector of leaks observes: duty, noise, hum and levels."""
+        return Observed(SIGNALS, lack=self.distrust) if self.distrust else observe_signals(self.recording)
 
-    def _run(self, name: str, detector: Detector) -> Evidence:
-        if detector.name != name:
-            raise ValueError(f"its name must be that of its entry point, {name!r}, got {detector.name!r}")
-        reason = unusable(detector, self.recording) or self.distrust
-        if reason is None and name != ORDER[0] and not self.baseline:
-            reason = does_not_move(self.recording)
-        baseline = self.baseline
-        if reason is None and baseline:
-            reasons = [_unusable(detector, own) for own in baseline]
-            baseline = tuple(own for own, why in zip(baseline, reasons, strict=True) if why is None)
-            reason = None if baseline else f"no baseline recording can be used: {reasons[0]}"
-        if reason is not None:
-            return Evidence("cannot tell", reason, detector=name, usable=False)
-        evidence = checked(detector.examine(self.recording, baseline, self.false_alarm_probability))
-        return replace(evidence, detector=name, share=self.share * evidence.share)
+    @cached_property
+    def null(self) -> HealthyNull:
+        """What the healthy recordings show of every observable."""
+        return null_of(self.baseline, self.rig)
+
+    def evidence(self, name: str) -> Evidence:
+        """Decide by one detector alone; the change of RMS by its own rule, whatever else changed."""
+        context = Context(
+            false_alarm_probability=self.false_alarm_probability,
+            refusal=self.refusal,
+            is_weighed=name != RMS_CHANGE,
+        )
+        return self._decide(name, [self.signals], context)
 
     def fused(self) -> Evidence:
-        """Return one verdict from all registered detectors but those that only stand in for one which judges."""
-        evidences: list[Evidence] = []
-        for name in sorted(detectors(), key=rank):
-            if name not in ORDER or deciding(evidences) is None:
-                evidences.append(self.evidence(name))
-        other = None if self.distrust else other_step(self.recording, RAREST)
-        return combined(evidences, other, self.refusal)
+        """Decide by all registered detectors: the first that measures the leak and can tell judges."""
+        context = Context(false_alarm_probability=self.false_alarm_probability, refusal=self.refusal)
+        names = sorted(detectors(), key=rank)
+        judged = dict[str, Evidence]()
+        reports = [self.signals, *(self.report(name) for name in names if name not in ORDER)]
+        for name in names:
+            if name not in ORDER or not any(is_decided(own) for own in judged.values()):
+                judged[name] = self._decide(name, reports, context)
+        return combine(list(judged.values()), context)
 
-
-def _unusable(detector: Detector, healthy: Healthy) -> str | None:
-    if isinstance(healthy, Recording):
-        return unusable(detector, healthy)
-    return None if detector.name in healthy.lessons else "it has taught this method nothing"
+    def _decide(self, name: str, reports: Sequence[Observed], context: Context) -> Evidence:
+        report = self.report(name)
+        with np.errstate(all="ignore"):
+            evidence = decide(report, reports, self.null, context)
+        return replace(evidence, share=self.share * evidence.share)
 
 
 @checked_call

@@ -18,6 +18,7 @@ from sealscope.diagnosis.detector import failure, unusable
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY, diagnose
 from sealscope.diagnosis.inspection import inspected
 from sealscope.diagnosis.learnt import Learnt, Lesson
+from sealscope.diagnosis.observation import RARITIES, rarities_of
 from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.machine import assumed_rig
@@ -260,6 +261,7 @@ def learn(recording: Recording, rig: Rig, file: str, checksum: str = "") -> Lear
                 failure(name, getattr(factory, "distribution", None), error)
     if not lessons:
         raise InputError(f"a healthy recording must hold channels that a method reads, got none such ({file})")
+    lessons[RARITIES] = rarities_of(part, rig)
     units = {name: part.units[name] for name in part.channels}
     about = {"sha256": checksum, **about_recording(recording, inspection)}
     start = start_seconds(recording, file)

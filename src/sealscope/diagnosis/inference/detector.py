@@ -1,9 +1,8 @@
-"""The volume balance as a detector: blocks of a recording, and of the healthy ones it is compared with, judged."""
+"""The volume balance as a detector: observables of a recording, and its leak beside that of healthy recordings."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,14 +11,14 @@ from sealscope.diagnosis.inference.balance import blocks_of, shortest
 from sealscope.diagnosis.inference.blocks import Columns
 from sealscope.diagnosis.inference.circuit.store import lost_beside
 from sealscope.diagnosis.inference.circuit.without_position import circulations
-from sealscope.diagnosis.inference.decision.judge import bound_of, judge
-from sealscope.diagnosis.inference.decision.recorded import RecordedBalance
+from sealscope.diagnosis.inference.balance_leak import BalanceLeak
+from sealscope.diagnosis.inference.observable import Observable, Observed
+from sealscope.diagnosis.inference.recorded import RecordedBalance
 from sealscope.diagnosis.inference.scatter import RecordingSums, Rise, motion_change, rise
 from sealscope.diagnosis.inference.terms import CYLINDER, LOCKED, circulation, equations, locked
 from sealscope.diagnosis.inference.weak_form import STRIDE, stride_samples
 from sealscope.diagnosis.learnt import Healthy, Lesson, lessons_of
 from sealscope.diagnosis.priors import priors
-from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Recording, remembered
 
@@ -93,7 +92,7 @@ class VolumeBalance:
                 for own in made
             ]
             answering = [own for own in recorded if own.equations[0].name == LOCKED or made_good(own)]
-            return min(answering, key=lambda own: bound_of(own, None), default=None)
+            return min(answering, key=lambda own: BalanceLeak(self.name, own).bound_flow, default=None)
         blocks = remembered(recording, (self.name, self.rig), lambda own: blocks_of(own, self.rig), _READ)
         if blocks is None:
             return None
@@ -130,22 +129,33 @@ class VolumeBalance:
     def _columns(self, channels: frozenset[str]) -> list[Columns]:
         return [Columns(equation) for equation in equations(self.rig, channels)]
 
-    def examine(self, recording: Recording, baseline: Sequence[Healthy], false_alarm_probability: float) -> Evidence:
-        """Return the evidence of a step of the leakage, and of its rise against the baseline."""
-        own = self.balance(recording)
-        if own is None:
-            return Evidence("cannot tell", _NO_BALANCE["x" in recording].format(recording.duration), usable=False)
-        names = list(own.columns[0].names)
+    def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
+        """Return the steps of the balance's terms, and the leak against healthy recordings."""
+        balance = self.balance(recording)
+        if balance is None:
+            return Observed(self.name, lack=_NO_BALANCE["x" in recording].format(recording.duration))
+        names = list(balance.columns[0].names)
         lessons = [lesson for lesson in lessons_of(self, baseline) if lesson["terms"] == names]
         healthy = [_sums_of(lesson) for lesson in lessons]
-        evidence, rows = judge(own, false_alarm_probability, healthy), own.blocks.rows
-        if own.equations[0].name != CYLINDER and len(own.columns) == 1:
-            return evidence
-        if healthy and len(own.columns) == 1:
-            evidence = replace(
-                evidence, reason=evidence.reason + _of_another_machine(own, healthy, false_alarm_probability)
-            )
-        return replace(evidence, share=float(rows.mean() / max(rows.max(), 1.0)))
+        leak, rows = BalanceLeak(self.name, balance, healthy), balance.blocks.rows
+        if leak.step is None and leak.rise is None:
+            why = "p_A and p_B hardly differ, or too few samples are whole: no leak would show"
+            return Observed(self.name, lack=why)
+        is_whole = balance.equations[0].name == CYLINDER or len(balance.columns) > 1
+        share = float(rows.mean() / max(rows.max(), 1.0)) if is_whole else 1.0
+        observables = balance.observables
+        if healthy and len(balance.columns) == 1 and is_whole:
+            observables += (_motion_observable(balance, healthy),)
+        return Observed(self.name, observables, leak, share=share)
+
+
+def _motion_observable(balance: RecordedBalance, healthy: Sequence[RecordingSums]) -> Observable:
+    """Compare the flow that motion takes with the healthy recordings: another machine, or another scale."""
+    change = motion_change(balance.recording_sums.sums[0], [own.sums[0] for own in healthy], balance.columns[0])
+    chance = 2.0 * min(change.chance, 1.0 - change.chance)
+    return Observable(
+        name="motion", data="motion", score=2.0 * change.log_ratio(change.value), chance=chance, size=change.value
+    )
 
 
 def _later(recorded: RecordingSums, times: int) -> float | None:
@@ -156,14 +166,3 @@ def _later(recorded: RecordingSums, times: int) -> float | None:
 def _sums_of(lesson: Lesson) -> RecordingSums:
     sums = np.asarray(lesson["sums"], dtype=float)
     return RecordingSums(sums, lesson["flow"], lesson["pressure"], lesson.get("start_s"), lesson.get("oil_degC"))
-
-
-def _of_another_machine(own: RecordedBalance, healthy: Sequence[RecordingSums], probability: float) -> str:
-    """Return in words that motion takes another flow than in the healthy recordings, empty where it does not."""
-    change = motion_change(own.recording_sums.sums[0], [of.sums[0] for of in healthy], own.columns[0])
-    if abs(change.score) <= change.threshold(0.5 * probability):
-        return ""
-    return (
-        f"; motion takes {np.exp(change.value):.3g} times the flow that it does in the healthy recordings: another "
-        "machine, or another scale of its sensors?"
-    )

@@ -88,6 +88,19 @@ class Rise(NamedTuple):
         ends = np.sort((self.parts.centres - ndtri(chance) * self.parts.deviations) / self.deviation)
         return float(brentq(lambda score: self._beyond(score) - chance, ends[0], ends[-1]))
 
+    def log_ratio(self, rise: float) -> float:
+        """Return the logarithm of the likelihood of a true rise over that of none."""
+        return self._log_density(self.value - rise) - self._log_density(self.value)
+
+    def _log_density(self, value: float) -> float:
+        """Return the logarithm of the density of a healthy recording's rise, up to a constant."""
+        if self.parts is None:
+            z = value / self.deviation
+            return float(-0.5 * (self.freedom + 1.0) * np.log1p(z * z / self.freedom))
+        weights, deviations, centres = self.parts
+        parts = np.log(np.maximum(weights, np.finfo(float).tiny)) - np.log(deviations)
+        return float(np.logaddexp.reduce(parts - 0.5 * ((value + centres) / deviations) ** 2))
+
     def bound(self, probability: float = 0.95) -> float:
         """Return the upper bound that holds with a probability; a rise below zero does not make it smaller."""
         return max(self.value, 0.0) + self.threshold(1.0 - probability) * self.deviation

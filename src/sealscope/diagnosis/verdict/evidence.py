@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 from sealscope.diagnosis.priors import priors
 from sealscope.recordings.recording import Array
 
 Verdict = Literal["leak", "no leak", "cannot tell"]
+#: The three verdicts; `decision.decide` alone gives one.
+LEAK, NO_LEAK, CANNOT_TELL = get_args(Verdict)
 #: What a change can come from.
 Cause = Literal[
     "piston leak",

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, information, mean_of, zero_of
+from sealscope.diagnosis.inference.changes.volumes import volume_observables
+from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import WITHIN_95, Course, Information, Interval, StepTest, course, step_test
-from sealscope.diagnosis.inference.other_steps.causes import StepHypothesis, hypotheses
 from sealscope.diagnosis.inference.scatter import RecordingSums
 from sealscope.diagnosis.inference.terms import LAG, ORIFICE, PUMP, Equation
 from sealscope.diagnosis.priors import priors
@@ -79,9 +80,9 @@ class RecordedBalance:
         return step_test(information(self.blocks, self.columns, column.names.index(ORIFICE), column.leak))
 
     @cached_property
-    def hypotheses(self) -> tuple[StepHypothesis, ...]:
-        """Tests of all terms' coefficients, the most likely first."""
-        return hypotheses(self.blocks, self.plain or self.blocks, self.equations, self.columns, self.lost)
+    def observables(self) -> tuple[Observable, ...]:
+        """Steps of all terms' coefficients, the most likely first."""
+        return volume_observables(self.blocks, self.plain or self.blocks, self.equations, self.columns, self.lost)
 
     @cached_property
     def recording_sums(self) -> RecordingSums:

@@ -16,7 +16,7 @@ from sealscope.diagnosis.priors import priors
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording
 
-_PRIORS = priors("inference.other_steps")["features"]
+_PRIORS = priors("inference.changes")["features"]
 BLOCKS, ORDER = _PRIORS["blocks"], _PRIORS["order"]
 #: What commands the motion, and what moves, in the order of preference.
 COMMANDS, MOTIONS = ("u", "omega", "theta"), ("x", "theta", "omega", "u")

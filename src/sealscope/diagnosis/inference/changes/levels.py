@@ -27,24 +27,23 @@ import numpy as np
 from sealscope.diagnosis.inference.onset import RANK, Information, two_sided
 from sealscope.diagnosis.inference.terms import HALF_DIFFERENCE
 from sealscope.diagnosis.priors import priors
-from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording
 
 _TINY = float(np.finfo(float).tiny)
 A, B, HALF_A, HALF_B = np.eye(4)
 #: Oil that is lost lowers both levels; what raises them has many causes.
-CHARGE = "a loss of oil"
-#: Name, what a step means, and rows that span it; where a simpler pattern lies within, once with it first for each.
-PATTERNS: tuple[tuple[str, Cause | None, list[list[Array]]], ...] = (
-    (CHARGE, "external leak", [[A + B]]),
-    ("friction", "friction change", [[A + B, HALF_A, HALF_B]]),
-    ("friction", "friction change", [[HALF_A - HALF_B]]),
-    ("friction", "friction change", [[A, B, HALF_A, HALF_B]]),
-    ("what feeds both chambers", None, [[A + B, HALF_A + HALF_B]]),
-    ("load", "changed duty", [[A, B], [B, A], [A + B, A]]),
-    ("zero of p_A", "sensor fault", [[A]]),
-    ("zero of p_B", "sensor fault", [[B]]),
+CHARGE, SUPPLY = "a loss of oil", "what feeds both chambers"
+#: Name, and rows that span it; where a simpler pattern lies within, once with it first for each.
+PATTERNS: tuple[tuple[str, list[list[Array]]], ...] = (
+    (CHARGE, [[A + B]]),
+    ("friction", [[A + B, HALF_A, HALF_B]]),
+    ("friction", [[HALF_A - HALF_B]]),
+    ("friction", [[A, B, HALF_A, HALF_B]]),
+    (SUPPLY, [[A + B, HALF_A + HALF_B]]),
+    ("load", [[A, B], [B, A], [A + B, A]]),
+    ("zero of p_A", [[A]]),
+    ("zero of p_B", [[B]]),
 )
 
 
@@ -56,7 +55,6 @@ class Level(NamedTuple):
     """
 
     name: str
-    cause: Cause | None
     rank: float
     score: float
     chance: float
@@ -95,7 +93,7 @@ def levels(recording: Recording) -> tuple[Array, Array] | None:
         return None
     pressures = np.column_stack([recording["p_A"], recording["p_B"]])
     means, motion = pressures.mean(axis=0), _motion(recording)
-    believed = priors("inference.other_steps")["levels"]
+    believed = priors("inference.changes")["levels"]
     if motion is None:
         motion, moving = np.zeros((len(recording), 0)), np.ones(len(recording))
         columns = np.column_stack([moving, pressures - means])
@@ -145,18 +143,18 @@ def level_tests(recording: Recording) -> tuple[Level, ...]:
     root[:, kept] = (basis / np.sqrt(np.maximum(eigen, RANK))) @ basis.T / size
     mean, both, tested = values.mean(axis=0), values[:, :2].sum(axis=1), []
     scales = (("scale of p_A", A + HALF_A), ("scale of p_B", B + HALF_B))
-    patterns = [*PATTERNS, *((name, "sensor fault", [[mean * own]]) for name, own in scales)]
-    for name, cause, bases in patterns:
-        tests = [_test(name, cause, np.array(own) @ root.T, values @ root.T, time) for own in bases]
+    patterns = [*PATTERNS, *((name, [[mean * rows]]) for name, rows in scales)]
+    for name, bases in patterns:
+        tests = [_test(name, np.array(rows) @ root.T, values @ root.T, time) for rows in bases]
         least = min((test for test in tests if test is not None), key=lambda test: test.rank, default=None)
         if least is not None:
             after = time > least.onset
             falls = after.any() and not after.all() and both[after].mean() <= both[~after].mean()
-            tested.append(least._replace(cause=None) if name == CHARGE and not falls else least)
+            tested.append(least._replace(name=SUPPLY) if name == CHARGE and not falls else least)
     return tuple(sorted(tested, key=lambda test: -test.rank))
 
 
-def _test(name: str, cause: Cause | None, rows: Array, whitened: Array, time: Array) -> Level | None:
+def _test(name: str, rows: Array, whitened: Array, time: Array) -> Level | None:
     """Return the test of whitened blocks (K, c) by the steps of `rows` (m, c), the first of them as it is."""
     basis, size = np.linalg.qr(rows.T)
     basis = basis[:, np.abs(np.diag(size)) > RANK * np.abs(size).max()]
@@ -172,4 +170,4 @@ def _test(name: str, cause: Cause | None, rows: Array, whitened: Array, time: Ar
     chance = 2.0 * count * min(test.law.chance(score) for test in tests)
     rank = score - (count - 1) * float(np.log(len(time)))
     onset, block = float(tests[0].onsets[best]), float(time[1] - time[0])
-    return Level(name, cause, rank, score, min(1.0, chance), onset, block)
+    return Level(name, rank, score, min(1.0, chance), onset, block)

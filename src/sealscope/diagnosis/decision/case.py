@@ -1,0 +1,162 @@
+"""What a decision rests on: the report that judges, what competes, healthy recordings, and the questions asked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from sealscope.diagnosis.decision.events import load_events
+from sealscope.diagnosis.decision.explanations import (
+    LEAK_EVENTS,
+    RISE,
+    Explanation,
+    LeakRise,
+    explain,
+    probability_of,
+)
+from sealscope.diagnosis.decision.null import HealthyNull
+from sealscope.diagnosis.inference.observable import LeakMeasure, Observable, Observed
+from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.verdict.evidence import Cause
+
+_PRIORS = priors("decision")
+#: The questions: did a leak begin here, is there more than in healthy recordings, or than the rig's file allows?
+WITHIN, AGAINST, LEVEL = "within the recording", "against the baseline", "against the rig's file"
+
+
+class Question(NamedTuple):
+    """A question: its score and threshold, its predictive chance, its share of the false-alarm probability."""
+
+    name: str
+    score: float
+    threshold: float
+    chance: float
+    probability: float
+
+
+class OtherEvent(NamedTuple):
+    """An event that is no leak: name, cause, words, probability, and the rarest observable that shows it."""
+
+    cause: Cause
+    words: str
+    probability: float
+    observable: Observable
+    chance: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Context:
+    """What a decision is made under.
+
+    Parameters
+    ----------
+    false_alarm_probability : float
+        Probability of `leak` on a leak-free recording.
+    refusal : str, optional
+        Why the recording cannot be compared with the healthy ones that were given.
+    is_weighed : bool
+        Whether other causes compete; False for a method by its own rule.
+    """
+
+    false_alarm_probability: float
+    refusal: str | None = None
+    is_weighed: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """All that a decision rests on: the report that judges, all observables, the null, and the context."""
+
+    judge: Observed
+    observables: Sequence[Observable]
+    null: HealthyNull
+    context: Context
+
+    @property
+    def leak(self) -> LeakMeasure | None:
+        """What the judging provider measures of the leak."""
+        return self.judge.leak
+
+    @cached_property
+    def explanations(self) -> tuple[Explanation, ...]:
+        """Sets of events with their probabilities."""
+        rise = None
+        if self.leak is not None and self.leak.rise is not None:
+            step = 0.0 if self.leak.step is None else self.leak.step.fitted[0] * self.leak.share_after
+            rise = LeakRise(self.leak.rise, step)
+        return explain(self.observables, self.null.chance, rise)
+
+    def leak_probability(self, alarm: Question) -> float:
+        """Compute the probability of a leak past piston or pump, given that what answers the alarm's question moved."""
+        if alarm.name == LEVEL or not self.context.is_weighed:
+            return 1.0
+        data = RISE if alarm.name == AGAINST and self.leak is not None else self.judge.observables[0].data
+        return probability_of(self.explanations, *LEAK_EVENTS, data=data)
+
+    @cached_property
+    def questions(self) -> tuple[Question, ...]:
+        """The questions that can be asked, each with its share of the false-alarm probability."""
+        return _leak_questions(self, self.leak) if self.leak is not None else _change_questions(self)
+
+    @property
+    def alarms(self) -> tuple[Question, ...]:
+        """The questions that are answered with yes, whatever explains it."""
+        return tuple(question for question in self.questions if question.chance < question.probability)
+
+    @cached_property
+    def other_event(self) -> OtherEvent | None:
+        """The event that is no leak, surely explains what was observed, and has a name; None where there is none."""
+        allowed = self.context.false_alarm_probability / max(len({own.data for own in self.observables}), 1)
+        for event in self.explanations[0].events if self.observables else ():
+            if event.cause is None or event.name in LEAK_EVENTS:
+                continue
+            moved = [own for own in self.observables if event.does_move(own)]
+            rarest = min(moved, key=self.null.chance, default=None)
+            sure = probability_of(self.explanations, cause=event.cause)
+            if rarest is None or sure <= _PRIORS["explanation"]["sure"]:
+                continue
+            if (chance := self.null.chance(rarest)) < allowed:
+                return OtherEvent(event.cause, event.words, sure, rarest, chance)
+        return None
+
+
+def _leak_questions(case: Case, leak: LeakMeasure) -> tuple[Question, ...]:
+    from scipy.special import ndtr, ndtri
+
+    allowed, questions = case.context.false_alarm_probability, []
+    step, rise, excess = leak.step, leak.rise, leak.excess
+    shared = step is not None and (rise is not None or excess is not None)
+    second = _PRIORS["questions"]["within"] * allowed if shared else 0.0
+    if step is not None:
+        share, key = second if rise is not None else allowed - second, step_key(leak.provider)
+        threshold = step.threshold(case.null.law_chance(key, share))
+        questions.append(Question(WITHIN, step.score, threshold, case.null.inflate(key, step.chance), share))
+    if rise is not None:
+        share = allowed - second
+        questions.append(Question(AGAINST, rise.score, rise.threshold(share), rise.chance, share))
+    if excess is not None:
+        share = second or allowed
+        questions.append(Question(LEVEL, excess, float(-ndtri(share)), float(ndtr(-excess)), share))
+    return tuple(questions)
+
+
+def step_key(provider: str) -> str:
+    """Return the name under which the rarity of a provider's leak within a recording is kept."""
+    return f"{provider}: step"
+
+
+def _change_questions(case: Case) -> tuple[Question, ...]:
+    """Return the one question of a provider that measures no leak: did what a leak moves change as it does?"""
+    leak = next(event for event in load_events() if event.name == LEAK_EVENTS[0])
+    moved = [own for own in case.judge.observables if leak.does_move(own)]
+    rarest = min(moved, key=lambda own: own.chance, default=None)
+    if rarest is None:
+        return ()
+    allowed, chance = case.context.false_alarm_probability, case.null.chance(rarest)
+    threshold = rarest.score * np.log(allowed) / np.log(min(max(rarest.chance, 1e-300), 1.0 - 1e-9))
+    where = WITHIN if rarest.onset is not None else AGAINST
+    return (Question(where, rarest.score, max(float(threshold), 0.0), chance, allowed),)

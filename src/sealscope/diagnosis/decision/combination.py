@@ -1,0 +1,67 @@
+"""Which detector's decision stands: the first that measures the leak and can tell.
+
+Letting any of several raise the alarm would make the false-alarm probability the sum of theirs. So one judges: the
+first of `ORDER` that decides, then a user's own detectors, last the change of RMS, which states no size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from sealscope.diagnosis.decision.case import Context
+from sealscope.diagnosis.decision.texts import text_of
+from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, LEAK, NO_LEAK, RMS_CHANGE, Evidence
+
+#: Detectors that measure the leak: by every litre, then by a model of the pressures.
+ORDER = ("volume balance", "pressure response")
+#: Share of a recording that must be whole for `no leak`.
+WHOLE = 0.95
+
+
+def rank(detector: str) -> int:
+    """Return when a detector is asked, 0 first; a user's own are all alike, and the least specific is the last."""
+    if detector == RMS_CHANGE:
+        return len(ORDER) + 1
+    return ORDER.index(detector) if detector in ORDER else len(ORDER)
+
+
+def is_decided(evidence: Evidence) -> bool:
+    """Return whether evidence stands: a verdict, or a change that is seen and not explained."""
+    return evidence.usable and not evidence.abstains
+
+
+def combine(decisions: Sequence[Evidence], context: Context) -> Evidence:
+    """Choose the decision that stands, with all others beside it as `parts`.
+
+    A recording that cannot be compared with the healthy ones it was given, or of which a part is missing, is not
+    without a leak.
+    """
+    ranked = sorted(decisions, key=lambda own: rank(own.detector))
+    usable = [own for own in ranked if own.usable]
+    measuring = [own for own in usable if own.detector != RMS_CHANGE]
+    judge = next((own for own in measuring or usable if not own.abstains), None)
+    if judge is None:
+        return _undecided(ranked, usable)
+    reasons, doubts = [judge.reason], []
+    if judge.share < 1.0:
+        reasons.append(text_of("doubt", "share", percent=100.0 * judge.share))
+    if judge.verdict == NO_LEAK:
+        if context.refusal is not None:
+            doubts.append(f"; {context.refusal}")
+        if judge.share < WHOLE:
+            doubts.append(text_of("doubt", "rest"))
+    verdict = CANNOT_TELL if doubts else judge.verdict
+    others = [own for own in ranked if own is not judge]
+    stated = replace(judge, verdict=verdict, reason="".join([*reasons, *doubts]), parts=(judge, *others))
+    return stated if verdict == LEAK else replace(stated, onset_s=None, onset_interval_s=None)
+
+
+def _undecided(ranked: Sequence[Evidence], usable: Sequence[Evidence]) -> Evidence:
+    """Say why no detector has a verdict: by the first that could be used, else by the one that needs least."""
+    if usable:
+        stated = usable[0]
+    else:
+        built_in = [own for own in ranked if own.detector in (*ORDER, RMS_CHANGE)] or list(ranked)
+        stated = Evidence(CANNOT_TELL, built_in[-1].reason if built_in else "there is no detector")
+    return replace(stated, detector="", parts=tuple(ranked), usable=True)

@@ -1,0 +1,64 @@
+"""The table of events: what may happen, how often, and which observables it moves (`events.toml`)."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from functools import cache
+from importlib.resources import files
+
+from sealscope.diagnosis.inference.observable import Observable
+from sealscope.diagnosis.verdict.evidence import Cause
+
+
+@dataclass(frozen=True)
+class Event:
+    """An event.
+
+    Parameters
+    ----------
+    name : str
+        Row of `events.toml`.
+    cause : str or None
+        Heading under which it is named; None where it is never named.
+    probability : float
+        Chance that it begins in a recording.
+    moves : tuple of str
+        Patterns of the observables that show it, as "data: name".
+    disturbs : tuple of str
+        Patterns of those that it may move as well.
+    words : str
+        What is said of it.
+    """
+
+    name: str
+    cause: Cause | None
+    probability: float
+    moves: tuple[str, ...]
+    disturbs: tuple[str, ...]
+    words: str
+
+    def does_move(self, observable: Observable) -> bool:
+        """Return whether an observable shows the event."""
+        return _matches(observable, self.moves)
+
+    def does_disturb(self, observable: Observable) -> bool:
+        """Return whether the event may move an observable as well."""
+        return _matches(observable, self.disturbs)
+
+
+def _matches(observable: Observable, patterns: Sequence[str]) -> bool:
+    key = f"{observable.data}: {observable.name}"
+    return any(fnmatchcase(key, pattern) for pattern in patterns)
+
+
+@cache
+def load_events() -> Sequence[Event]:
+    """Read the table of events."""
+    rows = tomllib.loads((files("sealscope.diagnosis.decision") / "events.toml").read_text("utf-8"))
+    return tuple(
+        Event(name, row["cause"] or None, row["probability"]["value"], tuple(row["moves"]), tuple(row.get("disturbs", ())), row["words"])
+        for name, row in rows.items()
+    )

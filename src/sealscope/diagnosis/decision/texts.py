@@ -1,0 +1,24 @@
+"""The texts of a verdict's reason, by key (`texts.toml`)."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+
+@cache
+def _texts() -> Mapping[str, Mapping[str, str]]:
+    return tomllib.loads((files("sealscope.diagnosis.decision") / "texts.toml").read_text("utf-8"))
+
+
+def text_of(table: str, key: str, **values: Any) -> str:
+    """Return the text of a key, filled in with its values."""
+    return _texts()[table][key].format(**values)
+
+
+def has_text(table: str, key: str) -> bool:
+    """Return whether a table holds a key."""
+    return key in _texts()[table]

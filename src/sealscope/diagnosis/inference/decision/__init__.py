@@ -1,1 +1,0 @@
-"""What a balance says, the questions asked of it, and the verdict."""

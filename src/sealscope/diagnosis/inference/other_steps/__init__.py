@@ -1,1 +1,0 @@
-"""What else than a leak steps: the duty, the noise of the sensors, and the levels of the pressures."""

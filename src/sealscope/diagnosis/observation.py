@@ -1,0 +1,116 @@
+"""Run detectors on a recording: what each observes, why it cannot, and what healthy recordings show of the same."""
+
+from __future__ import annotations
+
+import os
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from sealscope.diagnosis.decision.case import step_key
+from sealscope.diagnosis.decision.null import HealthyNull, key_of
+from sealscope.diagnosis.detector import Detector, checked, failure, unusable
+from sealscope.diagnosis.inference.changes.signals import observe_signals
+from sealscope.diagnosis.inference.observable import Observable, Observed
+from sealscope.diagnosis.learnt import Healthy, Learnt, lessons_of
+from sealscope.diagnosis.registry import DETECTORS, detectors
+from sealscope.diagnosis.rms_change.detector import RmsChange, compare_lessons
+from sealscope.diagnosis.verdict.evidence import RMS_CHANGE
+from sealscope.parameters import Rig, load_rig
+from sealscope.recordings.motion import does_not_move
+from sealscope.recordings.recording import Recording, remembered
+
+#: The lesson that holds how rare a healthy recording's own observables are, by their keys.
+RARITIES = "rarities"
+#: Fewest healthy recordings of which each can be compared with the others.
+FEWEST = 2
+#: Detectors that need no motion: what leaks may show at standstill.
+_AT_REST = ("volume balance",)
+
+
+def run_detector(
+    name: str,
+    recording: Recording,
+    baseline: Sequence[Healthy],
+    rig: Rig | str | os.PathLike[str],
+    distrust: str | None = None,
+) -> Observed:
+    """Run a registered detector on a recording; `distrust`: why its pressures cannot be judged.
+
+    Raises KeyError for a detector that is not registered. A detector that fails is left out with a logged line.
+    """
+    from threadpoolctl import threadpool_limits
+
+    factory = detectors()[name]
+    try:
+        # small matrices: threads would cost more than they give, and how they share the work may not repeat to the bit
+        with np.errstate(all="ignore"), threadpool_limits(limits=1):
+            detector = factory(load_rig(rig))
+            if detector.name != name:
+                raise ValueError(f"its name must be that of its entry point, {name!r}, got {detector.name!r}")
+            return _observe(detector, recording, baseline, distrust)
+    except Exception as error:
+        return Observed(name, lack=failure(name, getattr(factory, "distribution", None), error))
+
+
+def _observe(detector: Detector, recording: Recording, baseline: Sequence[Healthy], distrust: str | None) -> Observed:
+    name = detector.name
+    lack = unusable(detector, recording) or distrust
+    if lack is None and name not in _AT_REST and not baseline:
+        lack = does_not_move(recording)
+    if lack is None and baseline:
+        lacks = [_unusable(detector, healthy) for healthy in baseline]
+        baseline = tuple(healthy for healthy, why in zip(baseline, lacks, strict=True) if why is None)
+        lack = None if baseline else f"no baseline recording can be used: {lacks[0]}"
+    if lack is not None:
+        return Observed(name, lack=lack)
+    return checked(detector.observe(recording, baseline), name)
+
+
+def _unusable(detector: Detector, healthy: Healthy) -> str | None:
+    if isinstance(healthy, Recording):
+        return unusable(detector, healthy)
+    return None if detector.name in healthy.lessons else "it has taught this method nothing"
+
+
+def rarities_of(recording: Recording, rig: Rig | str | os.PathLike[str]) -> Mapping[str, float]:
+    """Compute how rare each change within a healthy recording is, by the key of its observable."""
+    return remembered(recording, (RARITIES, str(rig) if not isinstance(rig, Rig) else rig), lambda own: _rarities(own, rig))
+
+
+def _rarities(recording: Recording, rig: Rig | str | os.PathLike[str]) -> Mapping[str, float]:
+    reports = [observe_signals(recording)]
+    for name in DETECTORS:
+        if name != RMS_CHANGE and (name == "volume balance" or not reports[-1].leak):
+            reports.append(run_detector(name, recording, (), rig))
+    rarities: dict[str, float] = {}
+    for report in reports:
+        for observable in report.observables:
+            if observable.onset is not None and observable.rarity > rarities.get(key_of(observable), -1.0):
+                rarities[key_of(observable)] = observable.rarity
+        if report.leak is not None and report.leak.step is not None:
+            rarities[step_key(report.provider)] = -float(np.log(max(report.leak.step.chance, 1e-300)))
+    return rarities
+
+
+def null_of(baseline: Sequence[Healthy], rig: Rig | str | os.PathLike[str]) -> HealthyNull:
+    """Collect what healthy recordings show of every observable."""
+    known = defaultdict[str, list[float]](list)
+    for healthy in baseline:
+        rarities = healthy.lessons.get(RARITIES) if isinstance(healthy, Learnt) else rarities_of(healthy, rig)
+        for key, rarity in (rarities or {}).items():
+            known[key].append(float(rarity))
+    for observables in compare_healthy(baseline):
+        for data in {observable.data for observable in observables}:
+            rarest = max(observable.rarity for observable in observables if observable.data == data)
+            known[f"{data}: against"].append(rarest)
+    return HealthyNull(known)
+
+
+def compare_healthy(baseline: Sequence[Healthy]) -> Iterator[Sequence[Observable]]:
+    """Yield what each healthy recording's ringing shows against all others."""
+    lessons = lessons_of(RmsChange(), baseline)
+    alike = [own for own in lessons if own["chambers"] == lessons[0]["chambers"] and own["rate"] == lessons[0]["rate"]]
+    for k, lesson in enumerate(alike if len(alike) > FEWEST else ()):
+        yield compare_lessons(lesson, alike[:k] + alike[k + 1 :], lesson["chambers"])[0]
