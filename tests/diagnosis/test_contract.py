@@ -49,6 +49,7 @@ GOOD: dict[str, Change] = {
     "whole": lambda r: r,
     "counts": counts,
     "one gap near the end": lambda r: with_channels(r, p_A=np.where(np.arange(len(r)) == 50000, np.nan, r["p_A"])),
+    "every second value missing": every_second_missing,
     "command without a value": lambda r: with_channels(r, u=np.full(len(r), np.nan)),
 }
 #: ... and recordings on which it must say `cannot tell`, with what its reason has to name.
@@ -59,7 +60,6 @@ HOPELESS: dict[str, tuple[Change, str]] = {
     "no pressure": (lambda r: r.only(["u", "x", "p_1", "p_2"]), "p_A or p_B"),
     "constant pressure": (lambda r: with_channels(r, p_A=np.full(len(r), 3e5)), "p_A is constant"),
     "no value at all": (lambda r: with_channels(r, p_A=np.full(len(r), np.nan)), "226 samples"),
-    "every second value missing": (every_second_missing, "226 samples"),
     "time in ms labelled s": (lambda r: replace(r, t=np.arange(len(r)) * 2.0, rate=0.5), "the unit of the time"),
     "pressures at 0.5 Hz": (
         lambda r: replace(r, t=np.arange(len(r)) * 2.0, rate=0.5).only(["p_A", "p_B"]),

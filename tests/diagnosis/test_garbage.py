@@ -23,7 +23,7 @@ def noise(recording: Recording, size: float) -> np.ndarray:
 
 
 GARBAGE: dict[str, tuple[Change, str]] = {
-    "white noise": (lambda r: put(r, p_A=3e5 + noise(r, 1e5), p_B=3e5 - noise(r, 1e5)), "p_A is noise"),
+    "white noise": (lambda r: put(r, p_A=3e5 + noise(r, 1e5), p_B=3e5 - noise(r, 1e5)), "p_A - p_B is noise"),
     "a copy": (lambda r: put(r, p_B=r["p_A"]), "p_B is a copy of p_A"),
     "a noisy copy": (lambda r: put(r, p_B=r["p_A"] + noise(r, 4e3)), "p_A - p_B is noise"),
     "bar": (lambda r: put(r, p_A=1e-5 * r["p_A"], p_B=1e-5 * r["p_B"]), "is its unit right"),

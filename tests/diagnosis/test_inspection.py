@@ -91,13 +91,15 @@ def test_a_baseline_with_a_fault_is_left_out_for_every_detector(fault: str, heal
     assert "no baseline recording can be used: " in alone.reason
 
 
-def test_of_a_baseline_with_a_long_gap_the_longest_stretch_is_used(healthy: list[Recording]) -> None:
+def test_of_a_baseline_with_a_long_gap_both_sides_are_used(healthy: list[Recording]) -> None:
     recording, leak_free = healthy[:2]
     p_A = np.array(leak_free["p_A"])
     p_A[1000:9000] = np.nan
     holed = replace(leak_free, channels={**leak_free.channels, "p_A": p_A})
     (part,) = comparable(inspected(recording), [holed]).parts
-    assert len(part) == len(leak_free) - 9000
+    assert len(part) == len(leak_free)
+    assert part.bridged is not None
+    assert np.count_nonzero(part.bridged) == 8000
 
 
 class Failing:

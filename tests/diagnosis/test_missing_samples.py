@@ -9,6 +9,10 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.diagnose import diagnose
+from sealscope.diagnosis.inference.decision.recorded import RecordedBalance
+from sealscope.diagnosis.inference.detector import VolumeBalance
+from sealscope.diagnosis.inspection import inspected
+from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
 
 VIEWS = {"all": None, "command": ("u", "p_A", "p_B"), "pressures": ("p_A", "p_B")}
@@ -82,9 +86,107 @@ def test_a_motion_with_short_gaps_is_that_of_a_mass(gaps: str, late_leak: Record
     assert diagnose(MOTIONS[gaps](healthy)).verdict == "no leak"
 
 
-@pytest.mark.parametrize("view", ["all", "pressures"])
-def test_no_leak_needs_nearly_all_of_the_recording(view: str, healthy: Recording) -> None:
+def test_without_a_balance_no_leak_needs_nearly_all_of_the_recording(healthy: Recording) -> None:
     """A tenth of a second in every four after half: hardly a sample is missing, and few blocks are left."""
-    diagnosis = diagnose(observed(holed(healthy, (healthy.t % 4.0 < 0.1) & (healthy.t > 60.0)), view))
+    diagnosis = diagnose(observed(dotted(healthy), "pressures"))
     assert diagnosis.verdict == "cannot tell"
     assert "the rest may hide a leak" in diagnosis.reason
+
+
+def test_what_a_hole_touches_weighs_less_and_is_not_lost(late_leak: Recording, healthy: Recording) -> None:
+    """The balance loses as much as the holes last, not the test functions that they touch."""
+    whole, holes = diagnose(late_leak), diagnose(dotted(late_leak))
+    assert holes.verdict == "leak"
+    assert holes.relative.pump_share == pytest.approx(whole.relative.pump_share, rel=0.05)
+    sound = diagnose(dotted(healthy))
+    assert sound.verdict == "no leak"
+    assert sound.share > 0.98
+
+
+def dotted(recording: Recording) -> Recording:
+    return holed(recording, (recording.t % 4.0 < 0.1) & (recording.t > 60.0))
+
+
+@pytest.fixture(scope="module")
+def polled_leak(late_leak: Recording) -> Recording:
+    """The recording as a poll of 10 to 20 ms with holes of 0.2 s in each 4 s takes it."""
+    random = np.random.default_rng(7)
+    steps = random.integers(10, 21, 9000) * 1e-3
+    steps[::267] = 0.2
+    t = np.cumsum(steps)
+    t = t[t < late_leak.t[-1]]
+    channels = {name: np.interp(t, late_leak.t, values) for name, values in late_leak.channels.items()}
+    return replace(late_leak, t=t, channels=channels, rate=1.0 / 0.015)
+
+
+def balance_of(recording: Recording) -> RecordedBalance:
+    balance = VolumeBalance(load_rig("thesis")).balance(inspected(recording).part)
+    assert balance is not None
+    return balance
+
+
+def step_of(recording: Recording) -> tuple[float, float, float]:
+    """Estimate a step of the leak as a share of the flow, and its score and onset [s]."""
+    balance = balance_of(recording)
+    assert balance.test is not None
+    onset = balance.test.onset().value
+    return balance.test.fitted[0] * balance.mean_pressure(onset) / balance.mean_flow, balance.test.score, onset
+
+
+def test_a_poll_with_holes_gives_the_same_leak(late_leak: Recording, polled_leak: Recording) -> None:
+    """It was judged by its longest stretch without a hole, 4 s of 120 s."""
+    (share, score, onset), (polled_share, polled_score, polled_onset) = step_of(late_leak), step_of(polled_leak)
+    assert polled_share == pytest.approx(share, rel=0.06)
+    assert polled_score > 0.8 * score
+    assert polled_onset == pytest.approx(onset, abs=1.0)
+    rows = balance_of(polled_leak).blocks.rows
+    assert rows.mean() > 0.94 * rows.max()
+
+
+@pytest.mark.parametrize(("name", "every"), [("x", 50), ("p_A", 15), ("p_B", 50)])
+def test_a_channel_that_repeats_its_samples_gives_the_same_leak(late_leak: Recording, name: str, every: int) -> None:
+    """Samples held for 0.03 or 0.1 s: the mean delay of x was 50 ms."""
+    held = late_leak[name][np.arange(len(late_leak)) // every * every]
+    whole, diagnosis = diagnose(late_leak), diagnose(replace(late_leak, channels={**late_leak.channels, name: held}))
+    assert diagnosis.verdict == "leak"
+    assert diagnosis.relative.pump_share == pytest.approx(whole.relative.pump_share, rel=0.1)
+    (finding,) = (own for own in diagnosis.quality if own.code == "held_samples")
+    assert finding.channel == name
+    assert f"repeats each sample for {every / 500:.2g} s" in finding.text
+
+
+def test_rows_that_repeat_the_one_before_are_left_out(late_leak: Recording) -> None:
+    rows = np.arange(len(late_leak)) - (np.random.default_rng(3).random(len(late_leak)) < 0.07)
+    rows[0] = 0
+    repeated = replace(late_leak, channels={name: values[rows] for name, values in late_leak.channels.items()})
+    whole, diagnosis = diagnose(late_leak), diagnose(repeated)
+    assert diagnosis.relative.pump_share == pytest.approx(whole.relative.pump_share, rel=0.05)
+    assert any(own.code == "repeated_rows" for own in diagnosis.quality)
+
+
+def test_single_samples_that_leap_are_left_out(late_leak: Recording) -> None:
+    p_A = np.array(late_leak["p_A"])
+    p_A[[9000, 31_000]] = 0.0, 4e7
+    whole, diagnosis = diagnose(late_leak), diagnose(replace(late_leak, channels={**late_leak.channels, "p_A": p_A}))
+    assert diagnosis.relative.pump_share == pytest.approx(whole.relative.pump_share, rel=0.02)
+    assert next(own.count for own in diagnosis.quality if own.code == "spike") == 2
+
+
+@pytest.mark.parametrize("flow", ["omega", "q_pump"])
+def test_a_speed_without_a_sign_gets_it_from_the_motion(late_leak: Recording, flow: str) -> None:
+    """Displacement over area read several times the assumed one, and no leak was found."""
+    speed = late_leak["omega"] if flow == "omega" else late_leak["omega"] * load_rig("thesis").pump.q_b / (2 * np.pi)
+    channels = {name: late_leak[name] for name in ("x", "p_A", "p_B")} | {flow: speed}
+    signed = replace(late_leak, channels=channels, units=dict(late_leak.units) | {"q_pump": "m^3/s"})
+    unsigned = replace(signed, channels={**channels, flow: np.abs(speed)})
+    assert step_of(unsigned)[:2] == pytest.approx(step_of(signed)[:2], rel=0.05)
+    (finding,) = (own for own in inspected(unsigned).findings if own.code == "unsigned_speed")
+    assert "has no sign" in finding.text
+    assert not any(own.code == "unsigned_speed" for own in inspected(signed).findings)
+
+
+def test_without_a_position_the_command_gives_the_sign(late_leak: Recording) -> None:
+    unsigned = late_leak.only(("u", "omega", "p_A", "p_B"))
+    unsigned = replace(unsigned, channels={**unsigned.channels, "omega": np.abs(unsigned["omega"])})
+    part = inspected(unsigned).part
+    assert np.mean(np.sign(part["omega"]) == np.sign(late_leak["omega"])) > 0.95

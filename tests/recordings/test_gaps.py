@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from sealscope.recordings import CHANNEL_UNITS, Recording
-from sealscope.recordings.gaps import bridge, touched
+from sealscope.recordings.corrections.clock import even_clock
+from sealscope.recordings.corrections.gaps import bridge, holes, touched
 
 RATE, NOISE = 500.0, 1e3
 NEEDED = ("u", "p_A", "p_B")
@@ -64,22 +65,24 @@ def test_rows_that_a_logger_lost_come_back_at_their_times() -> None:
     kept = np.ones(len(whole), dtype=bool)
     kept[[5000, *range(9000, 9700)]] = False
     cut = replace(whole, t=whole.t[kept], channels={name: values[kept] for name, values in whole.channels.items()})
-    recording = bridge(cut, NEEDED)
+    recording = bridge(even_clock(cut), NEEDED)
     assert recording.bridged is not None
     assert np.array_equal(recording.bridged, ~kept)
     assert np.allclose(recording.t, whole.t, atol=1e-9)
     assert error(recording, whole, "p_A") < 2 * NOISE
 
 
-def test_without_a_cycle_only_a_short_gap_is_bridged() -> None:
+def test_without_a_cycle_a_line_joins_both_ends() -> None:
     whole = machine()
     walk = np.cumsum(np.random.default_rng(3).standard_normal((3, len(whole))), axis=1)
     whole = replace(whole, channels=dict(zip(NEEDED, walk, strict=True)))
     at = np.arange(len(whole))
-    recording = bridge(holed(whole, ((at >= 5000) & (at < 5010)) | ((at >= 9000) & (at < 9011))), NEEDED)
+    recording = bridge(holed(whole, ((at >= 5000) & (at < 5010)) | ((at >= 9000) & (at < 9050))), NEEDED)
     assert recording.bridged is not None
-    assert np.flatnonzero(recording.bridged).tolist() == list(range(5000, 5010))
-    assert np.isnan(recording["p_A"][9000:9011]).all()
+    assert np.flatnonzero(recording.bridged).tolist() == [*range(5000, 5010), *range(9000, 9050)]
+    line = np.linspace(whole["p_A"][8999], whole["p_A"][9050], 52)[1:-1]
+    assert np.allclose(recording["p_A"][9000:9050], line)
+    assert np.flatnonzero(holes(recording)).tolist() == [*range(9000, 9050)]  # longer than a tenth of a test function
 
 
 def test_a_cycle_is_not_taken_from_another_duty() -> None:
@@ -87,25 +90,72 @@ def test_a_cycle_is_not_taken_from_another_duty() -> None:
     first, second = machine(), machine(seed=1)
     at = np.arange(len(first))
     later = {name: np.where(at < 10_000, first[name], np.roll(second[name], 300)) for name in first.channels}
-    recording = holed(replace(first, channels=later), (at >= 10_000) & (at < 10_100))
-    assert bridge(recording, NEEDED) is recording
+    recording = bridge(holed(replace(first, channels=later), (at >= 10_000) & (at < 10_100)), NEEDED)
+    assert np.abs(np.diff(recording["p_A"][10_000:10_100], 2)).max() < 1e-6
 
 
 @pytest.mark.parametrize("share", [0.12, 0.5])
-def test_a_recording_of_gaps_is_not_bridged(share: float) -> None:
+def test_a_recording_of_short_gaps_is_bridged(share: float) -> None:
     whole = machine()
-    recording = holed(whole, np.random.default_rng(0).random(len(whole)) < share)
-    assert bridge(recording, NEEDED) is recording
+    recording = bridge(holed(whole, np.random.default_rng(0).random(len(whole)) < share), NEEDED)
+    assert np.isfinite(recording["p_A"][10:-10]).all()
+    assert not holes(recording).any()
 
 
-def test_infinity_is_a_missing_value_and_time_that_goes_back_stays() -> None:
+def test_infinity_is_a_missing_value() -> None:
     whole = machine()
-    p_A, t = np.array(whole["p_A"]), np.array(whole.t)
+    p_A = np.array(whole["p_A"])
     p_A[4000] = np.inf
-    t[8000:] -= 1.0
-    recording = bridge(replace(whole, t=t, channels={**whole.channels, "p_A": p_A}), NEEDED)
-    assert np.isfinite(recording["p_A"]).all()
-    assert np.array_equal(recording.t, t)
+    assert np.isfinite(bridge(replace(whole, channels={**whole.channels, "p_A": p_A}), NEEDED)["p_A"]).all()
+
+
+def cut(recording: Recording, kept: np.ndarray, t: np.ndarray | None = None) -> Recording:
+    t = recording.t if t is None else t
+    return replace(recording, t=t[kept], channels={name: values[kept] for name, values in recording.channels.items()})
+
+
+def test_late_and_repeated_rows_are_dropped() -> None:
+    whole = machine()
+    order = np.arange(len(whole))
+    order[8000:8003] = [8002, 8000, 8001]
+    recording = even_clock(cut(whole, np.insert(order, 500, 500)))
+    assert np.array_equal(np.flatnonzero(np.isnan(recording["p_A"])), [8000, 8001])
+    assert np.allclose(recording.t, whole.t, atol=1e-9)
+
+
+def test_of_two_recordings_in_one_file_the_longer_is_kept() -> None:
+    whole = machine()
+    at = np.arange(len(whole))
+    leapt = even_clock(replace(whole, t=whole.t + 3600.0 * (at >= 12_000)))
+    assert leapt.t[0] == pytest.approx(3624.0)
+    assert len(leapt) == len(whole) - 12_000
+    set_back = even_clock(replace(whole, t=whole.t - 20.0 * (at >= 12_000)))
+    assert len(set_back) == len(whole) - 12_000
+
+
+def test_an_uneven_clock_is_evened_and_its_holes_are_missing() -> None:
+    whole = machine(seconds=20.0)
+    random = np.random.default_rng(5)
+    steps = random.integers(10, 21, 1000) * 1e-3
+    steps[400] = 0.2
+    t = np.cumsum(steps)
+    t = t[t < 19.9]
+    taken = {name: np.interp(t, whole.t, values) for name, values in whole.channels.items()}
+    even = even_clock(Recording(t, taken, CHANNEL_UNITS, 1.0 / 0.015))
+    assert np.allclose(np.diff(even.t), 0.015)
+    missing = even.t[np.isnan(even["u"])]
+    assert missing.min() > t[399] - 1e-9
+    assert missing.max() < t[400]
+    known = np.isfinite(even["u"])
+    assert np.allclose(even["u"][known], 3 * np.sin(2 * np.pi * even.t[known] / 1.6), atol=6e-3)
+
+
+def test_many_gaps_cost_no_more_than_one() -> None:
+    """A file of bursts: each gap is as long as the recording of its burst, and the rows stay few."""
+    whole = machine()
+    at = np.arange(len(whole))
+    recording = even_clock(cut(whole, at, t=whole.t + 40.0 * (at // 10)))
+    assert len(recording) == 10
 
 
 def test_a_block_is_touched_by_more_than_a_hundredth() -> None:

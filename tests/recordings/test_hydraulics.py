@@ -61,6 +61,12 @@ def test_a_machine_passes(recording: Recording, names: tuple[str, ...] | None) -
     assert no_readings(recording if names is None else recording.only(names)) is None
 
 
+@pytest.mark.parametrize("rests", ["p_A", "p_B"])
+def test_one_chamber_may_rest_at_the_charge_pressure(rests: str) -> None:
+    recording = machine()
+    assert no_readings(put(recording, **{rests: 5e5 + 2e3 * np.random.default_rng(2).standard_normal(N)})) is None
+
+
 def under_load(recording: Recording, swing: float, omega: float) -> Recording:
     """A load that swings at `omega` [rad/s] in a closed loop: pressures of +-`swing` [Pa] beside those of friction."""
     pushed = swing * np.sin(omega * recording.t)
@@ -77,7 +83,8 @@ def test_a_machine_under_a_load_that_swings_passes(
 
 
 GARBAGE: dict[str, tuple[Callable[[Recording], Recording], str]] = {
-    "noise": (lambda r: put(r, p_A=3e5 + 5e4 * RANDOM.standard_normal(N)), "p_A is noise"),
+    "noise": (lambda r: put(r, p_A=3e5 + 5e4 * RANDOM.standard_normal(N)), "p_A - p_B is noise"),
+    "one chamber of noise": (lambda r: put(r, p_A=3e5 + RANDOM.standard_normal(N)).only(["u", "p_A"]), "p_A is noise"),
     "noisy copy": (lambda r: put(r, p_B=r["p_A"] + 4e3 * RANDOM.standard_normal(N)), "p_A - p_B is noise"),
     "copy": (lambda r: put(r, p_B=r["p_A"]), "p_B is a copy of p_A"),
     "ms labelled s": (lambda r: slower(r, 1e3), "the speed is 1e+03 times that at which the angle turns"),

@@ -16,11 +16,15 @@ import numpy as np
 
 from sealscope.diagnosis.learnt import Healthy, Learnt
 from sealscope.recordings.chambers import chambers_of
+from sealscope.recordings.corrections.clock import even_clock
+from sealscope.recordings.corrections.gaps import bridge, filled
+from sealscope.recordings.corrections.spikes import without_spikes
+from sealscope.recordings.corrections.stale import without_stale_samples
+from sealscope.recordings.corrections.unsigned import with_signed_speed
 from sealscope.recordings.formats.columns import counted, listed
-from sealscope.recordings.gaps import MOST_BRIDGED, bridge, filled
 from sealscope.recordings.hydraulics import lack_of_chambers, no_readings
 from sealscope.recordings.motion import runs_of
-from sealscope.recordings.quality import SHORTEST, Finding, Severity, inspect, uniform_segments
+from sealscope.recordings.quality import SHORTEST, Finding, Severity, inspect
 from sealscope.recordings.recording import Recording, remembered
 
 
@@ -28,9 +32,9 @@ from sealscope.recordings.recording import Recording, remembered
 class Inspection:
     """A recording as detectors see it.
 
-    `part`: its longest uniformly sampled stretch with no chamber pressure and no command missing, gaps bridged where
-    they can be (`recordings.gaps`); `findings` on the whole; `distrust`: why the chamber pressures cannot be trusted,
-    None where they can; `share` of the whole that the stretch is.
+    `part`: its samples on an even clock, from the first to the last with all chamber pressures and the command, as
+    `recordings.corrections` makes them; `findings` on the whole; `distrust`: why the chamber pressures cannot be
+    trusted, None where they can; `share` of the whole that the part is.
     """
 
     part: Recording
@@ -44,7 +48,7 @@ class Inspection:
         if lack := lack_of_chambers(self.part):
             return lack
         if len(self.part) < SHORTEST:
-            return f"needs {SHORTEST} samples or more without a gap, got {len(self.part)}"
+            return f"needs {SHORTEST} samples or more, got {len(self.part)}"
         return self.distrust
 
     @property
@@ -77,23 +81,28 @@ def _inspection(recording: Recording, names: Sequence[str]) -> Inspection:
     if "u" in part and not np.any(np.isfinite(part["u"])):  # `inspect` reports it; the pressures can do without
         part = part.only(name for name in part.channels if name != "u")
     needed = (*chambers, "u") if "u" in part else chambers
+    for correct in (without_spikes, without_stale_samples):
+        part, found = correct(part)
+        findings += found
+    count = len(part)
+    part = even_clock(part)
+    dropped = max(0, count - len(part))
+    part, found = with_signed_speed(part)
+    findings += found
     part = filled(bridge(part, needed), needed)
     if part.bridged is not None:
         rows = np.flatnonzero(part.bridged)
         text = (
-            f"{counted(rows.size, 'missing sample')} in {counted(len(runs_of(part.bridged)), 'gap')} bridged; blocks "
-            f"with more than {MOST_BRIDGED:.0%} of them are left out"
+            f"{counted(rows.size, 'missing sample')} in {counted(len(runs_of(part.bridged)), 'gap')} bridged: what a "
+            "long one touches counts less"
         )
         findings.append(Finding("gaps_bridged", "note", None, rows.size, float(part.t[rows[0]]), text))
-    stretches, count = uniform_segments(part, needed), len(part)
-    longest = max(stretches, key=lambda stretch: stretch.stop - stretch.start, default=slice(0, 0))
-    if longest.stop - longest.start < count:
-        part = part.samples(longest)
-        if stretches:
-            text = (
-                f"only the longest whole stretch was analysed: {part.t[0]:.4g} s to {part.t[-1]:.4g} s, {len(part)} of "
-                f"{count} samples"
-            )
+    known = np.flatnonzero(np.all([np.isfinite(part[name]) for name in needed], axis=0)) if needed else np.empty(0)
+    count = len(part) + dropped
+    if known.size < len(part) or dropped:
+        part = part.samples(slice(int(known[0]), int(known[-1]) + 1) if known.size else slice(0, 0))
+        if known.size:
+            text = f"analysed from {part.t[0]:.4g} s to {part.t[-1]:.4g} s: {len(part)} of {count} samples"
             findings.append(Finding("part_analysed", "warning", None, count - len(part), float(part.t[0]), text))
     wrong = [own for own in findings if own.channel in chambers and own.code in ("constant", "stuck")]
     lost = [own for own in findings if own.channel in chambers and own.code == "clipped" and own.count > len(part) / 2]

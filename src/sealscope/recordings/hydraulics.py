@@ -18,8 +18,9 @@ _COPY = 1e-6
 def no_readings(recording: Recording) -> str | None:
     """Return why pressures and speed are no readings of one machine, None where they may be.
 
-    White noise has third differences of 20 times its variance. Unit, zero and range of the pressures do not matter; a
-    constant or absent channel is no reason.
+    White noise has third differences of 20 times its variance. One chamber alone may rest at the charge pressure, as in
+    a lift: what drives a leak, p_A - p_B, must move. Unit, zero and range of the pressures do not matter; a constant or
+    absent channel is no reason.
     """
     names = [name for name in chambers_of(recording) if len(recording) > 3 and not constant(recording[name])]
     signals = {name: recording[name] for name in names}
@@ -37,10 +38,14 @@ def no_readings(recording: Recording) -> str | None:
             correlated = product >= _PRIORS["correlation"] * np.sqrt(square * float(omega @ omega)) > 0.0
             if correlated and not 1.0 / _PRIORS["misfit"] <= factor <= _PRIORS["misfit"]:
                 return f"the speed is {factor:.3g} times that at which the angle turns: is the unit of the time right?"
-    for name, values in signals.items():
-        if not np.mean(np.diff(values, 3) ** 2) <= 20.0 * _PRIORS["noise"] * np.var(values):
-            return f"{name} is noise: the machine's motion does not show in it"
+    driving = "p_A - p_B" if len(names) == 2 else next(iter(names), "")
+    if driving and _is_noise(signals[driving]):
+        return f"{driving} is noise: the machine's motion does not show in it"
     return None
+
+
+def _is_noise(values: Array) -> bool:
+    return not np.mean(np.diff(values, 3) ** 2) <= 20.0 * _PRIORS["noise"] * np.var(values)
 
 
 def _means(values: Array, every: int) -> Array:

@@ -38,10 +38,9 @@ _CLOCK, _HUM, _CREEP = (_PRIORS[table] for table in ("clock", "hum", "creep"))
 class Finding:
     """One thing that is wrong with a recording.
 
-    `code` names it; `severity` is ``fatal`` (the recording as a whole cannot be analysed as uniformly sampled;
-    `uniform_segments` gives the parts that can), ``warning`` (the channel needs a look before a verdict is believed) or
-    ``note``; `channel` is None for the time; `count`: samples or intervals concerned; `first_t`: where first [s];
-    `text`: a sentence.
+    `code` names it; `severity` is ``fatal`` (the recording cannot be analysed as it is), ``warning`` (the time or the
+    channel needs a look before a verdict is believed) or ``note``; `channel` is None for the time; `count`: samples or
+    intervals concerned; `first_t`: where first [s]; `text`: a sentence.
     """
 
     code: str
@@ -83,7 +82,7 @@ def inspect(recording: Recording) -> tuple[Finding, ...]:
     >>> t[400:] += 0.1
     >>> for finding in ss.inspect(ss.Recording(t, {"p_A": np.full(1000, 3e5)}, {"p_A": "Pa"}, rate=500.0)):
     ...     print(finding.severity, finding.code, "-", finding.text)
-    fatal gap - 1 gap, about 50 samples lost, the longest 0.102 s
+    warning gap - 1 gap, about 50 samples lost, the longest 0.102 s
     warning constant - p_A: is constant at 300000 Pa
     """
     with np.errstate(all="ignore"):
@@ -102,7 +101,7 @@ def _moment(recording: Recording, index: int) -> float | None:
 def _time_findings(recording: Recording) -> list[Finding]:
     t, findings, step = recording.t, list[Finding](), 1.0 / recording.rate
 
-    def add(code: str, where: NDArray[Any], text: str, severity: Severity = "fatal") -> None:
+    def add(code: str, where: NDArray[Any], text: str, severity: Severity = "warning") -> None:
         if where.size:
             findings.append(Finding(code, severity, None, where.size, _moment(recording, int(where[0])), text))
 
@@ -117,7 +116,7 @@ def _time_findings(recording: Recording) -> list[Finding]:
         typical = float(np.median(forward))
         if abs(typical / step - 1.0) > _CLOCK["rate"] and not (same.size and typical < 2.5 * step):
             text = f"time stamps tell {1.0 / typical:.6g} Hz, the recording's rate is {recording.rate:g} Hz"
-            add("rate_mismatch", known[:1], text)
+            add("rate_mismatch", known[:1], text, "fatal")
             step = typical
         gaps = np.flatnonzero(steps > _GAP * step)
         lost = np.round(steps[gaps] / step - 1.0).sum()
@@ -131,7 +130,7 @@ def _time_findings(recording: Recording) -> list[Finding]:
                 (steps > 0) & (steps <= _GAP * step) & (np.abs(steps / step - 1.0) > _CLOCK["scatter"])
             )
             text = f"intervals scatter by {100 * scatter:.0f} % of the sampling step"
-            add("irregular_sampling", known[odd], text, "fatal" if scatter > _CLOCK["unusable"] else "warning")
+            add("irregular_sampling", known[odd], text)
     if len(recording) < SHORTEST:
         text = f"{counted(len(recording), 'sample')}; the slowest detail needs {SHORTEST}"
         findings.append(Finding("too_short", "warning", None, len(recording), None, text))
@@ -236,13 +235,13 @@ def uniform_segments(recording: Recording, channels: Sequence[str] | None = None
     whole = np.isfinite(recording.t)
     for name in (name for name in recording.channels if name not in SLOW) if channels is None else channels:
         whole = whole & np.isfinite(recording[name])
-    joined = whole[1:] & whole[:-1] & even_steps(recording)
+    joined = whole[1:] & whole[:-1] & _even_steps(recording)
     starts = np.flatnonzero(whole & np.r_[True, ~joined][:count])
     stops = np.flatnonzero(whole & np.r_[~joined, True][-count:]) + 1 if count else starts
     return [slice(int(a), int(b)) for a, b in zip(starts, stops, strict=True)]
 
 
-def even_steps(recording: Recording) -> NDArray[np.bool_]:
+def _even_steps(recording: Recording) -> NDArray[np.bool_]:
     """Return which intervals (n - 1,) lie between half and one and a half steps of the recording's rate."""
     with np.errstate(invalid="ignore"):
         steps = np.diff(recording.t) * recording.rate

@@ -75,7 +75,7 @@ class Recording:
     history : tuple of str, optional
         One line for each processing step.
     bridged : array_like of bool, shape (n,), optional
-        Rows whose values were missing and are interpolated (`recordings.gaps`); None where there are none.
+        Rows whose values were missing and are interpolated (`recordings.corrections`); None where there are none.
 
     Raises
     ------

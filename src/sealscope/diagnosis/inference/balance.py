@@ -6,7 +6,6 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sealscope.control.drive import Drive
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, Weighting, solve
@@ -21,11 +20,11 @@ from sealscope.diagnosis.inference.terms import (
     Signals,
     equations,
 )
-from sealscope.diagnosis.inference.weak_form import OVERLAP, SPAN, STRIDE, rows, stride_samples
+from sealscope.diagnosis.inference.weak_form import OVERLAP, SPAN, STRIDE, rows, stride_samples, weights_beside_holes
 from sealscope.diagnosis.inference.zero import about_zero
 from sealscope.diagnosis.priors import priors
 from sealscope.recordings.channels import flow_source
-from sealscope.recordings.gaps import long_gaps
+from sealscope.recordings.corrections.gaps import holes
 from sealscope.recordings.quality import clipped
 from sealscope.recordings.recording import Array, Recording
 from sealscope.storage.plain_state import array_of, part_of, plain_array
@@ -40,6 +39,8 @@ SHORTEST: float = _BLOCKS["shortest"]
 #: Turns by which the terms are taken about a zero of p_A - p_B, and how near to it they are, as a share of what is
 #: believed of one: a root is not linear in it, nor is which side carries.
 TURNS, NEAR = 2, 3.0
+#: The name of the samples that are 1 in a hole that was bridged, else 0; absent where there is none.
+HOLE = "hole"
 #: Samples whose increments are computed at once: they stay in the processor's cache.
 AT_ONCE = 8192
 
@@ -174,19 +175,19 @@ class BlockStream:
             self._zeros = {name: _gauge_to_absolute(samples[name][early]) for name in ("p_A", "p_B") if name in samples}
         each = max(1, AT_ONCE // length)
         cuts = [self._cut(samples, k, min(k + each, end)) for k in range(first, end, each)]
-        whole = np.concatenate([cut.whole for cut in cuts])
-        values = [np.concatenate(of)[whole] for of in zip(*(cut.rows for cut in cuts), strict=True)]
+        weights = np.concatenate([cut.weights for cut in cuts])
+        counted, roots = weights > 0.0, np.sqrt(weights[weights > 0.0])[:, None]
+        values = [np.concatenate(of)[counted] * roots for of in zip(*(cut.rows for cut in cuts), strict=True)]
         self._signs = self._signs or self._oriented(values)
         for own, columns, sign in zip(values, self.columns, self._signs, strict=True):
             own[:, columns.left] *= sign
-        weights = whole.reshape(-1, self._strides).sum(axis=1)
-        gram = self._weighting.close(values, np.cumsum(weights))
+        gram = self._weighting.close(values, np.cumsum(counted.reshape(-1, self._strides).sum(axis=1)))
         index = np.arange(first, end, dtype=float)
         start = self._begin + (index * self._strides + 0.5 * SPAN) * (self._stride / self._rate)
         last = start + (self._strides - 1) * self._stride / self._rate
         flow, pressures = (np.concatenate([getattr(cut, name) for cut in cuts]) for name in ("flow", "pressures"))
         zeros = np.full(end - first, self._zero)
-        return Blocks(start, last, gram, weights.astype(float), flow, pressures, zeros)
+        return Blocks(start, last, gram, weights.reshape(-1, self._strides).sum(axis=1), flow, pressures, zeros)
 
     def _cut(self, samples: Mapping[str, Array], first: int, end: int) -> _Cut:
         """Return the rows of blocks `first` to `end`."""
@@ -211,14 +212,18 @@ class BlockStream:
         known = np.isfinite(rate)
         flow = np.where(known, rate, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
         parts = np.array([distribution(own, self._rate) for own in pressure])
-        return _Cut(tuple(cut_rows), whole, flow, parts)
+        beside = weights_beside_holes(cut[HOLE][inner.start : inner.stop + 1], self._rate) if HOLE in cut else 1.0
+        return _Cut(tuple(cut_rows), np.where(whole, beside, 0.0), flow, parts)
 
 
 class _Cut(NamedTuple):
-    """Rows (r, m) of each equation, whether each is `whole` (r,), and `Blocks.flow` and `Blocks.pressures`."""
+    """Rows (r, m) of each equation, the weight of each (r,), and `Blocks.flow` and `Blocks.pressures`.
+
+    A row counts as a share of one that no hole touches, and not at all where a sample is missing.
+    """
 
     rows: tuple[Array, ...]
-    whole: NDArray[np.bool_]
+    weights: Array
     flow: Array
     pressures: Array
 
@@ -258,12 +263,21 @@ def _gauge_to_absolute(pressure: Array) -> float:
 
 
 def whole_samples(recording: Recording, names: Collection[str]) -> dict[str, Array]:
-    """Return the samples of channels, NaN in `long_gaps` and where a pressure is cut off at an end of its range."""
-    samples, gaps = {}, long_gaps(recording)
+    """Return the samples of channels, NaN in `holes` and where a pressure is cut off at an end of its range."""
+    samples = bridged_samples(recording, names)
+    gaps = samples.pop(HOLE, np.zeros(0)) > 0.0
+    return {name: np.where(gaps, np.nan, values) for name, values in samples.items()} if gaps.any() else samples
+
+
+def bridged_samples(recording: Recording, names: Collection[str]) -> dict[str, Array]:
+    """Return the samples of channels, NaN where a pressure is cut off at an end of its range; `HOLE`: 1 in `holes`."""
+    samples, gaps = {}, holes(recording)
+    if gaps.any():
+        samples[HOLE] = gaps.astype(float)
     for name in recording.channels:
         if name not in names:
             continue
-        values = np.where(gaps, np.nan, recording[name]) if gaps.any() else recording[name]
+        values = recording[name]
         rails = [rail.value for rail in clipped(values[np.isfinite(values)])] if name.startswith("p_") else []
         samples[name] = np.where(np.isin(values, rails), np.nan, values) if rails else values
     return samples
@@ -311,7 +325,7 @@ def blocks_of(recording: Recording, rig: Rig) -> tuple[Blocks, Blocks, tuple[Col
         return None
     needed = {"x", "p_A", "p_B", str(flow_source(names))}
     needed |= {name for balance in balances for term in balance.terms for name in term.needs}
-    samples = whole_samples(recording, needed)
+    samples = bridged_samples(recording, needed)
     if balances[0].by_command:
         samples = commanded(samples, rig, recording.rate)
     seconds = min(LONGEST, max(SHORTEST, recording.duration / _BLOCKS["wanted"]))

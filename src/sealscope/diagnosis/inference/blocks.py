@@ -53,7 +53,7 @@ class Blocks:
         Sums of the products, over the rows' variances, of the m columns over the rows of each of E equations, the left
         side last.
     rows : array of float, shape (K,)
-        Number of rows that no missing sample touches.
+        Number of rows that no missing sample touches; beside a hole a row counts as a share.
     flow : array of float, shape (K,)
         Mean size of the left side's rate [m^3/s].
     pressures : array of float, shape (K, p)

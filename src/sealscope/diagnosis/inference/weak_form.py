@@ -26,6 +26,8 @@ from sealscope.recordings.recording import Array
 #: Distance of neighbouring test functions [s], and how many of these distances a test function spans.
 STRIDE = 0.125
 SPAN = 4
+#: A row of which holes leave less tells nothing.
+LEAST_WEIGHT = 0.1
 #: Sums of increments beyond it are no values of a sensor: their squares would overflow.
 LARGEST = 1e100
 
@@ -105,3 +107,22 @@ def rows(increments: Sequence[Array], rate: float, start: float = 0.0) -> Rows:
         touched |= missing[piece : piece + count]
     time: Array = start + (np.arange(count, dtype=float) + 0.5 * SPAN) * stride / rate
     return Rows(time, values, ~touched)
+
+
+def weights_beside_holes(holes: Array, rate: float) -> Array:
+    """Compute the weight of each row beside bridged holes, the share of its test function that lies in none.
+
+    Parameters
+    ----------
+    holes : array of float, shape (n,)
+        1 for a sample in a hole, else 0.
+    rate : float
+        Sampling rate [Hz].
+
+    Returns
+    -------
+    array of float, shape (r,)
+        1 for a row that no hole touches, falling to 0 for one that holes leave less than `LEAST_WEIGHT` of.
+    """
+    weights = 1.0 - rows([np.maximum(holes[1:], holes[:-1]) / rate], rate).values[:, 0]
+    return np.where(weights < LEAST_WEIGHT, 0.0, np.minimum(weights, 1.0))

@@ -14,8 +14,8 @@ import numpy as np
 
 from sealscope.diagnosis.priors import priors
 from sealscope.recordings.chambers import CHAMBERS, chambers_of
+from sealscope.recordings.corrections.gaps import touched
 from sealscope.recordings.cycle import find_cycle
-from sealscope.recordings.gaps import touched
 from sealscope.recordings.motion import ROUNDING
 from sealscope.recordings.quality import mostly_clipped
 from sealscope.recordings.recording import Array, Recording

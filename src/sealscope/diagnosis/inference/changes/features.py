@@ -7,7 +7,7 @@ the operator's, the noise stands above the ringing, which a leak damps, and in p
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
@@ -37,7 +37,10 @@ def duty_tests(recording: Recording) -> list[StepTest]:
     sizes = []
     for names in (COMMANDS, MOTIONS):
         if name := next((own for own in names if own in recording), None):
-            low, high = np.nanpercentile(_blocks(recording, length)[name], [2.0, 98.0], axis=1)
+            values = _blocks(recording, length)[name]
+            if not np.isfinite(values).any(axis=1).all():
+                return []
+            low, high = np.nanpercentile(values, [2.0, 98.0], axis=1)
             sizes.append(np.log(high - low))
     tests = [_test(recording, own, length) for own in sizes]
     return [test for test in tests if test is not None] if None not in tests else []
@@ -69,9 +72,9 @@ def _features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[str, A
         # whether p_A - p_B goes with the flow into A (1) or against it (-1): friction takes work
         flow = blocks[name] if name in ("omega", "u") else np.gradient(blocks[name], axis=1)
         difference = p_A - p_B - np.nanmean(p_A - p_B)
-        yield "sense of p_A - p_B", np.sign(np.nanmean(difference * flow, axis=1))
+        yield "sense of p_A - p_B", np.sign(_of_rows(np.nanmean, difference * flow))
     # the median square, for a jump at a reversal is no noise
-    own, other = (np.log(np.nanmedian(np.diff(p, ORDER, axis=1) ** 2, axis=1)) for p in (p_A, p_B))
+    own, other = (np.log(_of_rows(np.nanmedian, np.diff(p, ORDER, axis=1) ** 2)) for p in (p_A, p_B))
     yield "noise of the pressures", own + other
     yield "noise of p_A beside that of p_B", own - other
     length = p_A.shape[1] // 2
@@ -84,6 +87,14 @@ def _features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[str, A
             power = np.log((np.abs((values - values.mean(axis=2, keepdims=True)) @ window) ** 2).mean(axis=1))
             # a line over what is beside it: ringing is wider
             yield f"hum of {hertz:g} Hz", power[:, 0] - power[:, 1:].mean(axis=1)
+
+
+def _of_rows(statistic: Callable[..., Array], values: Array) -> Array:
+    """Compute a statistic of the known values of each row (K, n); NaN for a row without any."""
+    known = np.isfinite(values).any(axis=1)
+    results = np.full(len(values), np.nan)
+    results[known] = statistic(values[known], axis=1)
+    return results
 
 
 def _test(recording: Recording, values: Array, length: int) -> StepTest | None:

@@ -1,10 +1,10 @@
 """Gaps in a recording: short ones are bridged and marked, so that what lies on both sides of them can be analysed.
 
-A gap is a run of rows without a value of a needed channel, or rows that a logger has lost (its time stamps show them).
-How it is bridged depends on its length: up to `SPLINE` samples by a cubic spline; where the duty repeats, by the
-channel's own values whole cycles before or after, shifted evenly so that both ends meet; up to `LINE_SECONDS` by a
-straight line. A longer gap stays. What is bridged is no reading: `Recording.bridged` marks it, and a detector leaves
-out the blocks that are `touched`.
+A gap is a run of rows without a value of a needed channel, or rows that a logger has lost (`corrections.clock`). How it
+is bridged depends on its length: up to `SPLINE` samples by a cubic spline; where the duty repeats, by the channel's own
+values whole cycles before or after, shifted evenly so that both ends meet; else by a straight line. What is bridged is
+no reading: `Recording.bridged` marks it. The balance gives less weight to what a hole touches (`holes`); other
+detectors leave out the blocks that are `touched`.
 """
 
 from __future__ import annotations
@@ -18,17 +18,18 @@ from numpy.typing import NDArray
 
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.channels import Array
+from sealscope.recordings.corrections.clock import NEAR
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.motion import runs_of
-from sealscope.recordings.quality import even_steps, uniform_segments
+from sealscope.recordings.quality import uniform_segments
 from sealscope.recordings.recording import Recording
 from sealscope.storage.toml_file import priors_of
 
 Flags = NDArray[np.bool_]
 
-#: Longest gaps that are bridged: by a spline [samples], by a line [s], by other cycles (share of the recording); and
-#: largest share of a recording that all gaps together may be.
-SPLINE, LINE_SECONDS, LONGEST_SHARE = 3, 0.02, 0.1
+#: Longest gaps that are bridged by a spline [samples] and by other cycles (share of the recording).
+SPLINE, LONGEST_SHARE = 3, 0.1
+_GAPS = priors_of("sealscope.recordings")["gaps"]
 #: A block may hold this share of bridged samples: they move its sums by less than its own scatter.
 MOST_BRIDGED = 0.01
 #: Samples whose mean on either side of a gap sets the shift of another cycle.
@@ -40,43 +41,37 @@ _SLACK = 2
 
 
 def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
-    """Return the recording with gaps of the `needed` channels bridged where they can be; the same where none is.
+    """Return the recording with gaps of the `needed` channels bridged but for those at its ends; the same without any.
 
-    Rows that were lost come back; in bridged rows every other channel is bridged as well. Values that were recorded
-    stay as they are.
+    In bridged rows every other channel is bridged as well. Values that were recorded stay as they are. The clock is
+    even (`corrections.clock.even_clock`).
     """
-    whole = _with_lost_rows(recording)
-    known = np.all([np.isfinite(whole[name]) for name in needed], axis=0)
-    if not len(whole) or known.all() or not known.any():
+    known = np.all([np.isfinite(recording[name]) for name in needed], axis=0)
+    if not len(recording) or known.all() or not known.any():
         return recording
-    joined = even_steps(whole)
-    channels = {name: np.where(np.isfinite(values), values, np.nan) for name, values in whole.channels.items()}
-    stretches = uniform_segments(whole, needed)
+    channels = {name: np.where(np.isfinite(values), values, np.nan) for name, values in recording.channels.items()}
+    stretches = uniform_segments(recording, needed)
     longest = max(stretches, key=lambda stretch: stretch.stop - stretch.start, default=None)
-    cycle = None if longest is None else find_cycle(whole.samples(longest).only(needed))
-    bridged, by_spline = np.zeros(len(whole), dtype=bool), np.zeros(len(whole), dtype=bool)
+    cycle = None if longest is None else find_cycle(recording.samples(longest).only(needed))
+    bridged, by_spline, by_line = np.zeros((3, len(recording)), dtype=bool)
     for first, length in runs_of(~known).tolist():
         stop = first + length
-        if first == 0 or stop == len(whole) or not joined[first - 1 : stop].all():
+        if first == 0 or stop == len(recording):
             continue
+        bridged[first:stop] = True
         if length <= SPLINE:
             by_spline[first:stop] = True
-        elif length > LONGEST_SHARE * len(whole):
             continue
-        elif cycle is not None and _from_other_cycle(channels, needed, first, stop, cycle * whole.rate):
-            bridged[first:stop] = True
-        elif length <= LINE_SECONDS * whole.rate:
-            for values in channels.values():
-                _line(values, first, stop)
-            bridged[first:stop] = True
-    if by_spline.any():
-        for values in channels.values():
-            _spline(values, by_spline)
-    bridged |= by_spline
-    if not bridged.any() or np.mean(bridged) > LONGEST_SHARE:
+        repeats = 0.0 if cycle is None or length > LONGEST_SHARE * len(recording) else cycle * recording.rate
+        if not (repeats and _from_other_cycle(channels, needed, first, stop, repeats)):
+            by_line[first:stop] = True
+    for values in channels.values():
+        _spline(values, by_spline)
+        _line(values, by_line)
+    if not bridged.any():
         return recording
     note = f"{np.count_nonzero(bridged)} samples in {len(runs_of(bridged))} gaps bridged"
-    return replace(whole, channels=channels, bridged=bridged, history=(*whole.history, note))
+    return replace(recording, channels=channels, bridged=bridged, history=(*recording.history, note))
 
 
 def filled(recording: Recording, needed: Sequence[str]) -> Recording:
@@ -85,7 +80,7 @@ def filled(recording: Recording, needed: Sequence[str]) -> Recording:
     Those of positions, angles, speeds and flows while a mass moves on evenly, as a slower sensor leaves between its
     samples; those of pressures up to `SPLINE` samples.
     """
-    motion = priors_of("sealscope.recordings")["gaps"]["motion"] * recording.rate
+    motion = _GAPS["motion"] * recording.rate
     channels: dict[str, Array] = {}
     for name, values in recording.channels.items():
         missing = ~np.isfinite(values)
@@ -109,31 +104,14 @@ def touched(recording: Recording, bounds: Array | NDArray[np.integer]) -> Flags:
     return np.asarray(counts > MOST_BRIDGED * np.diff(bounds))
 
 
-def long_gaps(recording: Recording) -> Flags:
-    """Return which rows (n,) lie in bridged gaps of more than `SPLINE` samples; a spline errs by no more than noise."""
+def holes(recording: Recording) -> Flags:
+    """Return which rows (n,) lie in bridged gaps of more than a tenth of a test function."""
     flags = np.zeros(len(recording), dtype=bool)
     if recording.bridged is not None:
+        seconds = max(_GAPS["hole"], NEAR / recording.rate)
         for first, length in runs_of(recording.bridged).tolist():
-            flags[first : first + length] = length > SPLINE
+            flags[first : first + length] = length + 1 > seconds * recording.rate
     return flags
-
-
-def _with_lost_rows(recording: Recording) -> Recording:
-    """Return the recording without untimed rows, with rows of NaN where the time stamps show that some were lost."""
-    if not np.isfinite(recording.t).all():
-        recording = recording.between(-math.inf, math.inf)
-    steps = np.round(np.diff(recording.t) * recording.rate)
-    lost = np.where((steps > 1) & (steps <= LONGEST_SHARE * len(recording)), steps - 1, 0).astype(np.int64)
-    if not lost.any():
-        return recording
-    at = np.arange(len(recording)) + np.concatenate([[0], np.cumsum(lost)])
-    count = int(at[-1]) + 1
-    t = np.interp(np.arange(count), at, recording.t)
-    channels = {}
-    for name, values in recording.channels.items():
-        channels[name] = np.full(count, np.nan)
-        channels[name][at] = values
-    return replace(recording, t=t, channels=channels)
 
 
 def _mean(values: Array) -> float:
@@ -183,11 +161,13 @@ def _copy(values: Array, first: int, stop: int, shift: int) -> None:
     own[np.isnan(own)] = other[np.isnan(own)]
 
 
-def _line(values: Array, first: int, stop: int) -> None:
-    own = values[first - 1 : stop + 1]
-    known = np.isfinite(own)
-    if known[0] and known[-1]:
-        own[~known] = np.interp(np.flatnonzero(~known), np.flatnonzero(known), own[known])
+def _line(values: Array, rows: Flags) -> None:
+    """Set the missing values of these rows to straight lines between the known ones."""
+    known = np.flatnonzero(np.isfinite(values))
+    missing = np.flatnonzero(rows & np.isnan(values))
+    if missing.size and known.size:
+        missing = missing[(missing > known[0]) & (missing < known[-1])]
+        values[missing] = np.interp(missing, known, values[known])
 
 
 def _spline(values: Array, rows: Flags) -> None:
