@@ -33,7 +33,9 @@ if TYPE_CHECKING:
     from sealscope.diagnosis.commissioned.summary import Summary
 
 #: Suffixes of files in a folder that are no recordings: Sealscope's own pages and settings, and notes.
-NO_RECORDINGS = frozenset({".toml", ".html", ".htm", ".pdf", ".png", ".svg", ".md", ".jsonl", ".part", ".bak"})
+NO_RECORDINGS = frozenset(
+    {".toml", ".lessons", ".html", ".htm", ".pdf", ".png", ".svg", ".md", ".jsonl", ".part", ".bak"}
+)
 #: How a trend, or a verdict, that was written beside the recordings begins.
 _WRITTEN = re.compile(rb'\s*\{\s*"(verdict|file)":|file,time[, ]')
 

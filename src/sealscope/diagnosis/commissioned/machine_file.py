@@ -1,39 +1,53 @@
-"""The file of a commissioned machine: TOML that people read, with all that a diagnosis compares with.
+"""The file of a commissioned machine: TOML that people read and edit, with its lessons in a file beside it.
 
 It is a rig's file, too: `[rig]`, `[motor]` and so on state what is known of it, `[map]` its channels. Beside them
-`[machine]` names it, `[learnt]` is what its healthy recordings say, for people to read, and each `[[healthy]]` is a
-recording: the checksum of its file, and what it has taught each method. `[[alarms]]` is what persons said of alarms.
+`[machine]` names it, `[learnt]` is what its healthy recordings say, for people to read, and each `[[healthy]]` names a
+recording and the checksum of what it has taught, its lesson in the file beside (`lessons_file`). `[[alarms]]` is what
+persons said of alarms.
+
+The lessons are written before the text, with those of the text that is there and of the one that is kept as `.bak`. So
+each text finds its lessons whenever a writer is killed.
 """
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PositiveFloat, create_model
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from sealscope.calls import checked_call
+from sealscope.diagnosis.commissioned.lessons_file import (
+    SUFFIX,
+    Line,
+    format_lesson,
+    make_table,
+    read_lessons,
+    read_lines,
+    write_lines,
+)
 from sealscope.diagnosis.commissioned.machine import CommissionedMachine, JudgedAlarm, Judgement
-from sealscope.diagnosis.learnt import Learnt
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
 from sealscope.parameters import Rig
 from sealscope.parameters.load import OF_MACHINES
 from sealscope.recordings.formats.columns import REST, check_call
-from sealscope.storage.atomic import atomic_write
+from sealscope.storage.atomic import atomic_write, check_folder
 from sealscope.storage.plain_values import as_type
-from sealscope.storage.toml_file import read_toml
+from sealscope.storage.toml_file import LARGEST, read_toml
 
-#: Largest file read [bytes]: some 10 kB a recording.
-LARGEST = 50_000_000
+#: What this version writes and reads.
+_FORMAT = 2
 _HEAD = """\
-# A machine commissioned by Sealscope: what its healthy recordings have taught. [machine], [map] and [rig] may be
-# edited; [learnt] is written anew with each change; [[healthy]] is what diagnoses compare with.
+# A machine commissioned by Sealscope. [machine], [map] and [rig] may be edited; [learnt] is written anew with each
+# change; a [[healthy]] is a recording that diagnoses compare with: without it, the recording is forgotten. What the
+# recordings have taught is in the file of lessons beside this one: move them together.
 """
 
 
@@ -44,73 +58,19 @@ def _moment(text: Any) -> float:
         raise ValueError("must be a time as ISO 8601 writes it") from None
 
 
-def _numbers(values: list[Any]) -> np.ndarray:
-    try:
-        array = np.array(values, dtype=float)
-    except (TypeError, OverflowError):
-        raise ValueError("must hold numbers in equal rows") from None
-    if not np.isfinite(array).all():
-        raise ValueError("must hold finite numbers")
-    return array
-
-
+#: A file's name, which leads to no other folder.
+_FILE_NAME = re.compile(r"[^/\\\0:]{1,200}\.lessons")
 _Moment = Annotated[float, BeforeValidator(_moment)]
-_Numbers = Annotated[Any, AfterValidator(_numbers)]
 
 
-def _table(extra: Literal["allow", "ignore"] = "ignore", **kinds: Any) -> Any:
-    """Return the type of a table by the types of its values, in a tuple with None where a value may be absent."""
-    config = ConfigDict(strict=True, allow_inf_nan=False, extra=extra)
-    fields = {name: kind if isinstance(kind, tuple) else (kind, ...) for name, kind in kinds.items()}
-    return create_model("Table", __config__=config, **fields)  # type: ignore[call-overload]
+def _check_format(number: int) -> int:
+    if number != _FORMAT:
+        raise ValueError(f"must be {_FORMAT}, got {number}: commission it anew")
+    return number
 
 
-def _with_sums_of_its_terms(lesson: Any) -> Any:
-    size = len(lesson.terms) + 1
-    if lesson.sums.ndim != 3 or lesson.sums.shape[1:] != (size, size):
-        raise ValueError(f"sums must be of the shape (E, {size}, {size}), got {lesson.sums.shape}")
-    return lesson
-
-
-_BALANCE = _table(
-    "allow",
-    terms=list[str],
-    scale=float,
-    sums=_Numbers,
-    flow=float,
-    pressure=float,
-    start_s=(float, None),
-    oil_degC=(float, None),
-)
-#: What Sealscope's own methods were taught; those of others are plain tables.
-_LESSONS = {
-    "volume balance": (Annotated[_BALANCE, AfterValidator(_with_sums_of_its_terms)], None),
-    "pressure response": (_table("allow", level=float), None),
-    "rms change": (
-        _table(
-            "allow",
-            chambers=list[str],
-            recorded=(list[str], None),
-            rate=float,
-            start_s=(float, None),
-            levels=_Numbers,
-            duty=_Numbers,
-        ),
-        None,
-    ),
-}
-_ABOUT = {"sha256": str, "pressure_bar": float, "oil_degC": float, "noise": dict[str, float], "wrong": list[str]}
-_HEALTHY = _table(
-    file=str,
-    digest=str,
-    units=dict[str, str],
-    rate=PositiveFloat,
-    seconds=PositiveFloat,
-    start_s=(Annotated[_Moment, Field(alias="start")], None),
-    lessons=_table("allow", **_LESSONS),
-    about=(_table("allow", **{name: (kind, None) for name, kind in _ABOUT.items()}), None),
-)
-_ALARM = _table(
+_HEALTHY = make_table(file=str, lesson=Annotated[str, Field(pattern="^[0-9a-f]{64}$")])
+_ALARM = make_table(
     alarm=str,
     mark=Judgement,
     date_s=Annotated[_Moment, Field(alias="date")],
@@ -118,8 +78,14 @@ _ALARM = _table(
     leak_lpm=(float, None),
     reason=(str, None),
 )
-_FILE = _table(
-    machine=_table(format=Literal[1], name=str, rate=(float, None), limit=(str, None), left_out=(list[str], None)),
+_FILE = make_table(
+    machine=make_table(
+        format=Annotated[int, AfterValidator(_check_format)],
+        name=str,
+        rate=(float, None),
+        limit=(str, None),
+        left_out=(list[str], None),
+    ),
     map=(dict[str, str], None),
     healthy=Annotated[list[_HEALTHY], Field(min_length=1)],  # type: ignore[valid-type]
     alarms=(list[_ALARM], None),  # type: ignore[valid-type]
@@ -161,21 +127,61 @@ def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) ->
     target = Path(path)
     if target.suffix.lower() != ".toml":
         raise InputError(f"a machine's file must end in .toml, got {target}")
-    text = _HEAD + "\n".join(_lines(_tree(machine))) + "\n"
+    check_folder(target)
+    taught = [format_lesson(learnt) for learnt in machine.healthy]
+    data = (_HEAD + "\n".join(_lines(_tree(machine, taught, target))) + "\n").encode()
+    if len(data) > LARGEST:
+        raise InputError(f"a machine's file must be at most {LARGEST} bytes, got {len(data)} ({target})")
+    backup, lines = target.with_suffix(".toml.bak"), {line.checksum: line for line in taught}
+    for text in (target, backup):
+        tree = _read_if_there(text)
+        named = set(_lessons_named(tree)) - lines.keys()
+        lines |= {line.checksum: line for line in read_lines(_lessons_path(text, tree), named)} if named else {}
+    write_lines(lines.values(), target.with_suffix(SUFFIX))
     if target.is_file():
-        with atomic_write(target.with_suffix(".toml.bak")) as temporary:
+        with atomic_write(backup) as temporary:
             temporary.write_bytes(target.read_bytes())
     with atomic_write(target) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_bytes(data)
     return target
 
 
-def _tree(machine: CommissionedMachine) -> dict[str, Any]:
-    """Return the tables of a machine's file."""
+def _read_if_there(path: Path) -> dict[str, Any]:
+    """Return the tables of a machine's text, none where it cannot be read."""
+    try:
+        return read_toml(path, "a machine's file", str(path))
+    except InputError:
+        return {}
+
+
+def _lessons_named(tree: Mapping[str, Any]) -> list[str]:
+    """Return the checksums of the lessons that a machine's text, valid or not, names."""
+    rows = tree.get("healthy")
+    checksums = [row.get("lesson") for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+    return [checksum for checksum in checksums if isinstance(checksum, str)]
+
+
+def _lessons_path(path: Path, tree: Mapping[str, Any]) -> Path:
+    """Return the file of lessons of a text: that of its name, or where there is none that which it states."""
+    beside, head = path.with_suffix(SUFFIX), tree.get("machine")
+    stated = head.get("lessons") if isinstance(head, dict) else None
+    if beside.exists() or not isinstance(stated, str) or _FILE_NAME.fullmatch(stated) is None:
+        return beside
+    return path.with_name(stated) if path.with_name(stated).exists() else beside
+
+
+def _tree(machine: CommissionedMachine, lines: Iterable[Line], path: Path) -> dict[str, Any]:
+    """Return the tables of a machine's file at `path`, whose lessons are these lines."""
     from importlib.metadata import version
 
     summary, columns, now = machine.summary, machine.channel_map, datetime.now(UTC).isoformat(timespec="seconds")
-    head = {"format": 1, "name": machine.name, "sealscope": version("sealscope"), "written": now}
+    head = {
+        "format": _FORMAT,
+        "name": machine.name,
+        "lessons": path.with_suffix(SUFFIX).name,
+        "sealscope": version("sealscope"),
+        "written": now,
+    }
     head |= {"rate": machine.rate, "limit": machine.limit, "left_out": machine.left_out or None}
     tree: dict[str, Any] = {"machine": head}
     if columns:
@@ -186,9 +192,7 @@ def _tree(machine: CommissionedMachine) -> dict[str, Any]:
     terms = {name: term._asdict() for name, term in summary.terms.items()}
     tree["learnt"] = {"problems": summary.problems, "noise": summary.noise, **smallest, "terms": terms}
     tree["healthy"] = [
-        {"file": own.file, "digest": own.digest, "rate": own.rate, "seconds": own.seconds}
-        | {"start": _stamp(own.start_s), "units": own.units, "about": own.about, "lessons": own.lessons}
-        for own in machine.healthy
+        {"file": learnt.file, "lesson": line.checksum} for learnt, line in zip(machine.healthy, lines, strict=True)
     ]
     tree["alarms"] = [
         {"alarm": own.alarm, "mark": own.mark, "date": _stamp(own.date_s), "onset": _stamp(own.onset_s)}
@@ -266,18 +270,27 @@ def load_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
     sealscope.errors.InputError: a machine's file must be readable, got: No such file or directory (absent.toml)
     """
     place = os.fspath(path)
-    tree = read_toml(Path(path), "a machine's file", place, LARGEST)
+    tree = read_toml(Path(path), "a machine's file", place)
     rig = {name: table for name, table in tree.items() if name not in OF_MACHINES and name != "map"}
     try:
         stated = as_type(_FILE, tree).model_dump(exclude_unset=True)
         head, columns = stated["machine"], stated.get("map", {})
         check_call(columns, head.get("rate"))
         RepairLimit.of(head.get("limit"))
+        files = {row["lesson"]: row["file"] for row in stated["healthy"]}
+        if len(files) < len(stated["healthy"]):
+            raise ValueError("healthy must name each lesson once")
     except ValueError as error:
         raise InputError(f"{error} ({place})") from None
+    lessons = _lessons_path(Path(path), tree)
+    if not lessons.exists():
+        rule = (
+            f"{lessons.name} must lie beside a machine's file, got none: move it there, or commission the machine anew"
+        )
+        raise InputError(f"{rule} ({place})")
     return CommissionedMachine(
         name=head["name"],
-        healthy=tuple(Learnt(**{"start_s": None, **row}) for row in stated["healthy"]),
+        healthy=tuple(read_lessons(lessons, files)),
         rig=Rig.from_dict(rig, place=place) if rig else None,
         channel_map=columns,
         rate=head.get("rate"),

@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from sealscope.diagnosis.commissioned.machine import JUDGEMENTS, JudgedAlarm
-from sealscope.diagnosis.commissioned.machine_file import LARGEST, load_machine, write_machine
+from sealscope.diagnosis.commissioned.machine_file import load_machine, write_machine
 from sealscope.errors import SealscopeError
 from sealscope.monitor.alarms import Alarm
 from sealscope.recordings.formats.timebase import counts_from_1970
@@ -32,7 +32,7 @@ def pass_on(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording]) -> 
     if mark not in JUDGEMENTS or path.suffix.lower() != ".toml":
         return ""
     try:
-        if "machine" not in read_toml(path, "a machine's file", rig, LARGEST):
+        if "machine" not in read_toml(path, "a machine's file", rig):
             return ""
         with _writing:
             shift = 0.0 if counts_from_1970(alarm.onset_s) else time.time() - alarm.updated_s
