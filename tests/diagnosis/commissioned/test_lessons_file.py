@@ -158,11 +158,26 @@ def test_each_text_keeps_its_lessons_whichever_file_was_written_last(pair, machi
     assert len(ss.load_machine(text.with_suffix(".toml.bak")).healthy) == 4
 
 
-def test_a_lesson_that_no_text_names_goes(pair, machine):
+def test_lessons_that_no_text_names_are_kept_for_its_copies_while_they_are_few(pair, machine, monkeypatch):
     text, lessons = pair
+    copy = text.with_name("before.toml")
+    copy.write_bytes(text.read_bytes())
     for _ in range(3):
         ss.write_machine(replace(machine, healthy=machine.healthy[:1]), text)
+    assert len(ss.load_machine(copy).healthy) == 4
+    monkeypatch.setattr(
+        "sealscope.diagnosis.commissioned.machine_file._SPARE", 2 * len(format_lesson(machine.healthy[0]).data)
+    )
+    ss.write_machine(replace(machine, healthy=machine.healthy[:1]), text)
     assert len(lessons.read_bytes().splitlines()) == 2
+
+
+def test_a_torn_line_is_a_lesson_that_is_missing(pair):
+    text, lessons = pair
+    data = lessons.read_bytes()
+    second = data.splitlines(keepends=True)[2]
+    lessons.write_bytes(data.replace(second, second[:40] + b"\n"))
+    assert "of run2.nc must be in the file of lessons" in refused(text)
 
 
 def altered(line: Line, change: str, value: object) -> Line:
@@ -193,9 +208,7 @@ HOSTILE = {
 
 @pytest.mark.parametrize("change", HOSTILE)
 def test_an_altered_lesson_with_the_right_checksum_is_refused_in_one_line(pair, change):
-    _, lessons = pair
-    first = lessons.read_bytes().splitlines()[1].split(b" ", 1)[0].decode()
-    (line,) = read_lines(lessons, {first})
+    line = read_lines(pair[1])[0]
     value, rule = HOSTILE[change]
     with pytest.raises(InputError) as caught:
         parse_lesson(altered(line, change, value), "run1.nc", "hostile.lessons")

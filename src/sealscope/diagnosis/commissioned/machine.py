@@ -65,6 +65,13 @@ class JudgedAlarm(NamedTuple):
         return f"{self.alarm} {self.mark} {_date(self.date_s)}{since}{self.reason and f' ({self.reason})'}".strip()
 
 
+class Origin(NamedTuple):
+    """The file that a machine was loaded from, and its parts then, by which changes of others are known."""
+
+    path: Path
+    parts: frozenset[str]
+
+
 def _is_taken_back(word: JudgedAlarm, later: Iterable[JudgedAlarm]) -> bool:
     """Whether a later word calls the alarm invalid; a new alarm of the same name begins after this word."""
     own = (each for each in later if each.alarm == word.alarm and each.onset_s <= word.date_s)
@@ -97,6 +104,8 @@ class CommissionedMachine:
         Recordings that could not be used, each with the reason.
     alarms : tuple of JudgedAlarm, optional
         What persons said of the monitor's alarms, and repairs.
+    origin : Origin, optional
+        The file that it was loaded from.
 
     Examples
     --------
@@ -113,6 +122,7 @@ class CommissionedMachine:
     limit: str | None = None
     left_out: tuple[str, ...] = ()
     alarms: tuple[JudgedAlarm, ...] = ()
+    origin: Origin | None = field(default=None, repr=False, compare=False)
 
     @cached_property
     def summary(self) -> Summary:

@@ -14,7 +14,8 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Iterable, Mapping
+import tomllib
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
@@ -25,25 +26,29 @@ from pydantic import AfterValidator, BeforeValidator, Field
 from sealscope.calls import checked_call
 from sealscope.diagnosis.commissioned.lessons_file import (
     SUFFIX,
-    Line,
     format_lesson,
     make_table,
     read_lessons,
     read_lines,
     write_lines,
 )
-from sealscope.diagnosis.commissioned.machine import CommissionedMachine, JudgedAlarm, Judgement
+from sealscope.diagnosis.commissioned.machine import CommissionedMachine, JudgedAlarm, Judgement, Origin
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
 from sealscope.parameters import Rig
 from sealscope.parameters.load import OF_MACHINES
 from sealscope.recordings.formats.columns import REST, check_call
 from sealscope.storage.atomic import atomic_write, check_folder
+from sealscope.storage.folders import locked
 from sealscope.storage.plain_values import as_type
 from sealscope.storage.toml_file import LARGEST, read_toml
 
-#: What this version writes and reads.
-_FORMAT = 2
+#: What this version writes and reads; names in [machine] that are written anew with each change.
+_FORMAT, _REWRITTEN = 2, ("sealscope", "written", "lessons")
+#: Lessons that neither text names are kept while the file is smaller [bytes].
+_SPARE = 5_000_000
+#: Longest wait for another process that writes [s], and what is said then.
+_LONGEST_WAIT, _BUSY = 60.0, "a machine's file must be free to be written, got another process that writes it ({})"
 _HEAD = """\
 # A machine commissioned by Sealscope. [machine], [map] and [rig] may be edited; [learnt] is written anew with each
 # change; a [[healthy]] is a recording that diagnoses compare with: without it, the recording is forgotten. What the
@@ -96,6 +101,8 @@ _FILE = make_table(
 def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) -> Path:
     """Write a machine's file: whole under its name, or not at all; one that is there is kept, as `.toml.bak`.
 
+    A link is written through. Its lessons are written beside it, as `.lessons`.
+
     Parameters
     ----------
     machine : CommissionedMachine
@@ -111,7 +118,8 @@ def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) ->
     Raises
     ------
     InputError
-        The path does not end in .toml, or cannot be written.
+        The path does not end in .toml, or cannot be written, or writing would undo what another has changed since the
+        machine was loaded.
 
     Examples
     --------
@@ -124,26 +132,112 @@ def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) ->
     ...     ss.load_machine(path)
     <CommissionedMachine machine: 1 healthy recording>
     """
-    target = Path(path)
+    target = _resolve(path)
+    with locked(_lock_of(target), _BUSY.format(target), _LONGEST_WAIT):
+        if machine.origin is not None and machine.origin.path == target and target.exists():
+            change = _change_since(machine.origin, _parts(_read(target)), _parts(_tree_of(machine, target)))
+            if change is not None:
+                raise InputError(f"a machine's file must be as it was read, got {change}: load it again ({target})")
+        _write(machine, target)
+    return Path(path)
+
+
+def update_machine(
+    path: str | os.PathLike[str], change: Callable[[CommissionedMachine], CommissionedMachine]
+) -> CommissionedMachine:
+    """Read, change and write a machine's file, so that nothing which another process writes meanwhile is lost.
+
+    `change` is called once, and once more where the file has changed meanwhile; nobody waits for the first call. Raises
+    InputError as `load_machine`, `write_machine` and `change` do; then the file stays as it was.
+    """
+    target = _resolve(path)
+    machine = load_machine(target)
+    changed = change(machine)
+    with locked(_lock_of(target), _BUSY.format(target), _LONGEST_WAIT):
+        if machine.origin != Origin(target, frozenset(_parts(_read(target)))):
+            changed = change(load_machine(target))
+        _write(changed, target)
+    return changed
+
+
+def _resolve(path: str | os.PathLike[str]) -> Path:
+    """Return the file to write that a path leads to, through links; InputError where it does not end in .toml."""
+    target = _follow(path)
     if target.suffix.lower() != ".toml":
         raise InputError(f"a machine's file must end in .toml, got {target}")
     check_folder(target)
-    taught = [format_lesson(learnt) for learnt in machine.healthy]
-    data = (_HEAD + "\n".join(_lines(_tree(machine, taught, target))) + "\n").encode()
+    return target
+
+
+def _follow(path: str | os.PathLike[str]) -> Path:
+    """Return the file that a path leads to, through links; InputError where they end in a circle."""
+    try:
+        return Path(path).resolve()
+    except (OSError, RuntimeError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error).partition(" from ")[0]
+        raise InputError(f"a machine's file must be readable, got: {reason} ({os.fspath(path)})") from None
+
+
+def _lock_of(target: Path) -> Path:
+    return target.with_name(f".{target.name}.lock")
+
+
+def _write(machine: CommissionedMachine, target: Path) -> None:
+    """Write lessons, kept text and text, in this order: each text finds its lessons after any of them."""
+    taught, data = [format_lesson(learnt) for learnt in machine.healthy], _format_text(machine, target)
     if len(data) > LARGEST:
         raise InputError(f"a machine's file must be at most {LARGEST} bytes, got {len(data)} ({target})")
     backup, lines = target.with_suffix(".toml.bak"), {line.checksum: line for line in taught}
-    for text in (target, backup):
-        tree = _read_if_there(text)
-        named = set(_lessons_named(tree)) - lines.keys()
-        lines |= {line.checksum: line for line in read_lines(_lessons_path(text, tree), named)} if named else {}
-    write_lines(lines.values(), target.with_suffix(SUFFIX))
+    texts = [(path, _read_if_there(path)) for path in (target, backup)]
+    present = {line.checksum: line for path, tree in texts for line in read_lines(_lessons_path(path, tree))}
+    for checksum in (checksum for _, tree in texts for checksum in _lessons_named(tree) if checksum in present):
+        lines.setdefault(checksum, present[checksum])
+    size = sum(len(line.data) for line in lines.values())
+    for checksum, line in present.items():  # of texts that were renamed or copied
+        if checksum not in lines and (size := size + len(line.data)) < _SPARE:
+            lines[checksum] = line
+    write_lines([*lines.values()], target.with_suffix(SUFFIX))
     if target.is_file():
         with atomic_write(backup) as temporary:
             temporary.write_bytes(target.read_bytes())
     with atomic_write(target) as temporary:
         temporary.write_bytes(data)
-    return target
+
+
+def _format_text(machine: CommissionedMachine, target: Path) -> bytes:
+    return (_HEAD + "\n".join(_lines(_tree(machine, target))) + "\n").encode()
+
+
+def _tree_of(machine: CommissionedMachine, target: Path) -> dict[str, Any]:
+    """Return the tables of a machine's text as they are read again."""
+    return tomllib.loads(_format_text(machine, target).decode())
+
+
+def _parts(tree: Mapping[str, Any]) -> dict[str, str]:
+    """Return what a machine's text holds that another process may add or take away: each in JSON, and its name."""
+    head = {name: value for name, value in tree["machine"].items() if name not in _REWRITTEN}
+    stated = {name: table for name, table in tree.items() if name not in OF_MACHINES}
+    parts = {json.dumps([head, stated], sort_keys=True, default=str): "another statement of the machine"}
+    parts |= {json.dumps(row["lesson"]): f"another recording, {row['file']}" for row in tree["healthy"]}
+    alarms = tree.get("alarms", ())
+    return parts | {json.dumps(row, sort_keys=True): f"another mark of {row['alarm']}" for row in alarms}
+
+
+def _change_since(origin: Origin, present: Mapping[str, str], own: Mapping[str, str]) -> str | None:
+    """Name something that was added to, or taken from, a machine's file and that writing would undo; None for nothing.
+
+    `present`: parts of the file; `own`: parts of the machine to be written, which was read with those of `origin`.
+    """
+    added = [name for part, name in present.items() if part not in origin.parts and part not in own]
+    taken = [name for part, name in own.items() if part in origin.parts and part not in present]
+    return next(iter((*added, *taken)), None)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """Return the tables of a machine's text, checked but for its rig; InputError where one breaks a rule."""
+    tree = read_toml(path, "a machine's file", str(path))
+    _stated_in(tree, str(path))
+    return tree
 
 
 def _read_if_there(path: Path) -> dict[str, Any]:
@@ -170,8 +264,8 @@ def _lessons_path(path: Path, tree: Mapping[str, Any]) -> Path:
     return path.with_name(stated) if path.with_name(stated).exists() else beside
 
 
-def _tree(machine: CommissionedMachine, lines: Iterable[Line], path: Path) -> dict[str, Any]:
-    """Return the tables of a machine's file at `path`, whose lessons are these lines."""
+def _tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
+    """Return the tables of a machine's file at `path`."""
     from importlib.metadata import version
 
     summary, columns, now = machine.summary, machine.channel_map, datetime.now(UTC).isoformat(timespec="seconds")
@@ -191,9 +285,7 @@ def _tree(machine: CommissionedMachine, lines: Iterable[Line], path: Path) -> di
     smallest = {} if summary.smallest is None else {"smallest_leak": summary.smallest._asdict()}
     terms = {name: term._asdict() for name, term in summary.terms.items()}
     tree["learnt"] = {"problems": summary.problems, "noise": summary.noise, **smallest, "terms": terms}
-    tree["healthy"] = [
-        {"file": learnt.file, "lesson": line.checksum} for learnt, line in zip(machine.healthy, lines, strict=True)
-    ]
+    tree["healthy"] = [{"file": learnt.file, "lesson": format_lesson(learnt).checksum} for learnt in machine.healthy]
     tree["alarms"] = [
         {"alarm": own.alarm, "mark": own.mark, "date": _stamp(own.date_s), "onset": _stamp(own.onset_s)}
         | {"leak_lpm": own.leak_lpm or None, "reason": own.reason or None}
@@ -269,20 +361,11 @@ def load_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
     Traceback (most recent call last):
     sealscope.errors.InputError: a machine's file must be readable, got: No such file or directory (absent.toml)
     """
-    place = os.fspath(path)
-    tree = read_toml(Path(path), "a machine's file", place)
-    rig = {name: table for name, table in tree.items() if name not in OF_MACHINES and name != "map"}
-    try:
-        stated = as_type(_FILE, tree).model_dump(exclude_unset=True)
-        head, columns = stated["machine"], stated.get("map", {})
-        check_call(columns, head.get("rate"))
-        RepairLimit.of(head.get("limit"))
-        files = {row["lesson"]: row["file"] for row in stated["healthy"]}
-        if len(files) < len(stated["healthy"]):
-            raise ValueError("healthy must name each lesson once")
-    except ValueError as error:
-        raise InputError(f"{error} ({place})") from None
-    lessons = _lessons_path(Path(path), tree)
+    place, target = os.fspath(path), _follow(path)
+    tree = read_toml(target, "a machine's file", place)
+    stated = _stated_in(tree, place)
+    head, rig = stated["machine"], {name: of for name, of in tree.items() if name not in (*OF_MACHINES, "map")}
+    lessons = _lessons_path(target, tree)
     if not lessons.exists():
         rule = (
             f"{lessons.name} must lie beside a machine's file, got none: move it there, or commission the machine anew"
@@ -290,11 +373,25 @@ def load_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
         raise InputError(f"{rule} ({place})")
     return CommissionedMachine(
         name=head["name"],
-        healthy=tuple(read_lessons(lessons, files)),
+        healthy=tuple(read_lessons(lessons, {row["lesson"]: row["file"] for row in stated["healthy"]})),
         rig=Rig.from_dict(rig, place=place) if rig else None,
-        channel_map=columns,
+        channel_map=stated.get("map", {}),
         rate=head.get("rate"),
         limit=head.get("limit"),
         left_out=tuple(head.get("left_out", ())),
         alarms=tuple(JudgedAlarm(**row) for row in stated.get("alarms", ())),
+        origin=Origin(target, frozenset(_parts(tree))),
     )
+
+
+def _stated_in(tree: dict[str, Any], place: str) -> dict[str, Any]:
+    """Return the checked tables of a machine's text; InputError, with the `place`, where a value breaks a rule."""
+    try:
+        stated: dict[str, Any] = as_type(_FILE, tree).model_dump(exclude_unset=True)
+        check_call(stated.get("map", {}), stated["machine"].get("rate"))
+        RepairLimit.of(stated["machine"].get("limit"))
+        if len({row["lesson"] for row in stated["healthy"]}) < len(stated["healthy"]):
+            raise ValueError("healthy must name each lesson once")
+    except ValueError as error:
+        raise InputError(f"{error} ({place})") from None
+    return stated
