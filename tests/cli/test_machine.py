@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 
 import sealscope as ss
@@ -69,3 +71,22 @@ def test_what_the_machine_states_is_not_stated_twice(call, healthy, tmp_path):
     call("commission", healthy, "-o", file)
     refused = call("diagnose", healthy / "run1.nc", "--machine", file, "--rig", "thesis").refused()
     assert "--rig must not stand beside --machine" in refused
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links as POSIX has them")
+def test_a_link_is_written_through(call, healthy, tmp_path):
+    """Whatever reads the file that the link leads to reads what was added."""
+    there, new = tmp_path / "there", tmp_path / "new.nc"
+    there.mkdir()
+    file, link = there / "press.toml", tmp_path / "link.toml"
+    call("commission", healthy, "-o", file)
+    link.symlink_to(file)
+    ss.write(ss.simulate(command="3 sin(4t)", duration="15 s", seed=5), new)
+    assert "4 healthy" in call("commission", new, "-o", link, "--add").out
+    assert link.is_symlink()
+    assert len(ss.load_machine(file).healthy) == len(ss.load_machine(link).healthy) == 4
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["link.toml", "new.nc", "there"]
+    assert call("diagnose", new, "--machine", link).status == 0
+    link.unlink()
+    link.symlink_to(link)
+    assert "must be readable, got" in call("commission", new, "-o", link, "--add").refused()

@@ -42,7 +42,8 @@ def commissioned(tmp_path_factory: pytest.TempPathFactory) -> dict[float, Path]:
 
 def alarmed(folder: Path, file: Path, recording: ss.Recording = WORN) -> Service:
     """A monitor that has raised an alarm of an actuator whose rig is a copy of a machine's file."""
-    (folder / "press.toml").write_bytes(file.read_bytes())
+    for each_file in (file, file.with_suffix(".lessons")):
+        (folder / each_file.name).write_bytes(each_file.read_bytes())
     (folder / "settings").mkdir()
     settings = settings_in(folder / "settings")
     own = [replaced(each, folder / "press.toml") for each in settings.actuator]
@@ -129,6 +130,8 @@ def test_without_samples_or_a_file_it_says_so(tmp_path, commissioned):
     assert said_by(again) == "press.toml: not taught: no samples of the alarm are kept"
     (tmp_path / "gone").mkdir()
     service = alarmed(tmp_path / "gone", commissioned[0.0])
-    (tmp_path / "gone" / "press.toml").write_text("[machine]\nformat = 9\n")
+    (tmp_path / "gone" / "press.toml").write_text("[machine]\nformat = 1\n")
     service.actuators.mark(NAME, "valid")
-    assert said_by(service.actuators).startswith("press.toml: not written: machine.format must be 1")
+    assert said_by(service.actuators).startswith(
+        "press.toml: not written: machine.format must be 2, got 1: commission it anew"
+    )

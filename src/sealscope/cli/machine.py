@@ -35,9 +35,9 @@ def commission(
 
     `diagnose`, `trend`, `report` and `monitor` take the file by --machine.
     """
-    from sealscope.diagnosis.commissioned.machine import JudgedAlarm, checksum_of, recordings_in
+    from sealscope.diagnosis.commissioned.machine import CommissionedMachine, JudgedAlarm, checksum_of, recordings_in
     from sealscope.diagnosis.commissioned.machine import commission as commissioned
-    from sealscope.diagnosis.commissioned.machine_file import load_machine, write_machine
+    from sealscope.diagnosis.commissioned.machine_file import update_machine, write_machine
 
     if output.suffix.lower() != ".toml":
         raise InputError(f"a machine's file must end in .toml, got {output}")
@@ -47,14 +47,18 @@ def commission(
     if add:
         if stated != StatedMachine():
             raise InputError("what states the machine must not stand beside --add: the machine's file states it")
-        machine = load_machine(output)
-        if since is not None:
-            repair = JudgedAlarm("", "repaired", _date(since), _date(since))
-            machine = replace(machine, alarms=(*machine.alarms, repair))
-        for path in recordings_in(files):
-            machine = machine.with_healthy(machine.read(path), file=path.name, checksum=checksum_of(path))
-        if since is not None:
-            machine = machine.since(_date(since))
+        repair = None if since is None else _date(since)
+        paths = recordings_in(files)
+
+        def add_recordings(machine: CommissionedMachine) -> CommissionedMachine:
+            if repair is not None:
+                repaired = JudgedAlarm("", "repaired", repair, repair)
+                machine = replace(machine, alarms=(*machine.alarms, repaired))
+            for path in paths:
+                machine = machine.with_healthy(machine.read(path), file=path.name, checksum=checksum_of(path))
+            return machine if repair is None else machine.since(repair)
+
+        machine = update_machine(output, add_recordings)
     else:
         if output.exists():
             raise InputError(f"a machine's file must be new, got {output}, which exists; --add adds recordings to it")
@@ -62,7 +66,7 @@ def commission(
             files, rig=stated.rig, map=stated.channel_map or None, rate=stated.rate, limit=stated.limit,
             name=output.stem,
         )  # fmt: skip
-    write_machine(machine, output)
+        write_machine(machine, output)
     say(f"{output}:\n{machine}")
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from sealscope.recordings.recording import Recording
+from sealscope.recordings.recording import Array, Recording
 
 #: What a detector has learnt of a healthy recording, as plain values; the detector alone reads it.
 Lesson = Mapping[str, Any]
@@ -18,7 +18,8 @@ class Learnt:
 
     `digest`: hash of its chamber pressures in hexadecimal digits, by which copies are known; `units` by channel; `rate`
     [Hz]; `seconds` long; `start_s`: when its first sample was taken [s since 1970], None where not known; `lessons` by
-    the names of the detectors that could use it; `about`: what people read of it, pressure, oil, noise.
+    the names of the detectors that could use it; `about`: what people read of it, pressure, oil, noise; `statistics`:
+    finite numbers by name, of any shape, kept with the machine.
     """
 
     file: str
@@ -29,6 +30,7 @@ class Learnt:
     start_s: float | None
     lessons: Mapping[str, Lesson]
     about: Mapping[str, Any] = field(default_factory=dict)
+    statistics: Mapping[str, float | Array] = field(default_factory=dict)
 
 
 #: A healthy recording, or what it taught.

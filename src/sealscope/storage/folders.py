@@ -39,17 +39,24 @@ def by_numbers(name: str) -> list[str | int]:
 
 
 @contextmanager
-def locked(file: Path, busy: str | None) -> Iterator[None]:
+def locked(file: Path, busy: str | None, wait: float = 0.0) -> Iterator[None]:
     """Hold the lock `file` of a folder of results while the block runs; the process's end releases it, too.
 
-    `busy`: message of the InputError that is raised where a second process holds it; None to wait for its end. The file
-    is created where it is absent, and never emptied. Raises InputError for a link in its place.
+    `busy`: message of the InputError that is raised where another holds it for longer than `wait` [s]; None to wait for
+    its end. The file is created where it is absent, and never emptied. Raises InputError for a link in its place, and
+    where it cannot be created.
     """
     from filelock import FileLock, Timeout
 
+    lock = FileLock(file, timeout=-1 if busy is None else wait, poll_interval=0.01)
     try:
         open_inner(file, "a lock", "ab+").close()
-        with FileLock(file, timeout=-1 if busy is None else 0):
-            yield
+        lock.acquire()
     except Timeout:
         raise InputError(str(busy)) from None
+    except (OSError, NotImplementedError) as error:
+        raise InputError(f"cannot lock {file}: {getattr(error, 'strerror', None) or error}") from None
+    try:
+        yield
+    finally:
+        lock.release()

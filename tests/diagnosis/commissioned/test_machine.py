@@ -191,18 +191,19 @@ def test_a_file_is_whole_whenever_its_writer_is_killed(machine, folder, tmp_path
             assert (left.name, len(left.healthy)) in known
     assert any(tmp_path.glob(".*.part"))  # it was killed while it wrote, too
     remove_temporaries(tmp_path)
-    assert sorted(own.name for own in tmp_path.iterdir()) == ["actuator7.toml", "actuator7.toml.bak"]
+    assert sorted(each.name for each in tmp_path.glob("[!.]*")) == [
+        "actuator7.lessons",
+        "actuator7.toml",
+        "actuator7.toml.bak",
+    ]
 
 
 HOSTILE = {
-    "format = 1": ("format = 7", "machine.format"),
+    "format = 2": ("format = 1", "machine.format"),
     'name = "actuator7"': ("name = 7", "machine.name"),
-    "seconds = 20": ("seconds = nan\nlater = 20", "healthy[1].seconds"),
-    'digest = "': ('digest = 3 # "', "healthy[1].digest"),
-    "\npressure = ": ("\npressure = inf # ", "pressure"),
-    "sums = [[[": ("sums = [[[[", "must be TOML"),
-    'terms = ["': ('terms = ["x", "', "sums must be of the shape"),
-    "levels = [": ('levels = ["a", ', "levels"),
+    'lesson = "': ('lesson = "g', "healthy[1].lesson"),
+    'file = "run1.nc"': ("file = 3", "healthy[1].file"),
+    "\n[[healthy]]\n": ("\n[[healthy]\n", "must be TOML"),
 }
 
 

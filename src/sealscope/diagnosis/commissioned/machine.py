@@ -34,7 +34,9 @@ if TYPE_CHECKING:
     from sealscope.diagnosis.commissioned.summary import Summary
 
 #: Suffixes of files in a folder that are no recordings: Sealscope's own pages and settings, and notes.
-NO_RECORDINGS = frozenset({".toml", ".html", ".htm", ".pdf", ".png", ".svg", ".md", ".jsonl", ".part", ".bak"})
+NO_RECORDINGS = frozenset(
+    {".toml", ".lessons", ".html", ".htm", ".pdf", ".png", ".svg", ".md", ".jsonl", ".part", ".bak"}
+)
 #: How a trend, or a verdict, that was written beside the recordings begins.
 _WRITTEN = re.compile(rb'\s*\{\s*"(verdict|file)":|file,time[, ]')
 
@@ -62,6 +64,13 @@ class JudgedAlarm(NamedTuple):
         leak = "" if self.leak_lpm is None else f", {self.leak_lpm:.2g} L/min"
         since = "" if self.mark == "invalid" else f", since {_date(self.onset_s)}{leak}"
         return f"{self.alarm} {self.mark} {_date(self.date_s)}{since}{self.reason and f' ({self.reason})'}".strip()
+
+
+class Origin(NamedTuple):
+    """The file that a machine was loaded from, and its parts then, by which changes of others are known."""
+
+    path: Path
+    parts: frozenset[str]
 
 
 def _is_taken_back(word: JudgedAlarm, later: Iterable[JudgedAlarm]) -> bool:
@@ -96,6 +105,8 @@ class CommissionedMachine:
         Recordings that could not be used, each with the reason.
     alarms : tuple of JudgedAlarm, optional
         What persons said of the monitor's alarms, and repairs.
+    origin : Origin, optional
+        The file that it was loaded from.
 
     Examples
     --------
@@ -112,6 +123,7 @@ class CommissionedMachine:
     limit: str | None = None
     left_out: tuple[str, ...] = ()
     alarms: tuple[JudgedAlarm, ...] = ()
+    origin: Origin | None = field(default=None, repr=False, compare=False)
 
     @cached_property
     def summary(self) -> Summary:

@@ -1,39 +1,58 @@
-"""The file of a commissioned machine: TOML that people read, with all that a diagnosis compares with.
+"""The file of a commissioned machine: TOML that people read and edit, with its lessons in a file beside it.
 
 It is a rig's file, too: `[rig]`, `[motor]` and so on state what is known of it, `[map]` its channels. Beside them
-`[machine]` names it, `[learnt]` is what its healthy recordings say, for people to read, and each `[[healthy]]` is a
-recording: the checksum of its file, and what it has taught each method. `[[alarms]]` is what persons said of alarms.
+`[machine]` names it, `[learnt]` is what its healthy recordings say, for people to read, and each `[[healthy]]` names a
+recording and the checksum of what it has taught, its lesson in the file beside (`lessons_file`). `[[alarms]]` is what
+persons said of alarms.
+
+The lessons are written before the text, with those of the text that is there and of the one that is kept as `.bak`. So
+each text finds its lessons whenever a writer is killed.
 """
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+import re
+import tomllib
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PositiveFloat, create_model
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.commissioned.machine import CommissionedMachine, JudgedAlarm, Judgement
-from sealscope.diagnosis.learnt import Learnt
+from sealscope.diagnosis.commissioned.lessons_file import (
+    SUFFIX,
+    format_lesson,
+    make_table,
+    read_lessons,
+    read_lines,
+    write_lines,
+)
+from sealscope.diagnosis.commissioned.machine import CommissionedMachine, JudgedAlarm, Judgement, Origin
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
 from sealscope.parameters import Rig
 from sealscope.parameters.load import OF_MACHINES
 from sealscope.recordings.formats.columns import REST, check_call
-from sealscope.storage.atomic import atomic_write
+from sealscope.storage.atomic import atomic_write, check_folder
+from sealscope.storage.folders import locked
 from sealscope.storage.plain_values import as_type
-from sealscope.storage.toml_file import read_toml
+from sealscope.storage.toml_file import LARGEST, read_toml
 
-#: Largest file read [bytes]: some 10 kB a recording.
-LARGEST = 50_000_000
+#: What this version writes and reads; names in [machine] that are written anew with each change.
+_FORMAT, _REWRITTEN = 2, ("sealscope", "written", "lessons")
+#: Lessons that neither text names are kept while the file is smaller [bytes].
+_SPARE = 5_000_000
+#: Longest wait for another process that writes [s], and what is said then.
+_LONGEST_WAIT, _BUSY = 60.0, "a machine's file must be free to be written, got another process that writes it ({})"
 _HEAD = """\
-# A machine commissioned by Sealscope: what its healthy recordings have taught. [machine], [map] and [rig] may be
-# edited; [learnt] is written anew with each change; [[healthy]] is what diagnoses compare with.
+# A machine commissioned by Sealscope. [machine], [map] and [rig] may be edited; [learnt] is written anew with each
+# change; a [[healthy]] is a recording that diagnoses compare with: without it, the recording is forgotten. What the
+# recordings have taught is in the file of lessons beside this one: move them together.
 """
 
 
@@ -44,73 +63,19 @@ def _moment(text: Any) -> float:
         raise ValueError("must be a time as ISO 8601 writes it") from None
 
 
-def _numbers(values: list[Any]) -> np.ndarray:
-    try:
-        array = np.array(values, dtype=float)
-    except (TypeError, OverflowError):
-        raise ValueError("must hold numbers in equal rows") from None
-    if not np.isfinite(array).all():
-        raise ValueError("must hold finite numbers")
-    return array
-
-
+#: A file's name, which leads to no other folder.
+_FILE_NAME = re.compile(r"[^/\\\0:]{1,200}\.lessons")
 _Moment = Annotated[float, BeforeValidator(_moment)]
-_Numbers = Annotated[Any, AfterValidator(_numbers)]
 
 
-def _table(extra: Literal["allow", "ignore"] = "ignore", **kinds: Any) -> Any:
-    """Return the type of a table by the types of its values, in a tuple with None where a value may be absent."""
-    config = ConfigDict(strict=True, allow_inf_nan=False, extra=extra)
-    fields = {name: kind if isinstance(kind, tuple) else (kind, ...) for name, kind in kinds.items()}
-    return create_model("Table", __config__=config, **fields)  # type: ignore[call-overload]
+def _check_format(number: int) -> int:
+    if number != _FORMAT:
+        raise ValueError(f"must be {_FORMAT}, got {number}: commission it anew")
+    return number
 
 
-def _with_sums_of_its_terms(lesson: Any) -> Any:
-    size = len(lesson.terms) + 1
-    if lesson.sums.ndim != 3 or lesson.sums.shape[1:] != (size, size):
-        raise ValueError(f"sums must be of the shape (E, {size}, {size}), got {lesson.sums.shape}")
-    return lesson
-
-
-_BALANCE = _table(
-    "allow",
-    terms=list[str],
-    scale=float,
-    sums=_Numbers,
-    flow=float,
-    pressure=float,
-    start_s=(float, None),
-    oil_degC=(float, None),
-)
-#: What Sealscope's own methods were taught; those of others are plain tables.
-_LESSONS = {
-    "volume balance": (Annotated[_BALANCE, AfterValidator(_with_sums_of_its_terms)], None),
-    "pressure response": (_table("allow", level=float), None),
-    "rms change": (
-        _table(
-            "allow",
-            chambers=list[str],
-            recorded=(list[str], None),
-            rate=float,
-            start_s=(float, None),
-            levels=_Numbers,
-            duty=_Numbers,
-        ),
-        None,
-    ),
-}
-_ABOUT = {"sha256": str, "pressure_bar": float, "oil_degC": float, "noise": dict[str, float], "wrong": list[str]}
-_HEALTHY = _table(
-    file=str,
-    digest=str,
-    units=dict[str, str],
-    rate=PositiveFloat,
-    seconds=PositiveFloat,
-    start_s=(Annotated[_Moment, Field(alias="start")], None),
-    lessons=_table("allow", **_LESSONS),
-    about=(_table("allow", **{name: (kind, None) for name, kind in _ABOUT.items()}), None),
-)
-_ALARM = _table(
+_HEALTHY = make_table(file=str, lesson=Annotated[str, Field(pattern="^[0-9a-f]{64}$")])
+_ALARM = make_table(
     alarm=str,
     mark=Judgement,
     date_s=Annotated[_Moment, Field(alias="date")],
@@ -118,8 +83,14 @@ _ALARM = _table(
     leak_lpm=(float, None),
     reason=(str, None),
 )
-_FILE = _table(
-    machine=_table(format=Literal[1], name=str, rate=(float, None), limit=(str, None), left_out=(list[str], None)),
+_FILE = make_table(
+    machine=make_table(
+        format=Annotated[int, AfterValidator(_check_format)],
+        name=str,
+        rate=(float, None),
+        limit=(str, None),
+        left_out=(list[str], None),
+    ),
     map=(dict[str, str], None),
     healthy=Annotated[list[_HEALTHY], Field(min_length=1)],  # type: ignore[valid-type]
     alarms=(list[_ALARM], None),  # type: ignore[valid-type]
@@ -129,6 +100,8 @@ _FILE = _table(
 @checked_call
 def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) -> Path:
     """Write a machine's file: whole under its name, or not at all; one that is there is kept, as `.toml.bak`.
+
+    A link is written through. Its lessons are written beside it, as `.lessons`.
 
     Parameters
     ----------
@@ -145,7 +118,8 @@ def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) ->
     Raises
     ------
     InputError
-        The path does not end in .toml, or cannot be written.
+        The path does not end in .toml, or cannot be written, or writing would undo what another has changed since the
+        machine was loaded.
 
     Examples
     --------
@@ -158,24 +132,150 @@ def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) ->
     ...     ss.load_machine(path)
     <CommissionedMachine machine: 1 healthy recording>
     """
-    target = Path(path)
+    target = _resolve(path)
+    with locked(_lock_of(target), _BUSY.format(target), _LONGEST_WAIT):
+        if machine.origin is not None and machine.origin.path == target and target.exists():
+            change = _change_since(machine.origin, _parts(_read(target)), _parts(_tree_of(machine, target)))
+            if change is not None:
+                raise InputError(f"a machine's file must be as it was read, got {change}: load it again ({target})")
+        _write(machine, target)
+    return Path(path)
+
+
+def update_machine(
+    path: str | os.PathLike[str], change: Callable[[CommissionedMachine], CommissionedMachine]
+) -> CommissionedMachine:
+    """Read, change and write a machine's file, so that nothing which another process writes meanwhile is lost.
+
+    `change` is called once, and once more where the file has changed meanwhile; nobody waits for the first call. Raises
+    InputError as `load_machine`, `write_machine` and `change` do; then the file stays as it was.
+    """
+    target = _resolve(path)
+    machine = load_machine(target)
+    changed = change(machine)
+    with locked(_lock_of(target), _BUSY.format(target), _LONGEST_WAIT):
+        if machine.origin != Origin(target, frozenset(_parts(_read(target)))):
+            changed = change(load_machine(target))
+        _write(changed, target)
+    return changed
+
+
+def _resolve(path: str | os.PathLike[str]) -> Path:
+    """Return the file to write that a path leads to, through links; InputError where it does not end in .toml."""
+    target = _follow(path)
     if target.suffix.lower() != ".toml":
         raise InputError(f"a machine's file must end in .toml, got {target}")
-    text = _HEAD + "\n".join(_lines(_tree(machine))) + "\n"
-    if target.is_file():
-        with atomic_write(target.with_suffix(".toml.bak")) as temporary:
-            temporary.write_bytes(target.read_bytes())
-    with atomic_write(target) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    check_folder(target)
     return target
 
 
-def _tree(machine: CommissionedMachine) -> dict[str, Any]:
-    """Return the tables of a machine's file."""
+def _follow(path: str | os.PathLike[str]) -> Path:
+    """Return the file that a path leads to, through links; InputError where they end in a circle."""
+    try:
+        return Path(path).resolve()
+    except (OSError, RuntimeError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error).partition(" from ")[0]
+        raise InputError(f"a machine's file must be readable, got: {reason} ({os.fspath(path)})") from None
+
+
+def _lock_of(target: Path) -> Path:
+    return target.with_name(f".{target.name}.lock")
+
+
+def _write(machine: CommissionedMachine, target: Path) -> None:
+    """Write lessons, kept text and text, in this order: each text finds its lessons after any of them."""
+    taught, data = [format_lesson(learnt) for learnt in machine.healthy], _format_text(machine, target)
+    if len(data) > LARGEST:
+        raise InputError(f"a machine's file must be at most {LARGEST} bytes, got {len(data)} ({target})")
+    backup, lines = target.with_suffix(".toml.bak"), {line.checksum: line for line in taught}
+    texts = [(path, _read_if_there(path)) for path in (target, backup)]
+    present = {line.checksum: line for path, tree in texts for line in read_lines(_lessons_path(path, tree))}
+    for checksum in (checksum for _, tree in texts for checksum in _lessons_named(tree) if checksum in present):
+        lines.setdefault(checksum, present[checksum])
+    size = sum(len(line.data) for line in lines.values())
+    for checksum, line in present.items():  # of texts that were renamed or copied
+        if checksum not in lines and (size := size + len(line.data)) < _SPARE:
+            lines[checksum] = line
+    write_lines([*lines.values()], target.with_suffix(SUFFIX))
+    if target.is_file():
+        with atomic_write(backup) as temporary:
+            temporary.write_bytes(target.read_bytes())
+    with atomic_write(target) as temporary:
+        temporary.write_bytes(data)
+
+
+def _format_text(machine: CommissionedMachine, target: Path) -> bytes:
+    return (_HEAD + "\n".join(_lines(_tree(machine, target))) + "\n").encode()
+
+
+def _tree_of(machine: CommissionedMachine, target: Path) -> dict[str, Any]:
+    """Return the tables of a machine's text as they are read again."""
+    return tomllib.loads(_format_text(machine, target).decode())
+
+
+def _parts(tree: Mapping[str, Any]) -> dict[str, str]:
+    """Return what a machine's text holds that another process may add or take away: each in JSON, and its name."""
+    head = {name: value for name, value in tree["machine"].items() if name not in _REWRITTEN}
+    stated = {name: table for name, table in tree.items() if name not in OF_MACHINES}
+    parts = {json.dumps([head, stated], sort_keys=True, default=str): "another statement of the machine"}
+    parts |= {json.dumps(row["lesson"]): f"another recording, {row['file']}" for row in tree["healthy"]}
+    alarms = tree.get("alarms", ())
+    return parts | {json.dumps(row, sort_keys=True): f"another mark of {row['alarm']}" for row in alarms}
+
+
+def _change_since(origin: Origin, present: Mapping[str, str], own: Mapping[str, str]) -> str | None:
+    """Name something that was added to, or taken from, a machine's file and that writing would undo; None for nothing.
+
+    `present`: parts of the file; `own`: parts of the machine to be written, which was read with those of `origin`.
+    """
+    added = [name for part, name in present.items() if part not in origin.parts and part not in own]
+    taken = [name for part, name in own.items() if part in origin.parts and part not in present]
+    return next(iter((*added, *taken)), None)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """Return the tables of a machine's text, checked but for its rig; InputError where one breaks a rule."""
+    tree = read_toml(path, "a machine's file", str(path))
+    _stated_in(tree, str(path))
+    return tree
+
+
+def _read_if_there(path: Path) -> dict[str, Any]:
+    """Return the tables of a machine's text, none where it cannot be read."""
+    try:
+        return read_toml(path, "a machine's file", str(path))
+    except InputError:
+        return {}
+
+
+def _lessons_named(tree: Mapping[str, Any]) -> list[str]:
+    """Return the checksums of the lessons that a machine's text, valid or not, names."""
+    rows = tree.get("healthy")
+    checksums = [row.get("lesson") for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+    return [checksum for checksum in checksums if isinstance(checksum, str)]
+
+
+def _lessons_path(path: Path, tree: Mapping[str, Any]) -> Path:
+    """Return the file of lessons of a text: that of its name, or where there is none that which it states."""
+    beside, head = path.with_suffix(SUFFIX), tree.get("machine")
+    stated = head.get("lessons") if isinstance(head, dict) else None
+    if beside.exists() or not isinstance(stated, str) or _FILE_NAME.fullmatch(stated) is None:
+        return beside
+    return path.with_name(stated) if path.with_name(stated).exists() else beside
+
+
+def _tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
+    """Return the tables of a machine's file at `path`."""
     from importlib.metadata import version
 
     summary, columns, now = machine.summary, machine.channel_map, datetime.now(UTC).isoformat(timespec="seconds")
-    head = {"format": 1, "name": machine.name, "sealscope": version("sealscope"), "written": now}
+    head = {
+        "format": _FORMAT,
+        "name": machine.name,
+        "lessons": path.with_suffix(SUFFIX).name,
+        "sealscope": version("sealscope"),
+        "written": now,
+    }
     head |= {"rate": machine.rate, "limit": machine.limit, "left_out": machine.left_out or None}
     tree: dict[str, Any] = {"machine": head}
     if columns:
@@ -185,11 +285,7 @@ def _tree(machine: CommissionedMachine) -> dict[str, Any]:
     smallest = {} if summary.smallest is None else {"smallest_leak": summary.smallest._asdict()}
     terms = {name: term._asdict() for name, term in summary.terms.items()}
     tree["learnt"] = {"problems": summary.problems, "noise": summary.noise, **smallest, "terms": terms}
-    tree["healthy"] = [
-        {"file": own.file, "digest": own.digest, "rate": own.rate, "seconds": own.seconds}
-        | {"start": _stamp(own.start_s), "units": own.units, "about": own.about, "lessons": own.lessons}
-        for own in machine.healthy
-    ]
+    tree["healthy"] = [{"file": learnt.file, "lesson": format_lesson(learnt).checksum} for learnt in machine.healthy]
     tree["alarms"] = [
         {"alarm": own.alarm, "mark": own.mark, "date": _stamp(own.date_s), "onset": _stamp(own.onset_s)}
         | {"leak_lpm": own.leak_lpm or None, "reason": own.reason or None}
@@ -265,23 +361,37 @@ def load_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
     Traceback (most recent call last):
     sealscope.errors.InputError: a machine's file must be readable, got: No such file or directory (absent.toml)
     """
-    place = os.fspath(path)
-    tree = read_toml(Path(path), "a machine's file", place, LARGEST)
-    rig = {name: table for name, table in tree.items() if name not in OF_MACHINES and name != "map"}
-    try:
-        stated = as_type(_FILE, tree).model_dump(exclude_unset=True)
-        head, columns = stated["machine"], stated.get("map", {})
-        check_call(columns, head.get("rate"))
-        RepairLimit.of(head.get("limit"))
-    except ValueError as error:
-        raise InputError(f"{error} ({place})") from None
+    place, target = os.fspath(path), _follow(path)
+    tree = read_toml(target, "a machine's file", place)
+    stated = _stated_in(tree, place)
+    head, rig = stated["machine"], {name: of for name, of in tree.items() if name not in (*OF_MACHINES, "map")}
+    lessons = _lessons_path(target, tree)
+    if not lessons.exists():
+        rule = (
+            f"{lessons.name} must lie beside a machine's file, got none: move it there, or commission the machine anew"
+        )
+        raise InputError(f"{rule} ({place})")
     return CommissionedMachine(
         name=head["name"],
-        healthy=tuple(Learnt(**{"start_s": None, **row}) for row in stated["healthy"]),
+        healthy=tuple(read_lessons(lessons, {row["lesson"]: row["file"] for row in stated["healthy"]})),
         rig=Rig.from_dict(rig, place=place) if rig else None,
-        channel_map=columns,
+        channel_map=stated.get("map", {}),
         rate=head.get("rate"),
         limit=head.get("limit"),
         left_out=tuple(head.get("left_out", ())),
         alarms=tuple(JudgedAlarm(**row) for row in stated.get("alarms", ())),
+        origin=Origin(target, frozenset(_parts(tree))),
     )
+
+
+def _stated_in(tree: dict[str, Any], place: str) -> dict[str, Any]:
+    """Return the checked tables of a machine's text; InputError, with the `place`, where a value breaks a rule."""
+    try:
+        stated: dict[str, Any] = as_type(_FILE, tree).model_dump(exclude_unset=True)
+        check_call(stated.get("map", {}), stated["machine"].get("rate"))
+        RepairLimit.of(stated["machine"].get("limit"))
+        if len({row["lesson"] for row in stated["healthy"]}) < len(stated["healthy"]):
+            raise ValueError("healthy must name each lesson once")
+    except ValueError as error:
+        raise InputError(f"{error} ({place})") from None
+    return stated

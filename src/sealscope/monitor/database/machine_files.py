@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from sealscope.diagnosis.commissioned.machine import JUDGEMENTS, JudgedAlarm
-from sealscope.diagnosis.commissioned.machine_file import LARGEST, load_machine, write_machine
+from sealscope.diagnosis.commissioned.machine import JUDGEMENTS, CommissionedMachine, JudgedAlarm
+from sealscope.diagnosis.commissioned.machine_file import update_machine
 from sealscope.errors import SealscopeError
 from sealscope.monitor.alarms import Alarm
 from sealscope.recordings.formats.timebase import counts_from_1970
 from sealscope.recordings.joining import join
 from sealscope.recordings.recording import Recording
 from sealscope.storage.toml_file import read_toml
-
-_writing = threading.Lock()
 
 
 def pass_on(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording]) -> str:
@@ -32,21 +29,25 @@ def pass_on(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording]) -> 
     if mark not in JUDGEMENTS or path.suffix.lower() != ".toml":
         return ""
     try:
-        if "machine" not in read_toml(path, "a machine's file", rig, LARGEST):
+        if "machine" not in read_toml(path, "a machine's file", rig):
             return ""
-        with _writing:
-            shift = 0.0 if counts_from_1970(alarm.onset_s) else time.time() - alarm.updated_s
-            leak = None if mark == "invalid" else alarm.leak_lpm
-            said = JudgedAlarm(alarm.id, mark, time.time(), alarm.onset_s + shift, leak, alarm.reason)
-            machine, done = load_machine(path), "written down"
-            machine = replace(machine, alarms=(*machine.alarms, said))
+        shift = 0.0 if counts_from_1970(alarm.onset_s) else time.time() - alarm.updated_s
+        leak = None if mark == "invalid" else alarm.leak_lpm
+        judged = JudgedAlarm(alarm.id, mark, time.time(), alarm.onset_s + shift, leak, alarm.reason)
+        done = "written down"
+
+        def add_mark(machine: CommissionedMachine) -> CommissionedMachine:
+            nonlocal done
+            machine = replace(machine, alarms=(*machine.alarms, judged))
             if mark == "invalid":
                 try:
                     machine = machine.with_healthy(_recording(samples, shift), file=alarm.id)
                     done = "taught as healthy"
                 except SealscopeError as error:
                     done = f"not taught: {error}"
-            write_machine(machine, path)
+            return machine
+
+        update_machine(path, add_mark)
     except (SealscopeError, ValueError, OverflowError, OSError) as error:
         done = f"not written: {error}"
     return f"{path.name}: {done}"

@@ -1,0 +1,219 @@
+"""The lessons of a machine lie beside its text: whole, checked, found again, and never half of a pair."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sealscope as ss
+from sealscope.diagnosis.commissioned.lessons_file import SUFFIX, Line, format_lesson, parse_lesson, read_lines
+from sealscope.errors import InputError
+
+
+@pytest.fixture
+def pair(file: Path, tmp_path: Path) -> tuple[Path, Path]:
+    """Copies of a machine's text and of its lessons."""
+    text, lessons = tmp_path / "actuator7.toml", tmp_path / "actuator7.lessons"
+    text.write_bytes(file.read_bytes())
+    lessons.write_bytes(file.with_suffix(SUFFIX).read_bytes())
+    return text, lessons
+
+
+def refused(path: Path) -> str:
+    with pytest.raises(InputError) as caught:
+        ss.load_machine(path)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+def test_a_lesson_is_read_as_it_was_learnt(machine):
+    """To the last bit, with names that this version does not know."""
+    numbers = np.array([[1.0, 1e-300], [-0.1, 3e200]])
+    statistics = {"rise": 0.25, "later kind": numbers, "empty": np.zeros((0, 3))}
+    lessons = {**machine.healthy[0].lessons, "a plug-in's": {"names": ["a", "b"], "n": 3, "curve": [0.1, 0.2]}}
+    learnt = replace(machine.healthy[0], statistics=statistics, lessons=lessons)
+    again = parse_lesson(format_lesson(learnt), learnt.file, "place")
+    assert (again.digest, again.units, again.rate, again.seconds) == (
+        learnt.digest, learnt.units, learnt.rate, learnt.seconds,
+    )  # fmt: skip
+    assert again.about == learnt.about
+    assert {name: np.shape(value) for name, value in again.statistics.items()} == {
+        "rise": (), "later kind": (2, 2), "empty": (0, 3),
+    }  # fmt: skip
+    np.testing.assert_array_equal(again.statistics["later kind"], numbers)
+    np.testing.assert_array_equal(again.lessons["volume balance"]["sums"], lessons["volume balance"]["sums"])
+    assert format_lesson(again) == format_lesson(learnt)
+    np.testing.assert_array_equal(again.lessons["a plug-in's"].pop("curve"), [0.1, 0.2])
+    assert again.lessons["a plug-in's"] == {"names": ["a", "b"], "n": 3}
+
+
+def test_the_text_is_small(pair, machine):
+    """What a person edits is three lines a recording, whatever they have taught."""
+    text, lessons = pair
+    rows = text.read_text().partition("\n[[healthy]]\n")[2]
+    assert len(rows) < 150 * len(machine.healthy)
+    assert len(lessons.read_bytes()) > 30 * len(rows)
+
+
+def test_numbers_that_are_not_finite_are_no_lesson(machine):
+    for value in (np.nan, [1.0, np.inf]):
+        with pytest.raises(InputError, match=r"of run1\.nc"):
+            format_lesson(replace(machine.healthy[0], statistics={"rise": value}))
+
+
+def test_a_damaged_lesson_is_named(pair):
+    text, lessons = pair
+    data = bytearray(lessons.read_bytes())
+    data[data.index(b"run") if b"run" in data else len(data) // 2] ^= 1
+    lessons.write_bytes(data)
+    message = refused(text)
+    assert "must have the SHA-256" in message
+    assert "run" in message
+    assert "take its [[healthy]] out of the machine's file, or commission it anew" in message
+
+
+def test_without_its_damaged_lesson_the_machine_is_what_the_others_taught(pair):
+    text, lessons = pair
+    rows = lessons.read_bytes().splitlines(keepends=True)
+    rows[2] = rows[2].replace(b'"rate":', b'"rote":')
+    lessons.write_bytes(b"".join(rows))
+    assert "run2.nc" in refused(text)
+    parts = text.read_text().split("[[healthy]]")
+    text.write_text("[[healthy]]".join(part for part in parts if "run2.nc" not in part))
+    assert [learnt.file for learnt in ss.load_machine(text).healthy] == ["run1.nc", "run3.nc", "run4.nc"]
+
+
+def test_a_lesson_that_is_not_there_is_named(pair):
+    text, lessons = pair
+    lessons.write_bytes(b"".join(lessons.read_bytes().splitlines(keepends=True)[:-1]))
+    assert "of run4.nc must be in the file of lessons, got none such" in refused(text)
+
+
+def test_lessons_that_were_left_behind_are_asked_for(pair):
+    text, lessons = pair
+    lessons.unlink()
+    assert refused(text).startswith("actuator7.lessons must lie beside a machine's file, got none: move it there")
+
+
+def test_a_pair_is_renamed_or_its_text_alone(pair, tmp_path):
+    text, lessons = pair
+    alone = text.rename(tmp_path / "press.toml")
+    assert len(ss.load_machine(alone).healthy) == 4
+    lessons.rename(tmp_path / "press.lessons")
+    assert len(ss.load_machine(alone).healthy) == 4
+    ss.write_machine(ss.load_machine(alone), alone)
+    assert 'lessons = "press.lessons"' in alone.read_text()
+
+
+@pytest.mark.parametrize("name", ["../actuator7.lessons", "/etc/passwd", "sub/actuator7.lessons", "passwd"])
+def test_a_text_names_no_lessons_elsewhere(pair, tmp_path, name):
+    text, _ = pair
+    other = tmp_path / "inner"
+    other.mkdir()
+    hostile = other / "hostile.toml"
+    hostile.write_text(text.read_text().replace('lessons = "actuator7.lessons"', f'lessons = "{name}"'))
+    assert refused(hostile).startswith("hostile.lessons must lie beside")
+
+
+def test_each_text_keeps_its_lessons_whichever_file_was_written_last(pair, machine, monkeypatch):
+    """Broken off after any of the three files, text and kept text are those of before or of after."""
+    text, _ = pair
+    ss.write_machine(replace(machine, name="kept"), text)
+    ss.write_machine(replace(machine, name="first"), text)
+    new = ss.simulate(command="3 sin(4t)", duration="20 s", seed=40)
+    later = replace(machine.with_healthy(new, file="new.nc"), name="later")
+    later = replace(later, healthy=later.healthy[2:])
+    from sealscope.diagnosis.commissioned import lessons_file, machine_file
+
+    def written(count: int) -> list[tuple[str, int]]:
+        """Texts after a write that ends before its file number `count`."""
+        left, write = [count], lessons_file.atomic_write
+
+        def stop(path: Path):
+            left[0] -= 1
+            if left[0] < 0:
+                raise KeyboardInterrupt
+            return write(path)
+
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr(lessons_file, "atomic_write", stop)
+            patch.setattr(machine_file, "atomic_write", stop)
+            ss.write_machine(later, text)
+        texts = (ss.load_machine(path) for path in (text, text.with_suffix(".toml.bak")))
+        return [(known.name, len(known.healthy)) for known in texts]
+
+    assert [written(count) for count in range(3)] == [
+        [("first", 4), ("kept", 4)],
+        [("first", 4), ("kept", 4)],
+        [("first", 4), ("first", 4)],
+    ]
+    ss.write_machine(later, text)
+    assert len(ss.load_machine(text).healthy) == 3
+    assert len(ss.load_machine(text.with_suffix(".toml.bak")).healthy) == 4
+
+
+def test_lessons_that_no_text_names_are_kept_for_its_copies_while_they_are_few(pair, machine, monkeypatch):
+    text, lessons = pair
+    copy = text.with_name("before.toml")
+    copy.write_bytes(text.read_bytes())
+    for _ in range(3):
+        ss.write_machine(replace(machine, healthy=machine.healthy[:1]), text)
+    assert len(ss.load_machine(copy).healthy) == 4
+    monkeypatch.setattr(
+        "sealscope.diagnosis.commissioned.machine_file._SPARE", 2 * len(format_lesson(machine.healthy[0]).data)
+    )
+    ss.write_machine(replace(machine, healthy=machine.healthy[:1]), text)
+    assert len(lessons.read_bytes().splitlines()) == 2
+
+
+def test_a_torn_line_is_a_lesson_that_is_missing(pair):
+    text, lessons = pair
+    data = lessons.read_bytes()
+    second = data.splitlines(keepends=True)[2]
+    lessons.write_bytes(data.replace(second, second[:40] + b"\n"))
+    assert "of run2.nc must be in the file of lessons" in refused(text)
+
+
+def altered(line: Line, change: str, value: object) -> Line:
+    tree = json.loads(line.data)
+    *path, name = change.split("/")
+    place = tree
+    for part in path:
+        place = place[part]
+    place[name] = value
+    data = json.dumps(tree).encode()
+    return Line(sha256(data).hexdigest(), data)
+
+
+HOSTILE = {
+    "digest": (3, "digest"),
+    "rate": (-1.0, "rate"),
+    "seconds": (0.0, "seconds"),
+    "units": ([], "units"),
+    "start_s": ("now", "start_s"),
+    "lessons/volume balance/sums": ([[1.0]], "must be an array of numbers"),
+    "lessons/volume balance/terms": (["a"], "sums must be of the shape"),
+    "lessons/volume balance/pressure": (None, "pressure"),
+    "lessons/rms change/levels": ({"shape": [3], "f8": "AAAA"}, "levels"),
+    "lessons/other": ([[], []] * 4000, "must hold its numbers in arrays"),
+    "statistics/rise": ("high", "statistics.rise"),
+}
+
+
+@pytest.mark.parametrize("change", HOSTILE)
+def test_an_altered_lesson_with_the_right_checksum_is_refused_in_one_line(pair, change):
+    line = read_lines(pair[1])[0]
+    value, rule = HOSTILE[change]
+    with pytest.raises(InputError) as caught:
+        parse_lesson(altered(line, change, value), "run1.nc", "hostile.lessons")
+    message = str(caught.value)
+    assert message.startswith("the lesson of run1.nc is wrong: ")
+    assert rule in message
+    assert "hostile.lessons" in message
+    assert "\n" not in message

@@ -1,0 +1,152 @@
+"""Two processes that change a machine's file at once lose nothing of each other's."""
+
+from __future__ import annotations
+
+import multiprocessing
+from dataclasses import replace
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import pytest
+
+import sealscope as ss
+from sealscope.diagnosis.commissioned.machine import JudgedAlarm
+from sealscope.diagnosis.commissioned.machine_file import update_machine
+from sealscope.errors import InputError
+from sealscope.monitor.alarms import Alarm
+from sealscope.monitor.database.machine_files import pass_on
+
+
+def run(seed: int) -> ss.Recording:
+    recording = ss.simulate(command="3 sin(4t)", duration="6 s", rate="100 Hz", seed=seed)
+    return replace(recording, provenance={})
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The two files of a machine, by name."""
+    folder = tmp_path_factory.mktemp("healthy")
+    for seed in (1, 2):
+        ss.write(run(seed), folder / f"run{seed}.nc")
+    file = ss.write_machine(ss.commission(folder), folder / "press.toml")
+    return {each.name: each.read_bytes() for each in (file, file.with_suffix(".lessons"))}
+
+
+def place(pair: dict[str, bytes], folder: Path) -> Path:
+    for name, data in pair.items():
+        (folder / name).write_bytes(data)
+    return folder / "press.toml"
+
+
+def add(path: Path, seed: int) -> None:
+    recording = run(seed)
+    update_machine(path, lambda machine: machine.with_healthy(recording, file=f"run{seed}.nc"))
+
+
+def mark(path: Path, number: int) -> None:
+    span, words = (1.68e9, 1.695e9), ("piston leak", "the balance", "the seal")
+    alarm = Alarm(f"press-{number}", "press", "error", "new", 1.7e9, 1.7e9, 1.69e9, span, 0.01, None, *words, 1)
+    done = pass_on(str(path), alarm, "valid", [])
+    assert done == "press.toml: written down", done
+
+
+def work(pipe: Connection, path: Path) -> None:
+    """Carry out what comes, and answer with the error, if any."""
+    for task, argument in iter(pipe.recv, None):
+        try:
+            {"add": add, "mark": mark}[task](path, argument)
+            pipe.send("")
+        except Exception as error:
+            pipe.send(repr(error))
+
+
+def attack(pair: dict[str, bytes], folder: Path, rounds: int) -> None:
+    """Each round: two recordings are added and an alarm is marked, by three processes at once."""
+    context, path = multiprocessing.get_context("fork"), folder / "press.toml"
+    pipes = []
+    for _ in range(3):
+        here, there = context.Pipe()
+        process = context.Process(target=work, args=(there, path), daemon=True)
+        process.start()
+        pipes.append((here, process))
+    for number in range(rounds):
+        place(pair, folder)
+        tasks = [("add", 10), ("add", 11), ("mark", number)]
+        for (pipe, _), task in zip(pipes, tasks, strict=True):
+            pipe.send(task)
+        assert [pipe.recv() for pipe, _ in pipes] == ["", "", ""]
+        machine = ss.load_machine(path)
+        assert {learnt.file for learnt in machine.healthy} == {"run1.nc", "run2.nc", "run10.nc", "run11.nc"}
+        assert [alarm.alarm for alarm in machine.alarms] == [f"press-{number}"]
+    for pipe, process in pipes:
+        pipe.send(None)
+        process.join()
+
+
+needs_fork = pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="forks as POSIX does")
+
+
+@needs_fork
+def test_two_added_recordings_and_a_mark_at_once_are_all_there(pair, tmp_path):
+    attack(pair, tmp_path, 5)
+
+
+@needs_fork
+@pytest.mark.slow
+def test_nothing_is_lost_in_500_rounds(pair, tmp_path):
+    attack(pair, tmp_path, 500)
+
+
+def test_what_another_wrote_since_is_not_undone(pair, tmp_path):
+    path = place(pair, tmp_path)
+    machine = ss.load_machine(path)
+    mark(path, 1)
+    before = path.read_bytes()
+    with pytest.raises(InputError, match="must be as it was read, got another mark of press-1: load it again"):
+        ss.write_machine(replace(machine, limit="5 mL/min"), path)
+    assert path.read_bytes() == before
+
+
+def test_a_recording_that_was_taken_out_since_does_not_come_back(pair, tmp_path):
+    path = place(pair, tmp_path)
+    machine = ss.load_machine(path)
+    update_machine(path, lambda known: replace(known, healthy=known.healthy[1:]))
+    with pytest.raises(InputError, match=r"got another recording, run1\.nc"):
+        ss.write_machine(machine, path)
+
+
+def test_an_edited_text_is_not_undone(pair, tmp_path):
+    path = place(pair, tmp_path)
+    machine = ss.load_machine(path)
+    path.write_text(path.read_text().replace('name = "machine"', 'name = "press 7"'))
+    with pytest.raises(InputError, match="got another statement of the machine"):
+        ss.write_machine(machine, path)
+
+
+def test_a_machine_may_be_written_again_and_again(pair, tmp_path):
+    """Its own changes are no other's; a machine that was never read replaces what is there."""
+    path = place(pair, tmp_path)
+    machine = ss.load_machine(path)
+    alarms = [JudgedAlarm(f"press-{k}", "valid", 1.7e9, 1.69e9) for k in range(3)]
+    for count in range(1, 4):
+        ss.write_machine(replace(machine, alarms=tuple(alarms[:count])), path)
+    assert len(ss.load_machine(path).alarms) == 3
+    ss.write_machine(replace(machine, origin=None), path)
+    assert ss.load_machine(path).alarms == ()
+
+
+def test_a_writer_that_does_not_end_is_waited_for_a_while(pair, tmp_path, monkeypatch):
+    from sealscope.diagnosis.commissioned import machine_file
+    from sealscope.storage.folders import locked
+
+    path = place(pair, tmp_path)
+    monkeypatch.setattr(machine_file, "_LONGEST_WAIT", 0.05)
+    with locked(tmp_path / ".press.toml.lock", "busy"), pytest.raises(InputError, match="another process that writes"):
+        ss.write_machine(ss.load_machine(path), path)
+
+
+def test_a_change_that_fails_leaves_the_file(pair, tmp_path):
+    path = place(pair, tmp_path)
+    with pytest.raises(InputError, match="must be new"):
+        update_machine(path, lambda machine: machine.with_healthy(run(1), file="run1.nc"))
+    assert path.read_bytes() == pair["press.toml"]
