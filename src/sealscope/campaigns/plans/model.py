@@ -97,8 +97,7 @@ class RecordGroup(_Entries):
 
     `use`: `calibrate` sets thresholds (leak-free), `judge` is judged by them, on seeds of its own; `leak_lpm`: mean
     flow [L/min] of a leak of that `law` (`mixture`: half of each) from the plan's onset on, 0 for none; `fault`:
-    another fault, as text; `bound`: whether the rows of leaks of this size say what the Cramer-Rao bound of their
-    machine allows, which does not depend on the size, as the plan says where it is None.
+    another fault, as text.
     """
 
     count: Annotated[Whole, Field(ge=1)]
@@ -106,7 +105,6 @@ class RecordGroup(_Entries):
     leak_lpm: Annotated[Number, Field(ge=0, alias="leak"), _quantity("L/min")] = 0.0
     law: LeakLaw = "laminar"
     fault: Text = ""
-    bound: Flag | None = None
 
     def __post_init__(self) -> None:
         if self.use == "calibrate" and (self.leak_lpm or self.fault):
@@ -156,7 +154,7 @@ class SimulatedPlan(_JudgedPlan):
     record draws, "" for the rig without drift; `onset_s`: of the leaks, nan for half of the duration; `factors`: name
     -> levels, every combination is a cell; `command` and `closed` are the duty, `family` names families of the profile,
     other names are parameters of the rig; `seed`: the base of every case's seed; `part`: what the plan is for, such as
-    development or judging; `bound`: of groups of records that do not say it.
+    development or judging.
     """
 
     rig_name: Annotated[Text, Field(alias="rig")] = "thesis"
@@ -170,7 +168,6 @@ class SimulatedPlan(_JudgedPlan):
     records: Annotated[tuple[RecordGroup, ...], Field(min_length=1)]
     factors: Mapping[str, Annotated[tuple[Level, ...], Field(min_length=1)]] = field(default_factory=dict)
     part: Text = ""
-    bound: Flag = False
 
     @cached_property
     def rig(self) -> Rig:
@@ -188,12 +185,6 @@ class SimulatedPlan(_JudgedPlan):
     def size(self) -> int:
         """Number of records."""
         return sum(group.count for group in self.records)
-
-    @property
-    def bounded(self) -> frozenset[float]:
-        """Sizes of leaks [L/min] whose rows get the bound of their machine."""
-        wanted = (group for group in self.records if (self.bound if group.bound is None else group.bound))
-        return frozenset(group.leak_lpm for group in wanted if group.leak_lpm)
 
 
 @dataclass(frozen=True, kw_only=True)
