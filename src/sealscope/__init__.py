@@ -11,7 +11,6 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sealscope import datasets as datasets
     from sealscope.diagnosis.commissioned.machine import CommissionedMachine as CommissionedMachine
     from sealscope.diagnosis.commissioned.machine import commission as commission
     from sealscope.diagnosis.commissioned.machine_file import load_machine as load_machine
@@ -65,7 +64,7 @@ _NAMES = {
 }
 _HOMES = {name: home for home, names in _NAMES.items() for name in names.split()}
 # LeakDetector needs the extra `learn`, so it is in no `import *`
-__all__ = list(sorted({*_HOMES, "__version__", "datasets"} - {"LeakDetector"}))
+__all__ = list(sorted({*_HOMES, "__version__"} - {"LeakDetector"}))
 
 
 def _load(name: str) -> Any:
@@ -73,8 +72,6 @@ def _load(name: str) -> Any:
         from importlib.metadata import version
 
         return version("sealscope")
-    if name == "datasets":
-        return import_module("sealscope.datasets")
     if name in _HOMES:
         return getattr(import_module(f"sealscope.{_HOMES[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
