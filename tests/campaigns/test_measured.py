@@ -15,7 +15,7 @@ from sealscope.errors import InputError
 from sealscope.recordings import read, write
 from sealscope.reporting.campaign.page import campaign_text, render_campaign_page
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 
 PLAN = """
 [campaign]
@@ -46,10 +46,10 @@ def recordings(tmp_path_factory):
     """Twelve healthy recordings and two leaky ones of one machine."""
     tmp_path = tmp_path_factory.mktemp("measured")
     for seed in range(1, 13):
-        made = simulate_with_truth(Experiment.of(command="3 sin(4t)", duration=8.0, seed=seed)).recording
+        made = simulate_experiment(Experiment.of(command="3 sin(4t)", duration=8.0, seed=seed)).recording
         write(made, tmp_path / f"healthy-{seed}.csv")
     for seed in range(2):
-        leak = simulate_with_truth(
+        leak = simulate_experiment(
             Experiment.of(command="3 sin(4t)", duration=8.0, seed=50 + seed, leak="0.3 L/min from 4 s")
         )
         write(leak.recording, tmp_path / f"leaky-{seed}.csv")

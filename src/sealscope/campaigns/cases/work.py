@@ -11,7 +11,7 @@ from sealscope.campaigns.cases.machines import experiment_of
 from sealscope.campaigns.cases.row import CaseRow, error_text
 from sealscope.campaigns.cases.scoring import judged_record
 from sealscope.campaigns.plans.model import SimulatedPlan
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 
 
 def work(plan: SimulatedPlan, case: CampaignCase, folder: Path | None = None) -> CaseRow:
@@ -25,7 +25,7 @@ def work(plan: SimulatedPlan, case: CampaignCase, folder: Path | None = None) ->
 
 
 def _work(plan: SimulatedPlan, case: CampaignCase, folder: Path | None) -> CaseRow:
-    simulated = simulate_with_truth(experiment_of(plan, case))
+    simulated = simulate_experiment(experiment_of(plan, case))
     if folder is not None:
         from sealscope.recordings import write
 
