@@ -89,7 +89,7 @@ def test_a_reproduction_follows_no_link(name: str, outside: Path, tmp_path: Path
 
 @pytest.mark.parametrize("name", ["figures", "tables"])
 def test_products_go_into_no_linked_folder(name: str, outside: Path, tmp_path: Path) -> None:
-    from sealscope.reporting.thesis.files import publish
+    from sealscope.thesis.pages.files import publish
 
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / name).symlink_to(outside)
