@@ -24,7 +24,7 @@ from bench_solvers import CASES, FREQUENCY, RATE, Case, build, quartiles, rms, t
 
 from sealscope.simulation.batch.batch import simulate_batch
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 
 PROMISED = 0.35
 #: Rig, peer and steps [s].
@@ -50,7 +50,7 @@ def timed(runs: list[Experiment], threads: int) -> tuple[float, float]:
 def same_run(case: Case, program: Path, step: float) -> float:
     """Rms difference [Pa] in p_A of the C++ program from the run that the batch is tested against, over 5 s."""
     one = replace(experiments(case, 1, 5.0, step)[0], allow_unresolved=True)  # its details are not measured here
-    ours = simulate_with_truth(one).truth.outputs["p_A"]
+    ours = simulate_experiment(one).truth.outputs["p_A"]
     difference = rms(theirs(program, case, step, 5.0)()[1][:, 1] - ours)
     if not difference < 1.0:
         raise SystemExit(f"{case.name}: the C++ program and ours must agree within 1 Pa rms, got {difference:.3g} Pa")

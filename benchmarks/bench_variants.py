@@ -43,12 +43,12 @@ VARIANTS: dict[str, tuple[str, dict[str, Any], str]] = {
 CHILD = """
 import sys, time
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 rig, values, command, duration = eval(sys.stdin.readline())
 experiment = Experiment.of(rig=rig, set=values, command=command, duration=duration)
 def timed():
     begun = time.process_time()
-    simulate_with_truth(experiment)
+    simulate_experiment(experiment)
     print(time.process_time() - begun, flush=True)
 timed()
 for _ in sys.stdin:

@@ -21,7 +21,7 @@ from sealscope.campaigns.cases.case import CampaignCase, cases_of, interleaved
 from sealscope.campaigns.cases.machines import experiment_of
 from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.campaigns.plans.reader import load_plan
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 
 PLANS = ("bench-detectors", "bench-closed-loop-development", "bench-single-rod-development", "bench-valve")
 VIEWS: dict[str, tuple[str, ...] | None] = {"all": None, "command": ("u", "p_A", "p_B")}
@@ -59,7 +59,7 @@ def recording_of(plan: SimulatedPlan, case: CampaignCase, fault: str, folder: Pa
     if path is not None and path.exists():
         return ss.read(path)
     own = replace(case, leak_lpm=LEAK) if fault == "leak" else replace(case, fault=fault)
-    recording = simulate_with_truth(experiment_of(plan, own)).recording
+    recording = simulate_experiment(experiment_of(plan, own)).recording
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         ss.write(recording, path)

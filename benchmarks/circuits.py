@@ -22,7 +22,7 @@ from sealscope.diagnosis.inference.blocks import information, zero_of
 from sealscope.diagnosis.inference.onset import step_test
 from sealscope.errors import SealscopeError
 from sealscope.recordings.recording import Recording
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 from sealscope.units import LITRE_PER_MINUTE
 
 PLANS = ("bench-single-rod-development", "bench-closed-loop-development", "bench-load-development", "bench-valve")
@@ -41,7 +41,7 @@ def chosen(plan_name: str, count: int) -> Iterator[tuple[CampaignCase, Recording
             continue
         taken[kind] += 1
         try:
-            run = simulate_with_truth(experiment_of(plan, case))
+            run = simulate_experiment(experiment_of(plan, case))
         except SealscopeError as error:
             print(f"{case.id}: {error}")
             continue

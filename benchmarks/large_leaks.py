@@ -23,7 +23,7 @@ from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 
 SIZES = (0.0002, 0.0005, 0.001, 0.0042, 0.015, 0.05, 0.1, 0.2, 0.5, 1.0)
 COMMANDS = ("3 sin(4t)", "5 sin(2t)", "8 sin(t)")
@@ -51,7 +51,7 @@ def row(lpm: float, detector: str, times: int) -> str:
         leak = f"{lpm} L/min {'orifice ' if law == 'orifice' else ''}from {onset:.3f} s"
         try:
             experiment = Experiment.of(command=command, duration=SECONDS, leak=leak, set=throttles, seed=number)
-            simulated = simulate_with_truth(experiment)
+            simulated = simulate_experiment(experiment)
         except (InputError, SimulationFailed):
             impossible += 1
             continue
@@ -80,7 +80,7 @@ def main() -> None:
     parser.add_argument("--detector", default="volume balance")
     chosen = parser.parse_args()
     verdicts = [
-        examined(simulate_with_truth(experiment).recording, chosen.detector).verdict
+        examined(simulate_experiment(experiment).recording, chosen.detector).verdict
         for seed in range(chosen.healthy)
         for command, throttles in settings()
         for experiment in [Experiment.of(command=command, duration=SECONDS, set=throttles, seed=seed)]

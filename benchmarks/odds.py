@@ -15,7 +15,7 @@ import numpy as np
 
 import sealscope as ss
 from sealscope.simulation.bench.machines import draw
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 
 LEVELS = (0.2, 0.1, 0.05, 0.02, 0.01)
 VIEWS = {"all channels": None, "pressures and command": ("u", "p_A", "p_B")}
@@ -31,7 +31,7 @@ def main() -> None:
     chances: dict[tuple[str, str], list[float]] = {}
     for machine in range(chosen.machines):
         own = draw("bench", chosen.seed + machine, duration=chosen.duration)
-        recording = simulate_with_truth(own.experiment(seed=own.seed)).recording
+        recording = simulate_experiment(own.experiment(seed=own.seed)).recording
         for view, channels in VIEWS.items():
             diagnosis = ss.diagnose(recording if channels is None else recording.only(channels))
             for detector in diagnosis.parts:

@@ -20,7 +20,7 @@ from sealscope.campaigns.cases.case import cases_of, interleaved
 from sealscope.campaigns.cases.machines import experiment_of
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 
 PLANS = ("bench-detectors", "bench-unmodelled-development", "bench-closed-loop-development", "bench-load-development")
 
@@ -41,7 +41,7 @@ def judged(plan_name: str, records: int, false_alarm: float, channels: str) -> d
     plan = load_plan(plan_name)
     kinds: dict[tuple[float, str], Kind] = defaultdict(Kind)
     for case in interleaved(cases_of(plan))[:records]:
-        simulated = simulate_with_truth(experiment_of(plan, case))
+        simulated = simulate_experiment(experiment_of(plan, case))
         kind, started = kinds[case.leak_lpm, case.fault], time.process_time()
         viewed = simulated.recording.only(channels.split(",")) if channels else simulated.recording
         verdict = diagnose(viewed, rig=plan.rig, false_alarm_probability=false_alarm)

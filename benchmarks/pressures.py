@@ -25,7 +25,7 @@ from sealscope.diagnosis.inference.pressures.evidence import PRIORS
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.bench.machines import draw
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 
 SECONDS, ONSET = 180.0, 90.0
 FAMILIES = (
@@ -70,7 +70,7 @@ def main() -> None:
             leak = f"{lpm:g} L/min {('laminar', 'orifice')[number % 2]} from {ONSET:g} s" if lpm else ()
             fault = {"fault": f"{given.fault} from {ONSET:g} s"} if given.fault else {}
             run = machine.experiment(seed=seed + 5, leak=leak, **fault)
-            simulated = simulate_with_truth(replace(run, leaks=sized_once(run)))
+            simulated = simulate_experiment(replace(run, leaks=sized_once(run)))
             recording, begun = simulated.recording.only(("u", "p_A", "p_B")), time.process_time()
             answers.append(answer(recording, rig, given.false_alarm))
             spent.append(time.process_time() - begun)

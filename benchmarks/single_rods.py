@@ -27,7 +27,7 @@ from sealscope.evaluation.binomial import clopper_pearson
 from sealscope.parameters import Rig, load_rig
 from sealscope.parameters.new_rig import rig_text
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.simulate import Run, simulate_with_truth
+from sealscope.simulation.simulate import Run, simulate_experiment
 from sealscope.units import LITRE_PER_MINUTE
 
 DEVELOPED = ("constant load", "swinging load")
@@ -129,7 +129,7 @@ def row(family: str, count: int, seed: int) -> tuple[str, np.ndarray]:
         balance = VolumeBalance(drawn.rig)
         for law in (LAWS[number % 2], None):
             try:
-                simulated = simulate_with_truth(drawn.experiment(law))
+                simulated = simulate_experiment(drawn.experiment(law))
             except (InputError, SimulationFailed):
                 continue
             evidence = balance.examine(simulated.recording, [], P)

@@ -25,7 +25,7 @@ from sealscope.campaigns.smallest import PlannedDuty, experiment_of, findable
 from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.parameters import load_rig
 from sealscope.simulation.leaks import Leak, from_time
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 from sealscope.units import LITRE_PER_MINUTE
 
 CASES = (("thesis", "3 sin(4t)"), ("thesis-closed-loop", "3 sin(3t)"), ("thesis", "8 sin(t)"))
@@ -92,7 +92,7 @@ def main() -> None:
             detected = 0
             for seed in range(given.seeds):
                 experiment = replace(experiment_of(rig, duty, given.duration, 1000 + seed), leaks=(leak,))
-                recording = simulate_with_truth(experiment).recording
+                recording = simulate_experiment(experiment).recording
                 detected += VolumeBalance(rig).examine(recording, [], 0.01).verdict == "leak"
             counts.append(f"{detected} of {given.seeds}")
         size = predicted.conductance * predicted.pressure / LITRE_PER_MINUTE

@@ -23,6 +23,7 @@ import sealscope as ss
 from sealscope.campaigns.cases.case import CampaignCase, cases_of
 from sealscope.campaigns.cases.machines import experiment_of
 from sealscope.campaigns.plans.reader import load_plan
+from sealscope.simulation.simulate import simulate_experiment
 
 HEALTHY, SIZE, FAULT = 64, 16, 10
 VIEWS = {"all": None, "pressures": {"u", "p_A", "p_B"}}
@@ -44,7 +45,7 @@ def recording_of(case: CampaignCase, folder: Path | None) -> ss.Recording:
     file = None if folder is None else folder / f"{case.id}.nc"
     if file is not None and file.is_file():
         return ss.read(file)
-    recording = ss.simulate_with_truth(experiment_of(load_plan("bench-detectors"), case)).recording
+    recording = simulate_experiment(experiment_of(load_plan("bench-detectors"), case)).recording
     if file is not None:
         file.parent.mkdir(parents=True, exist_ok=True)
         ss.write(recording, file)

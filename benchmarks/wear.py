@@ -38,7 +38,7 @@ from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Array, Recording
 from sealscope.simulation.bench.machines import BenchMachine, draw
 from sealscope.simulation.leaks import Leak
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 from sealscope.units import DAYS_PER_MONTH, DAYS_PER_YEAR, LITRE_PER_MINUTE
 
 HEALTHY_DAYS, WORN_DAYS, SECONDS, YEARS = 20, 84, 120.0, 10.0
@@ -83,7 +83,7 @@ def recording_of(seed: int, day: int, kelvin: float, conductance: float) -> Reco
     machine = machine_of(seed, day, kelvin)
     leak = {"leak": Leak(coefficient=conductance)} if conductance > 0.0 else {}
     experiment = machine.experiment(seed=10_000_000 + 1000 * seed + day, **leak)
-    return simulate_with_truth(experiment).recording
+    return simulate_experiment(experiment).recording
 
 
 def simulate(folder: Path, machines: int, pressures_of: int, seconds: float) -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import doctest
 import inspect
 import re
+from importlib import import_module
+from pathlib import Path
 
 import pytest
 
@@ -12,14 +15,8 @@ import sealscope as ss
 
 
 def public() -> dict[str, object]:
-    """Public names and their values; the functions of a public module stand beside it."""
-    values = {name: getattr(ss, name) for name in ss.__all__ if name != "__version__"}
-    for name, module in list(values.items()):
-        if inspect.ismodule(module):
-            functions = inspect.getmembers(module, inspect.isfunction)
-            own = {member: value for member, value in functions if value.__module__ == module.__name__}
-            values |= {f"{name}.{member}": value for member, value in own.items() if not member.startswith("_")}
-    return values
+    """Public names and their values."""
+    return {name: getattr(ss, name) for name in ss.__all__ if name != "__version__"}
 
 
 VALUES = public()
@@ -75,3 +72,13 @@ def test_the_examples_are_true(name, tmp_path, monkeypatch):
     assert runner.summarize(verbose=False).failed == 0
     # a class shows in its own docstring how it is used, whatever its methods show
     assert sum(len(example.examples) for example in examples if example.name == name) > 0
+
+
+def test_the_stub_names_each_export_once_and_is_what_python_loads():
+    tree = ast.parse(Path(ss.__file__).with_suffix(".pyi").read_text("utf-8"))
+    lines = [(node.module, alias) for node in tree.body if isinstance(node, ast.ImportFrom) for alias in node.names]
+    names = [alias.asname for _, alias in lines]
+    assert len(set(names)) == len(names)
+    assert {*names, "__version__"} == {*ss.__all__, "LeakDetector"}
+    for module, alias in lines:
+        assert getattr(ss, alias.name) is getattr(import_module(str(module)), str(alias.asname))

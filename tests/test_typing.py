@@ -16,7 +16,7 @@ import sealscope as ss
 recording: ss.Recording = ss.simulate(command="3 sin(4t)", leak="0.0042 L/min from 90 s", duration="3 min", rate=500)
 experiment: ss.Experiment = ss.Experiment.of(rig=ss.load_rig("thesis"), set={"V_1": "50[cm^3]"}, error="20[Pa]")
 changes = ss.simulate_batch([experiment], threads=1).changes("p_A", "d3")
-reveal_type(ss.simulate_with_truth(experiment).truth.onset_s)
+reveal_type(ss.simulate_with_truth(leak="0.0042 L/min from 90 s").truth.onset_s)
 reveal_type(ss.load_rig().cylinder.L)
 """
 WRONG = """\

@@ -19,51 +19,52 @@ import platform
 import re
 import shutil
 import stat
-import sys
 import tempfile
 from collections.abc import Callable
-from contextlib import suppress
 from functools import cache, cached_property
+from importlib import import_module
 from pathlib import Path
-from threading import Lock
+from types import ModuleType
 from typing import Any, TypeVar
 
 import numba
 import numpy as np
 from llvmlite import ir as llvm
 from numba import types
-from numba.core import config, ir
-from numba.core.caching import FunctionCache
-from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import CompilerBase
-from numba.core.compiler_machinery import FunctionPass, PassManager, register_pass
-from numba.core.ir_utils import get_definition, guard
-from numba.core.registry import CPUDispatcher
-from numba.core.typed_passes import (
-    AnnotateTypes,
-    IRLegalization,
-    NativeLowering,
-    NoPythonBackend,
-    NopythonTypeInference,
-    PreLowerStripPhis,
-)
-from numba.core.untyped_passes import (
-    DeadBranchPrune,
-    FixupArgs,
-    GenericRewrites,
-    IRProcessing,
-    ReconstructSSA,
-    RewriteSemanticConstants,
-    TranslateByteCode,
-)
 from numba.extending import intrinsic
+from platformdirs import user_cache_path
 
-config._config_fname = ""  # numba's settings in the working folder may be hostile, and name a library to load
-config.reload_config()
+# numba's settings in the working folder may be hostile, and name a library to load
+numba.config._config_fname = ""
+numba.config.reload_config()
 _F = TypeVar("_F", bound=Callable[..., Any])
-_COMPILED_PACKAGES = ("compiled.py", "physics", "signals", "control", "simulation", "diagnosis")
+_COMPILED_PACKAGES = (
+    *("compiled.py", "numba_pipeline.py", "numba_private.py"),
+    *("physics", "signals", "control", "simulation", "diagnosis"),
+)
 _KEPT_GENERATIONS = 4
+#: Versions of numba whose private names are known: from the first to before the second.
+KNOWN_VERSIONS = (0, 61, 2), (0, 69, 0)
 _log = logging.getLogger(__name__)
+
+
+def knows_version(version: str) -> bool:
+    """Return whether the private names of a version of numba are known."""
+    first, after = KNOWN_VERSIONS
+    return first <= tuple(int(digits) for digits in re.findall(r"\d+", version)[:3]) < after
+
+
+@cache
+def _compiler() -> ModuleType:
+    """Choose what compiles: numba's private classes where this version's are known, else its whole pipeline."""
+    if knows_version(numba.__version__):
+        return import_module("sealscope.numba_private")
+    low, high = (".".join(map(str, version)) for version in KNOWN_VERSIONS)
+    _log.warning(
+        "numba %s is not a version from %s to before %s: laws compile slowly and are not cached",
+        *(numba.__version__, low, high),
+    )
+    return import_module("sealscope.numba_pipeline")
 
 
 def source_hash(root: Path) -> str:
@@ -79,17 +80,12 @@ def source_hash(root: Path) -> str:
 
 
 def _user_cache_folder() -> Path | None:
+    """Choose the folder for compiled code; None where caching is turned off."""
     chosen = os.environ.get("SEALSCOPE_CACHE_DIR")
     if chosen is not None:
         return Path(chosen) if chosen else None
-    home = Path.home()
-    if sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local")
-    elif sys.platform == "darwin":
-        base = home / "Library" / "Caches"
-    else:
-        base = Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache")
-    return base / "sealscope"
+    folder = user_cache_path("sealscope", appauthor=False)
+    return folder if folder.is_absolute() else None  # of a user without a home
 
 
 def _prune(kernels: Path, current: str) -> None:
@@ -127,7 +123,7 @@ def cache_directory() -> Path | None:
     base = _user_cache_folder()
     if base is None:
         return None
-    environment = f"{numba.__version__} {platform.python_version()} {platform.machine()} {config.CPU_NAME}"
+    environment = f"{numba.__version__} {platform.python_version()} {platform.machine()} {numba.config.CPU_NAME}"
     key = hashlib.sha256((source_hash(Path(__file__).parent) + environment).encode()).hexdigest()[:20]
     for temporary in (False, True):
         directory = Path("kernels") / key
@@ -154,176 +150,15 @@ def cache_directory() -> Path | None:
     return None
 
 
-_one_at_a_time = Lock()
-
-
-class _Cache(FunctionCache):  # type: ignore[misc]
-    """numba's cache, where a file that cannot be read or written is a cache miss."""
-
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return the compiled code of a signature, None where there is none or it is damaged."""
-        try:
-            return super().load_overload(sig, target_context)
-        except Exception as error:  # unpickling a cut-off file raises many kinds
-            _log.debug("compiled code in %s is damaged: %s", self.cache_path, error)
-            with suppress(OSError):
-                self.flush()
-            return None
-
-    def save_overload(self, sig: Any, data: Any) -> None:
-        """Save the compiled code of a signature, if there is room for it."""
-        try:
-            super().save_overload(sig, data)
-        except Exception as error:
-            _log.debug("cannot save compiled code in %s: %s", self.cache_path, error)
-
-
-@register_pass(mutates_CFG=False, analysis_only=False)  # type: ignore[untyped-decorator]
-class _SettledLaws(FunctionPass):  # type: ignore[misc]
-    """Replace len(p.law) by its number, `p` an argument that is a named tuple or a record, `law` a tuple or an array.
-
-    So is len(choice) of an argument that is a tuple itself. Branches on it are then settled before types are inferred,
-    and a law that is absent is not even compiled.
-    """
-
-    _name = "sealscope_settled_laws"
-
-    def __init__(self) -> None:
-        FunctionPass.__init__(self)
-
-    def run_pass(self, state: Any) -> bool:
-        """Run the pass; True where it changed something."""
-        code, changed = state.func_ir, False
-
-        def definition(variable: Any) -> Any:
-            return guard(get_definition, code, variable)
-
-        def type_of(given: Any) -> Any:
-            if isinstance(given, ir.Arg):
-                return state.args[given.index]
-            numbers = definition(given.value) if getattr(given, "op", None) == "getattr" else None
-            kind = state.args[numbers.index] if isinstance(numbers, ir.Arg) else None
-            if isinstance(kind, types.BaseNamedTuple) and given.attr in kind.fields:
-                return kind.types[kind.fields.index(given.attr)]
-            return kind.typeof(given.attr) if isinstance(kind, types.Record) and given.attr in kind.fields else None
-
-        def length(value: Any) -> int | None:
-            if getattr(value, "op", None) != "call" or len(value.args) != 1:
-                return None
-            if getattr(definition(value.func), "value", None) is not len:
-                return None
-            kind = type_of(definition(value.args[0]))
-            if isinstance(kind, types.NestedArray):
-                return int(kind.shape[0])
-            return kind.count if isinstance(kind, types.BaseTuple) else None
-
-        for block in code.blocks.values():
-            for statement in block.body:
-                value = statement.value if isinstance(statement, ir.Assign) else None
-                count = length(value)
-                if count is not None:
-                    statement.value = ir.Const(count, statement.loc)
-                    known = code._definitions[statement.target.name]
-                    known[known.index(value)] = statement.value
-                    changed = True
-        return changed
-
-
-#: What of numba's compiler numbers and arrays need, closures, literals and expressions of whole arrays apart.
-_PASSES = (
-    *(TranslateByteCode, FixupArgs, IRProcessing, RewriteSemanticConstants, _SettledLaws, DeadBranchPrune),
-    *(GenericRewrites, ReconstructSSA, NopythonTypeInference, PreLowerStripPhis, IRLegalization, AnnotateTypes),
-    *(NativeLowering, NoPythonBackend),
-)
-
-
-class _Compiler(CompilerBase):  # type: ignore[misc]
-    """numba's compiler, reduced to `_PASSES`."""
-
-    def define_pipelines(self) -> list[Any]:
-        """Return the one pipeline."""
-        pipeline = PassManager("nopython")
-        for own in _PASSES:
-            pipeline.add_pass(own, own.__name__)
-        pipeline.finalize()
-        return [pipeline]
-
-
 def kernel(function: _F, fastmath: Any = False) -> _F:
     """Compile `function` (no Python objects, GIL released) with the safe cache; errors in floats follow IEEE 754."""
-    return _cached(function, {"no_cfunc_wrapper": True, "fastmath": fastmath})
+    return _compiler().compile_kernel(function, fastmath, cache_directory())  # type: ignore[no-any-return]
 
 
-def _cached(function: _F, own: dict[str, Any]) -> _F:
-    directory = cache_directory()
-    options = {"nogil": True, "error_model": "numpy"} | own
-    dispatcher = numba.njit(pipeline_class=_Compiler, **options)(function)
-    if directory is None:
-        return dispatcher  # type: ignore[no-any-return]
-    # numba reads the folder when the decorator runs; other users of numba in this process keep theirs. Two threads that
-    # import kernels at once would take each other's setting: none at all is the working directory.
-    with _one_at_a_time:
-        before = config.CACHE_DIR
-        config.CACHE_DIR = str(directory)
-        try:
-            dispatcher._cache = _Cache(function)  # as `cache=True` does
-        except (OSError, RuntimeError) as error:  # the folder is gone
-            _log.debug("cannot cache compiled code in %s: %s", directory, error)
-        finally:
-            config.CACHE_DIR = before
-    return dispatcher  # type: ignore[no-any-return]
-
-
-class _LawLibrary(JITCodeLibrary):  # type: ignore[misc]
-    """The code of a law, which kernels are linked with: without machine code, for no address of it is asked for.
-
-    It is optimised here, not anew within each kernel: a law gives the same bits in all of them.
-    """
-
-    def _finalize_final_module(self) -> None:
-        self._finalized = True
-
-
-class _LawCompiler(_Compiler):
-    """The compiler of laws, which makes no machine code: it is a fifth of the time that a kernel takes."""
-
-    def define_pipelines(self) -> list[Any]:
-        """Return the one pipeline."""
-        self.state.flags.no_compile = True
-        self.state.library = _LawLibrary(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
-        return super().define_pipelines()
-
-
-class _Law(CPUDispatcher):  # type: ignore[misc]
-    """A function that other compiled functions take in whole: made without the code by which Python calls it.
-
-    That code unpacks and checks each argument and takes more time to make than the law itself. Called from Python, a
-    small law is run by Python, a large one is compiled a second time, as a kernel is.
-    """
-
-    def add_overload(self, cres: Any) -> None:
-        """Keep compiled code for other compiled functions; nothing that Python could call."""
-        name = object()  # in place of machine code
-        self.targetctx.insert_user_function(name, cres.fndesc, [cres.library])
-        self.overloads[tuple(cres.signature.args)] = cres._replace(entry_point=name)
-
-    @cached_property
-    def _for_python(self) -> Any:
-        inlined = self.targetoptions["forceinline"]
-        return self.py_func if inlined else kernel(self.py_func, self.targetoptions["fastmath"])
-
-    def __call__(self, *arguments: Any, **named: Any) -> Any:
-        """Call from Python."""
-        return self._for_python(*arguments, **named)
-
-
-def _law(function: _F, fastmath: Any, inline: bool = True) -> _F:
-    if config.DISABLE_JIT:
+def _law(function: _F, fastmath: Any, inlined: bool = True) -> _F:
+    if numba.config.DISABLE_JIT:
         return function
-    options = {"nopython": True, "nogil": True, "error_model": "numpy", "fastmath": fastmath, "forceinline": inline}
-    options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-    options |= {} if inline else {"_nrt": False}
-    return _Law(function, targetoptions=options, pipeline_class=_LawCompiler)  # type: ignore[return-value]
+    return _compiler().compile_law(function, fastmath, inlined, cache_directory())  # type: ignore[no-any-return]
 
 
 def law(function: _F) -> _F:
@@ -333,7 +168,7 @@ def law(function: _F) -> _F:
 
 def large_law(function: _F) -> _F:
     """Compile a law that is too large to be inlined at each of its calls; else as `law`."""
-    return _law(function, False, inline=False)
+    return _law(function, False, inlined=False)
 
 
 def contracted(function: _F) -> _F:
@@ -346,19 +181,17 @@ def contracted(function: _F) -> _F:
 
 
 class Entry:
-    """A function double f(double *memory, double *given), compiled when its address is first asked for, and cached."""
+    """A function double f(double *memory, double *input), compiled when its address is first asked for, and cached."""
 
     _SIGNATURE = numba.float64(types.CPointer(numba.float64), types.CPointer(numba.float64))
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        self._dispatcher: Any = _cached(function, {"no_cpython_wrapper": True})
+        self._address = _compiler().compile_at_address(function, self._SIGNATURE, cache_directory())
 
     @cached_property
     def address(self) -> int:
-        """Where the compiled function is: C, `call_at` and ctypes can call it."""
-        self._dispatcher.compile(self._SIGNATURE)
-        compiled = self._dispatcher.overloads[self._SIGNATURE.args]
-        return int(compiled.library.get_pointer_to_function(compiled.fndesc.llvm_cfunc_wrapper_name))
+        """Address of the compiled function, for C, `call_at` and ctypes."""
+        return int(self._address())
 
 
 def entry(function: Callable[..., Any]) -> Entry:

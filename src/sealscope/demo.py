@@ -12,7 +12,7 @@ from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.recordings import read, write
 from sealscope.reporting.page import write_page
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.simulate import Progress, Truth, simulate_with_truth
+from sealscope.simulation.simulate import Progress, Truth, simulate_experiment
 from sealscope.storage.folders import make_folder
 
 #: The command of the demo, on the thesis's rig.
@@ -43,10 +43,10 @@ def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> D
     recordings = {}
     for k, name in enumerate(names):
         without = Experiment.of(command=COMMAND, duration=SECONDS, seed=len(names) * seed + k)
-        recordings[name] = simulate_with_truth(without).recording
+        recordings[name] = simulate_experiment(without).recording
         update("simulating healthy recordings", (k + 1) / len(names))
     experiment = Experiment.of(command=COMMAND, leak=LEAK, duration=60.0, seed=seed)
-    result = simulate_with_truth(experiment, progress)
+    result = simulate_experiment(experiment, progress)
     file, page = folder / "recording.nc", folder / "report.html"
     make_folder(folder / "healthy")
     for name, recording in {**recordings, file.name: result.recording}.items():

@@ -19,7 +19,7 @@ from sealscope.monitor.service import Source
 from sealscope.monitor.settings import ActuatorSettings, MonitorSettings, SimulateSettings
 from sealscope.monitor.sources.source_block import BlockReceiver, SourceBlock
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 
 #: Samples that a block holds [s].
 BLOCK_S = 1.0
@@ -82,7 +82,7 @@ def _source(name: str, experiment: Experiment, words: SimulateSettings, say: Cal
                 if receiver.stopping.is_set():
                     return
                 say(f"simulates {name}")
-                run = simulate_with_truth(experiment).recording
+                run = simulate_experiment(experiment).recording
             recording = run.only([channel for channel in CHANNELS if channel in run])
             count = round(BLOCK_S * recording.rate)
             began = time.monotonic()

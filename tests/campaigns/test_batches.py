@@ -20,7 +20,7 @@ from sealscope.campaigns.execution.batches import step_chooser
 from sealscope.campaigns.plans.reader import read_plan
 from sealscope.campaigns.results import simulated_result, write_result
 from sealscope.errors import InputError
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 
 QUIET = {f"sensors.{name}.{what}": 0.0 for name in ("p_A", "p_B") for what in ("noise", "drift", "hum")}
 QUIET |= {"sensors.common_noise": 0.0, "daq.bits": 24}
@@ -57,7 +57,7 @@ def alone(plan, case):
     """Scores of a case's whole recording, at the step that it has in a batch."""
     experiment = unsized(plan, case)
     experiment = replace(experiment, step=step_chooser(plan)(case, experiment))
-    made = simulate_with_truth(replace(experiment, leaks=sized_once(experiment)))
+    made = simulate_experiment(replace(experiment, leaks=sized_once(experiment)))
     return judged_record(made.recording, plan.onset_s, plan, plan.rig)[0], made.truth
 
 

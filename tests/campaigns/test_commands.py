@@ -111,7 +111,9 @@ def test_an_incomplete_campaign_says_so(call, tiny, finished_tiny):
         (("campaign", "report", "TINY", "-o", "nowhere"), "must have rows to report on"),
         (("campaign", "run", "TINY", "-o", "nowhere", "-j", "0"), "--jobs must be >= 1"),
         (("campaign", "run", "bench-volume", "--batch"), "got 'volume balance', which needs whole recordings"),
-        (("campaign", "run", "appendix-c", "--batch"), "must simulate its records; run it without --batch"),
+        (("campaign", "run", "rotary-seal", "--batch"), "must simulate its records; run it without --batch"),
+        (("campaign", "run", "rotary-seal"), "give their folder with --data"),
+        (("campaign", "run", "rotary-seal", "--data", "nowhere"), "--data must be the folder of recordings"),
     ],
 )
 def test_wrong_calls_are_one_line(call, tiny, tmp_path, monkeypatch, words, message):

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from importlib.metadata import EntryPoint
 
-import numpy as np
 import pytest
 
-from sealscope.campaigns.cases.bound import change_bound
 from sealscope.campaigns.cases.case import cases_of
 from sealscope.campaigns.cases.machines import experiment_of
 from sealscope.campaigns.cases.work import work
@@ -21,9 +18,6 @@ from sealscope.control import Flatness, registry
 from sealscope.errors import InputError
 from sealscope.simulation.bench.machines import draw
 from sealscope.simulation.bench.profile import load_profile
-from sealscope.simulation.commands import recorded
-from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.integrate import trajectory
 
 PLAN = """
 [campaign]
@@ -190,16 +184,3 @@ def test_a_profiles_duty_is_refused_in_one_line(tmp_path, duty, message):
     with pytest.raises(InputError, match=re.escape(message)) as error:
         load_profile(path)
     assert "own.toml" in str(error.value)
-
-
-def test_the_bound_of_a_closed_loop_is_that_of_its_voltages(monkeypatch):
-    """Put in again with the loop open, they move the piston as the controller did, and a leak shows as it would."""
-    monkeypatch.setattr("sealscope.campaigns.cases.bound.unknown_of", lambda rig: ("fluid.K_oil",))
-    closed = Experiment.of(rig="thesis-closed-loop", command="position 20 mm sin(2t)", duration=4.0)
-    a = trajectory(closed, ())
-    opened = replace(closed, command=recorded(a.t, a.volts, "as controlled"), controller=None)
-    b = trajectory(opened, ())
-    assert np.max(np.abs(a["x"] - b["x"])) < 1e-4
-    sizes = [change_bound(one, 60.0, 60.0, 0.1e6) for one in (closed, opened)]
-    assert sizes[0] == sizes[1]
-    assert 1e-5 < sizes[0] < 0.1

@@ -12,7 +12,7 @@ from sealscope.campaigns.plans.duty import closing_values, fault_of
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.errors import InputError
 from sealscope.simulation.bench import profile
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 
 
 @pytest.fixture
@@ -44,7 +44,7 @@ def test_the_cells_are_what_the_plan_says_and_not_what_was_drawn(bench):
 
 def test_the_same_case_gives_the_same_bytes(bench):
     case = cases_of(bench)[0]
-    one, other = (simulate_with_truth(experiment_of(bench, case)).recording for _ in range(2))
+    one, other = (simulate_experiment(experiment_of(bench, case)).recording for _ in range(2))
     assert all(np.array_equal(one[name], other[name]) for name in one.channels)
     rows = [work(bench, case).as_dict() | {"seconds": 0.0} for _ in range(2)]
     assert rows[0] == rows[1]

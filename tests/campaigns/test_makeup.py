@@ -11,7 +11,7 @@ from sealscope.campaigns.cases.machines import experiment_of
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.parameters import load_rig
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 
 
 @pytest.mark.slow
@@ -20,7 +20,7 @@ def test_a_circuit_that_fills_at_the_start_hides_no_small_leak() -> None:
     plan = load_plan("bench-detectors")
     leaking = (case for case in cases_of(plan) if case.leak_lpm == 0.0002)
     (case,) = itertools.islice(leaking, 1, 2)
-    recording = simulate_with_truth(experiment_of(plan, case)).recording
+    recording = simulate_experiment(experiment_of(plan, case)).recording
     detector = VolumeBalance(load_rig("thesis"))
     evidence = detector.examine(recording, [], 0.01)
     assert evidence.verdict == "leak"

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from shutil import copy, copytree
 
 import pytest
 
 from sealscope.campaigns.cases.recordings import recorded_rows
-from sealscope.campaigns.held_out.data_sets import hydraulic_samples, needs_folder
 from sealscope.campaigns.plans.reader import load_plan
-from sealscope.campaigns.results import held_out_result, prior_knowledge, recorded_result, write_result
+from sealscope.campaigns.results import prior_knowledge, recorded_result, write_result
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.errors import InputError, UnreadableFile
+from sealscope.errors import InputError
 from sealscope.recordings import read, write
 from sealscope.reporting.campaign.page import campaign_text, render_campaign_page
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 
 PLAN = """
 [campaign]
@@ -48,10 +46,10 @@ def recordings(tmp_path_factory):
     """Twelve healthy recordings and two leaky ones of one machine."""
     tmp_path = tmp_path_factory.mktemp("measured")
     for seed in range(1, 13):
-        made = simulate_with_truth(Experiment.of(command="3 sin(4t)", duration=8.0, seed=seed)).recording
+        made = simulate_experiment(Experiment.of(command="3 sin(4t)", duration=8.0, seed=seed)).recording
         write(made, tmp_path / f"healthy-{seed}.csv")
     for seed in range(2):
-        leak = simulate_with_truth(
+        leak = simulate_experiment(
             Experiment.of(command="3 sin(4t)", duration=8.0, seed=50 + seed, leak="0.3 L/min from 4 s")
         )
         write(leak.recording, tmp_path / f"leaky-{seed}.csv")
@@ -163,18 +161,6 @@ def test_a_set_without_files_and_a_file_in_two_sets_are_refused(folder):
         recorded_rows(plan_of(folder, PLAN.replace("first = 11", "first = 10")), folder)
 
 
-def test_data_that_are_not_there_are_named(tmp_path):
-    with pytest.raises(InputError, match="give its folder with --data"):
-        needs_folder(None, "the set")
-    with pytest.raises(InputError, match="--data must be the folder"):
-        needs_folder(tmp_path / "none", "the set")
-    with pytest.raises(UnreadableFile, match=r"profile\.txt"):
-        hydraulic_samples(tmp_path)
-    (tmp_path / "profile.txt").write_text("1\t2\n3\t4\n", encoding="utf-8")
-    with pytest.raises(UnreadableFile, match="must hold 2205 x 5 numbers"):
-        hydraulic_samples(tmp_path)
-
-
 def test_rotary_strokes(real_folder):
     """Levels of d3 lie high where the seal is defective; ten healthy strokes raise one alarm at 10 %."""
     result = recorded_result(load_plan("rotary-seal"), real_folder / "vtnsi_actuator")
@@ -184,15 +170,3 @@ def test_rotary_strokes(real_folder):
     assert table["d3 of p_B high"].alarms.value > 0.5
     assert table["d3 of p_B high"].false_alarm.count <= 4
     assert {"always fire", "never fire"} <= set(table)
-
-
-def test_pump_leakage_at_an_unseen_oil_temperature(real_folder, tmp_path):
-    """Pressures alone lose most of what random folds promise; with flow and motor power it holds."""
-    samples = hydraulic_samples(real_folder / "zema_hydraulic")
-    assert len(set(samples.tests)) == 194
-    result = held_out_result(load_plan("hydraulic-pump"), samples)
-    write_result(result, tmp_path)
-    with (tmp_path / "roc.csv").open(encoding="utf-8") as file:
-        areas = {row["detector"]: float(row["AUC"]) for row in csv.DictReader(file) if row["leak [grade]"] == "any"}
-    assert areas["logistic on six pressures"] < 0.8
-    assert areas["logistic on pressures, flow, power"] > 0.97

@@ -53,12 +53,6 @@ def test_a_plan_is_read_with_its_units(tiny):
     assert plan.factors["closed"] == ("0 %", "50 %")
 
 
-def test_a_bound_is_asked_for_all_sizes_of_leaks_or_for_those_of_a_group():
-    assert load_plan("bench-load").bounded == {0.0042}
-    assert load_plan("bench-unmodelled").bounded == {0.0005, 0.0042, 0.1, 0.5}
-    assert not load_plan("bench-volume").bounded
-
-
 def test_kinds_of_records_take_turns(tiny):
     """However early a campaign ends, each kind has its share, within one record."""
     cases = cases_of(load_plan(tiny))

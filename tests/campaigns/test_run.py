@@ -265,19 +265,6 @@ def test_rows_whose_origin_is_lost_are_not_continued(tiny, finished_tiny):
         campaign.run(load_plan(tiny), finished_tiny, jobs=1)
 
 
-def test_a_bound_asked_for_later_is_made(tiny, text, tmp_path):
-    few = text.replace("count = 6", "count = 1").replace("count = 5", "count = 1").replace("count = 10", "count = 8")
-    path = tmp_path / "few.toml"
-    path.write_text(few, encoding="utf-8")
-    assert campaign.run(load_plan(path), tmp_path / "rows", jobs=1).complete
-    path.write_text(few.replace('leak = "0.015 L/min"', 'leak = "0.015 L/min"\nbound = true'), encoding="utf-8")
-    plan = load_plan(path)
-    assert store.progress_of(plan, tmp_path / "rows").done == plan.size - 1
-    assert campaign.run(plan, tmp_path / "rows", jobs=1).complete
-    rows = store.rows_of(plan, tmp_path / "rows").values()
-    assert {row.leak_lpm for row in rows if row.bound_lpm is not None} == plan.bounded
-
-
 def test_a_spoilt_line_is_refused_with_its_place(tiny, tmp_path):
     plan = load_plan(tiny)
     store.begin(tmp_path, store.made_from(plan))

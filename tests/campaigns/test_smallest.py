@@ -14,7 +14,7 @@ from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
 from sealscope.simulation.leaks import Leak, from_time
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 from sealscope.units import LITRE_PER_MINUTE
 
 DUTY = PlannedDuty("3 sin(4t)")
@@ -36,7 +36,7 @@ def test_what_is_planned_is_found(rig: Rig, minute: Findable) -> None:
     for factor in (1.3, 1.0 / 3.0):
         leak = Leak("laminar", coefficient=factor * minute.conductance, opening=from_time(30.0))
         runs = [replace(experiment_of(rig, DUTY, 60.0, seed), leaks=(leak,)) for seed in range(10, 14)]
-        records = [simulate_with_truth(run).recording for run in runs]
+        records = [simulate_experiment(run).recording for run in runs]
         result.append(sum(VolumeBalance(rig).examine(own, [], 0.01).verdict == "leak" for own in records))
     assert result[0] >= 3 and result[1] == 0
 

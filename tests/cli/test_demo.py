@@ -84,6 +84,6 @@ def test_a_folder_that_cannot_be_one_is_refused_before_the_work(call, untouched,
     def not_called(*_):
         raise AssertionError("simulated before the folder was looked at")
 
-    monkeypatch.setattr("sealscope.demo.simulate_with_truth", not_called)
+    monkeypatch.setattr("sealscope.demo.simulate_experiment", not_called)
     assert call("demo", "-o", "taken").refused() == "cannot create folder: File exists (taken)"
     assert call("demo", "-o", "taken/below").refused().endswith("(taken/below)")

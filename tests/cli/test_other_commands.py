@@ -168,12 +168,12 @@ def test_bash_completes_with_the_script_that_is_shown(shell, tmp_path):
         }
         pressed sealscope diag
         pressed sealscope simulate --rig thesis-
-        pressed sealscope datasets zem
+        pressed sealscope campaign run bench-thes
     """
     done = shell("bash", "-c", script, PATH=f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
     assert (done.status, done.err) == (0, "")
     first, second, third = done.out.splitlines()
-    assert (first, third) == ("diagnose", "zema-hydraulic")
+    assert (first, third) == ("diagnose", "bench-thesis")
     assert "thesis-calibrated" in second.split()
 
 

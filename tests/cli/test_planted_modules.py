@@ -134,7 +134,7 @@ def test_none_runs_in_a_campaign(planted: Path, run: Ran) -> None:
 def test_settings_of_compiled_code_are_not_taken_from_the_working_folder(planted: Path, run: Ran) -> None:
     """numba reads them there: `cuda_driver` names a library that it loads."""
     (planted / ".numba_config.yaml").write_text("disable_jit: 1\ncuda_driver: ./evil.so\n")
-    text = "from sealscope import compiled\nprint(compiled.config.DISABLE_JIT, repr(compiled.config.CUDA_DRIVER))"
+    text = "import sealscope.compiled, numba\nprint(numba.config.DISABLE_JIT, repr(numba.config.CUDA_DRIVER))"
     assert run([], text).stdout == "0 ''\n"
 
 

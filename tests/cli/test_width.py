@@ -10,7 +10,7 @@ import pytest
 
 #: Calls in a folder with leak.nc, healthy_1.nc to healthy_3.nc and those as days/press_2024-05-0N.nc.
 CALLS = [
-    "rigs", "datasets", "parameters", "reproduce --list",
+    "rigs", "parameters", "reproduce --list",
     "diagnose healthy_1.nc --rig thesis", "-v diagnose leak.nc healthy_1.nc",
     "inspect leak.nc", "trend days", "-v trend days --rig thesis", "convert leak.nc leak.csv",
     "commission days -o press.toml --rig thesis", "report healthy_1.nc healthy_2.nc -o pages",

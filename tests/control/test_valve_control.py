@@ -22,7 +22,7 @@ from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.physics.valve import edge_flow
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 
 RIG = load_rig("servo-valve")
 #: Friction and stiffness off by 20 % from what the controllers assume.
@@ -32,7 +32,7 @@ OFF = {"F_pr": 30.0, "F_cfr": 1.2e-6, "F_v": 360.0, "K_oil": "551[MPa]"}
 def followed(command, duration, **options):
     """True position, target [m] and time [s] of a run."""
     experiment = Experiment.of(rig=RIG, command=command, duration=duration, **options)
-    run = simulate_with_truth(experiment)
+    run = simulate_experiment(experiment)
     return run, run.truth.outputs["x"], experiment.target.at(run.truth.t)
 
 
@@ -88,7 +88,7 @@ def test_an_overlap_is_crossed():
     errors = []
     for controller in (knows, replace(knows, dead_volts=0.0)):
         experiment = Experiment.of(rig=rig, command="position 20 mm sin(1.57t)", duration=8.0, controller=controller)
-        run = simulate_with_truth(experiment)
+        run = simulate_experiment(experiment)
         late = run.truth.t >= 2.0
         errors.append(np.sqrt(np.mean((run.truth.outputs["x"] - experiment.target.at(run.truth.t))[late] ** 2)))
     assert errors[0] < 0.5 * errors[1]

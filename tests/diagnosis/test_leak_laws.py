@@ -8,7 +8,7 @@ from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.inference.pressures.detector import PressureResponse
 from sealscope.parameters import load_rig
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 
 ONSET = 36.3
 
@@ -24,7 +24,7 @@ def test_mean_flow_and_onset(law: str, lpm: float, command: str) -> None:
     that slips.
     """
     leak = f"{lpm} L/min {'orifice ' if law == 'orifice' else ''}from {ONSET} s"
-    result = simulate_with_truth(Experiment.of(command=command, duration=75.0, leak=leak, seed=7))
+    result = simulate_experiment(Experiment.of(command=command, duration=75.0, leak=leak, seed=7))
     evidence = VolumeBalance(load_rig("thesis")).examine(result.recording, [], 0.01)
     true = result.truth.mean_leak_lpm
     assert evidence.verdict == "leak"
@@ -55,7 +55,7 @@ def test_half_of_the_blocks_leak_much(command: str, lpm: float, law: str) -> Non
     experiment = Experiment.of(
         command=command, duration=60.0, leak=f"{lpm} L/min {law}from 30 s", set=throttles, seed=3
     )
-    result = simulate_with_truth(experiment)
+    result = simulate_experiment(experiment)
     evidence = VolumeBalance(load_rig("thesis")).examine(result.recording, [], 0.01)
     true = result.truth.mean_leak_lpm
     assert evidence.verdict == "leak"
@@ -71,7 +71,7 @@ def test_zero_errors_of_the_transducers_do_not_bend_the_law(laws: tuple[str, ...
     offsets = {"sensors.p_A.offset": "12[kPa]", "sensors.p_1.offset": "12[kPa]"}
     offsets |= {"sensors.p_B.offset": "-12[kPa]", "sensors.p_2.offset": "-12[kPa]"}
     leak = [f"{lpm / len(laws)} L/min {'orifice ' if law == 'orifice' else ''}from {ONSET} s" for law in laws]
-    result = simulate_with_truth(Experiment.of(command="5 sin(2t)", duration=75.0, leak=leak, set=offsets, seed=7))
+    result = simulate_experiment(Experiment.of(command="5 sin(2t)", duration=75.0, leak=leak, set=offsets, seed=7))
     evidence = VolumeBalance(load_rig("thesis")).examine(result.recording, [], 0.01)
     true = result.truth.mean_leak_lpm
     assert evidence.leak_lpm == pytest.approx(true, rel=0.06)
@@ -83,7 +83,7 @@ def test_zero_errors_of_the_transducers_do_not_bend_the_law(laws: tuple[str, ...
 def test_mean_flow_from_pressures_and_command(law: str) -> None:
     """The flow of an orifice damps the ringing half as much as a laminar one: the interval holds both."""
     leak = f"0.015 L/min {'orifice ' if law == 'orifice' else ''}from {ONSET} s"
-    result = simulate_with_truth(Experiment.of(command="3 sin(4t)", duration=75.0, leak=leak, seed=7))
+    result = simulate_experiment(Experiment.of(command="3 sin(4t)", duration=75.0, leak=leak, seed=7))
     recording = result.recording.only(("u", "p_A", "p_B"))
     evidence = PressureResponse(load_rig("thesis")).examine(recording, [], 0.01)
     assert evidence.verdict == "leak"
@@ -95,7 +95,7 @@ def test_mean_flow_from_pressures_and_command(law: str) -> None:
 def test_pressures_that_hardly_vary_leave_the_size_as_it_is() -> None:
     """A laminar leak passes for an orifice whose zero is off: its flow is counted about that zero."""
     leak = "0.1 L/min from 30 s"
-    result = simulate_with_truth(
+    result = simulate_experiment(
         Experiment.of(rig="single-rod-eha", command="2 sin(6t)", load="0 N", duration=60.0, leak=leak, seed=1)
     )
     evidence = VolumeBalance(load_rig("single-rod-eha")).examine(result.recording, [], 0.01)

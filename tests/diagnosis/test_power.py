@@ -8,7 +8,7 @@ from sealscope.diagnosis.diagnose import Examination
 from sealscope.diagnosis.registry import detectors
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 
 #: The larger sizes need a duty whose pump delivers as much; in that one the details hardly show a leak.
 FAST, SLOW = "3 sin(4t)", "8 sin(t)"
@@ -24,7 +24,7 @@ THROTTLES = {"line.orifices": "present", "line.closed_A": "50[%]", "line.closed_
 def leaking(lpm: float, command: str) -> Recording:
     leak = f"{lpm} L/min from 30 s"
     experiment = Experiment.of(command=command, duration=60.0, leak=leak, set=THROTTLES, seed=3)
-    return simulate_with_truth(experiment).recording
+    return simulate_experiment(experiment).recording
 
 
 #: How long a detector's turn takes, where it is not slow.

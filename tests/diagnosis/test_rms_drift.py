@@ -18,7 +18,7 @@ from sealscope.signals.details import QUANTITIES
 from sealscope.simulation.bench.machines import draw
 from sealscope.simulation.commands import parse_command
 from sealscope.simulation.courses import parse_force
-from sealscope.simulation.simulate import simulate, simulate_with_truth
+from sealscope.simulation.simulate import simulate, simulate_experiment
 
 BLOCK = 1.5
 #: Deviation of a block's log RMS of d1..d4 where it is white noise at 500 Hz.
@@ -167,7 +167,7 @@ def test_what_noise_drowns_is_not_called_healthy() -> None:
 def test_a_loaded_machine_that_wanders_is_not_called_leaky(seed: int) -> None:
     """Under 800 N the ringing follows friction twice as much as it does unloaded, and the change of RMS alarms."""
     machine = replace(draw("load", seed, rig="thesis-closed-loop", duration=120.0), command=parse_command("5 sin(2t)"))
-    run = simulate_with_truth(machine.experiment(load=parse_force("800 N")))
+    run = simulate_experiment(machine.experiment(load=parse_force("800 N")))
     assert diagnose(run.recording.only(["u", "p_A", "p_B"]), rig="thesis-closed-loop").verdict != "leak"
 
 

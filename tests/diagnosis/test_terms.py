@@ -20,7 +20,7 @@ from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.channels import CHANNEL_UNITS
 from sealscope.recordings.recording import Array, Recording
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 
 RATE, DURATION, ONSET = 200.0, 60.0, 30.0
 LEAK = 5e-12
@@ -188,7 +188,7 @@ def test_nothing_is_balanced_without_a_source_of_flow(rig: Rig) -> None:
 @pytest.fixture(scope="module")
 def single_rod() -> Recording:
     words = {"rig": "single-rod-eha", "command": "5 sin(2t)", "load": "-3000 N", "leak": LATE}
-    return simulate_with_truth(Experiment.of(duration=120, seed=3, **words)).recording
+    return simulate_experiment(Experiment.of(duration=120, seed=3, **words)).recording
 
 
 @pytest.mark.parametrize("bar", [-6.0, -1.0, 6.0])
@@ -206,7 +206,7 @@ def test_a_zero_that_is_far_off_leaves_a_single_rod_s_leak_as_it_is(single_rod: 
 @pytest.mark.parametrize("samples", [-2, 0, 2])
 def test_a_position_recorded_late_is_named_and_changes_no_size(samples: int) -> None:
     experiment = Experiment.of(command="3 sin(4t)", duration=40, leak="0.05 L/min from 20 s", seed=3)
-    own = simulate_with_truth(experiment).recording
+    own = simulate_experiment(experiment).recording
     shifted = replace(own, channels={**own.channels, "x": np.roll(own["x"], samples)}).between(0.1, 39.9)
     diagnosis = diagnose(shifted, rig=load_rig("thesis"))
     assert diagnosis.verdict == "leak" and diagnosis.leak_lpm == pytest.approx(0.05, rel=0.03)

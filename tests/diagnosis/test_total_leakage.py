@@ -12,7 +12,7 @@ from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording
 from sealscope.reporting.messages import diagnosis_text, total_leakage
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 
 from .balance_machine import machine, step
 
@@ -113,7 +113,7 @@ def test_a_single_rod_s_total_is_stated_from_the_first_sample(command: str, load
     """An angle has no zero of the flow: what drifts over a cycle is what pump and piston pass together."""
     own = load_rig("single-rod-eha")
     experiment = Experiment.of(rig=own, command=command, load=load, duration=60, leak="0.1 L/min from 0 s", seed=3)
-    simulated = simulate_with_truth(experiment)
+    simulated = simulate_experiment(experiment)
     difference = simulated.truth.outputs["p_A"] - simulated.truth.outputs["p_B"]
     true = own.pump.G_pump * float(np.abs(difference).mean()) * LPM + simulated.truth.mean_leak_lpm
     diagnosis = diagnose(simulated.recording, rig=own)

@@ -13,7 +13,7 @@ from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.bench.machines import draw
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 
 from .balance_machine import irregular, machine, step
 
@@ -138,7 +138,7 @@ def test_a_leak_worth_finding_is_two_percent_of_the_pumps_flow_however_long_the_
 def test_under_a_weight_that_is_held_a_leak_inside_is_none_to_the_outside() -> None:
     """What swings alone showed a steady flow of 0.02 L/min to the outside beside it: `no leak` for 14 of 96 leaks."""
     drawn = draw("load", 100, rig="thesis-closed-loop", duration=120.0, family="resting, loop closed")
-    leaks = simulate_with_truth(drawn.experiment(seed=100, leak="0.0015 L/min from 60 s"))
+    leaks = simulate_experiment(drawn.experiment(seed=100, leak="0.0015 L/min from 60 s"))
     result = VolumeBalance(load_rig("thesis-closed-loop")).examine(leaks.recording, [], P)
     assert result.verdict == "leak" and result.cause in ("piston leak", "piston or pump leak"), result.reason
     assert result.leak_interval_lpm is not None

@@ -16,7 +16,7 @@ from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.simulate import Run, simulate_with_truth
+from sealscope.simulation.simulate import Run, simulate_experiment
 from sealscope.units import LITRE_PER_MINUTE
 
 RATE, SECONDS, P = 200.0, 120.0, 0.01
@@ -101,7 +101,7 @@ def test_the_accumulator_tells_oil_that_leaves_from_oil_that_passes() -> None:
 @cache
 def simulated(rig: str, command: str, load: str = "0 N", leak: str = "") -> Run:
     words = {"rig": rig, "command": command, "load": load, "duration": SECONDS, "seed": 2}
-    return simulate_with_truth(Experiment.of(**words, leak=leak or ()))
+    return simulate_experiment(Experiment.of(**words, leak=leak or ()))
 
 
 def test_an_open_loop_delivers_nothing_of_what_leaks() -> None:

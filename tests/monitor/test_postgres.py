@@ -6,7 +6,6 @@ import io
 import json
 import os
 import shutil
-import signal
 import tempfile
 import threading
 import time
@@ -16,12 +15,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from sqlalchemy import create_engine, inspect, text
+from sqlalchemy import create_engine, text
 from sqlalchemy.exc import OperationalError
 from starlette.testclient import TestClient
 
 from sealscope.diagnosis.live.estimates import BlockEstimate
-from sealscope.errors import InputError
 from sealscope.monitor.alarms import AlarmJudge
 from sealscope.monitor.database.store import MonitorStore, StoredRows, away
 from sealscope.monitor.database.tables import metadata
@@ -29,7 +27,7 @@ from sealscope.monitor.page.site import site
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import PageSettings, WatchSettings
 
-from .plant import HEALTHY, LINES, WORN, kill_often, lines_of, rows_of, served, settings_in, until
+from .plant import LINES, kill_often, rows_of, served, settings_in, until
 from .servers import NO_POSTGRESQL, PostgreSQL
 from .test_alarms import LEAK
 
@@ -59,87 +57,6 @@ def test_kills_change_no_row_in_postgresql(undisturbed, url: str, tmp_path: Path
     assert rows_of(url) == undisturbed
     served(settings, LINES)
     assert rows_of(url) == undisturbed
-
-
-SHARED = '\n[share]\nname = "{name}"\nlease_s = 2.0\n'
-FOUR = {"press 1": WORN, "press 2": HEALTHY, "press 3": HEALTHY, "press 4": WORN}
-
-
-def test_three_monitors_share_the_actuators_and_take_over_those_of_a_killed_one(url: str, tmp_path: Path):
-    more = '[[actuator]]\nname = "press 3"\n[[actuator]]\nname = "press 4"\n'
-    lines = lines_of(FOUR, 150).splitlines(keepends=True)
-    plain = tmp_path / "plain"
-    plain.mkdir()
-    served(settings_in(plain, more), b"".join(lines))
-    engine = create_engine(url)
-    metadata.drop_all(engine)
-    children, writers = {}, {}
-    for name in ("a", "b", "c"):
-        folder = tmp_path / name
-        folder.mkdir()
-        settings = settings_in(folder, more + SHARED.format(name=name), database=url)
-        reading, writing = os.pipe()
-        child = os.fork()
-        if child == 0:
-            status = 1
-            try:
-                os.close(writing)
-                for other in writers.values():
-                    os.close(other)
-                with os.fdopen(reading, "rb") as stream, Path(folder / "out.jsonl").open("w") as out:
-                    Service(settings, once=True, stdin=stream, stdout=out).run()
-                status = 0
-            finally:
-                os._exit(status)
-        os.close(reading)
-        children[name], writers[name] = child, writing
-    killed, holder = "", "select actuator, holder from leases where until > extract(epoch from clock_timestamp())"
-
-    def holders() -> dict[str, str]:
-        with engine.connect() as connection:
-            if not inspect(connection).has_table("leases"):
-                return {}
-            return {row.actuator: row.holder for row in connection.execute(text(holder))}
-
-    def shared() -> bool:
-        return set(holders()) == {"", *FOUR} and len(set(holders().values())) == 3
-
-    until(shared)
-    for k, line in enumerate(lines):
-        for name, writing in writers.items():
-            if name != killed:
-                os.write(writing, line)
-        time.sleep(10.0 / len(lines))
-        if k == len(lines) // 2:
-            until(shared)
-            killed = holders()["press 1"]
-            os.kill(children[killed], signal.SIGKILL)
-            since = time.monotonic()
-    while time.monotonic() - since < 30.0:  # asked: taken over within 30 s
-        held = holders()
-        if set(held) == {"", *FOUR} and killed not in held.values():
-            break
-        time.sleep(0.2)
-    else:
-        raise AssertionError(f"not taken over: {held}")
-
-    def stored() -> int:
-        with engine.connect() as connection:
-            return int(connection.execute(text("select count(*) from blocks")).scalar() or 0)
-
-    until(lambda: stored() == len(lines))
-    for name, writing in writers.items():
-        os.close(writing)
-        if name != killed:
-            assert os.waitstatus_to_exitcode(os.waitpid(children[name], 0)[1]) == 0
-    os.waitpid(children[killed], 0)
-    ours, theirs = rows_of(url), rows_of(str(plain / "monitor.db"))
-    for table in ("estimates", "alarms", "events", "blocks"):
-        assert ours[table] == theirs[table], table
-    said = [line for name in children for line in (tmp_path / name / "out.jsonl").read_text().splitlines()]
-    events = sorted({json.loads(line)["number"] for line in said})
-    assert len(events) == len(theirs["events"])  # none is left out; the last before the kill may come twice
-    engine.dispose()
 
 
 def test_an_event_that_is_stored_late_goes_out(url: str):
@@ -295,8 +212,3 @@ def test_a_statement_that_waits_for_a_lock_is_ended_by_the_server(server: Postgr
     finally:
         store.engine.dispose()
         other.dispose()
-
-
-def test_monitors_that_share_a_file_are_refused(tmp_path: Path):
-    with pytest.raises(InputError, match="monitors that share actuators need a database by URL"):
-        settings_in(tmp_path, SHARED.format(name="a"))

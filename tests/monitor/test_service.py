@@ -401,9 +401,9 @@ def test_settings_that_do_not_fit_together_are_refused(tmp_path: Path, more: str
         settings_in(tmp_path, more)
 
 
-def test_monitors_that_share_are_no_primary_host(tmp_path: Path):
-    with pytest.raises(InputError, match=r"mqtt\.host_id"):
-        settings_in(tmp_path, '[mqtt]\nhost_id = "a"\n[share]\nname = "a"\n', "postgresql://nowhere/monitor")
+def test_a_table_of_leases_is_refused(tmp_path: Path):
+    with pytest.raises(InputError, match="share"):
+        settings_in(tmp_path, '[share]\nname = "a"\n', "postgresql://nowhere/monitor")
 
 
 def test_settings_that_nobody_edited_complain_once(tmp_path, monkeypatch, caplog):

@@ -5,9 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
-import shutil
 import signal
-import tempfile
 import threading
 import time
 from collections.abc import Callable
@@ -22,7 +20,7 @@ from sealscope.monitor.service import Service
 from sealscope.monitor.settings import MonitorSettings
 
 from .plant import CHANNELS, HEALTHY, WORN, Running, rows_of, settings_in, until
-from .servers import MOSQUITTO, NO_POSTGRESQL, Broker, PostgreSQL
+from .servers import MOSQUITTO, Broker
 
 spb = pytest.importorskip("pysparkplug")
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(MOSQUITTO is None, reason="mosquitto is not installed")]
@@ -209,46 +207,6 @@ def told_in_parts(node: EdgeNode, start: int, stop: int) -> None:
         for k, (device, recording) in enumerate((("press 1", WORN), ("press 2", HEALTHY))):
             node.tell(k, device, recording.samples(slice(at, at + 150)))
         time.sleep(0.02)  # of QoS 0 a broker keeps none
-
-
-@pytest.mark.skipif(NO_POSTGRESQL is not None, reason=NO_POSTGRESQL or "")
-def test_monitors_that_share_actuators_hear_sparkplug_and_go_on_for_each_other(
-    broker: Broker,
-    tmp_path: Path,
-    undisturbed,
-):
-    """Of two monitors one ends halfway: no block is missing, none is stored twice, and one node states the alarm."""
-    folder = tempfile.mkdtemp(prefix="sealscope-pg-")
-    database = PostgreSQL(folder)
-    wire = Wire(broker.port)
-    node = EdgeNode(wire)
-    wire.on_message = lambda topic, payload: node.bear() if topic == "spBv1.0/plant/NCMD/edge" else None
-    running = []
-    for name in ("a", "b"):
-        more = MORE.format(port=broker.port, host="") + f'[share]\nname = "{name}"\nlease_s = 4.0\n'
-        running.append(Running(settings_in(tmp_path, more, database.url, OWN)))
-    stays, ends = running
-    try:
-        until(lambda: all(each.service.actuators.held for each in running))
-        wire.until("plant/NCMD/edge", 2)
-        wire.until("plant/DBIRTH/edge", 4)
-        half = len(WORN) // 300 * 150
-        told_in_parts(node, 0, half)
-        stays.until(2 * half // 150)
-        ends.end()
-        told_in_parts(node, half, len(WORN))
-        stays.until(2 * -(-len(WORN) // 150))
-        until(lambda: any("Alarm/Event" in values(each) for each in wire.of("Sealscope/DDATA/monitor/press 1")))
-    finally:
-        stays.end()
-        ends.end()
-        wire.close()
-    ours, theirs = rows_of(database.url), undisturbed
-    database.stop()
-    shutil.rmtree(folder, ignore_errors=True)
-    assert len(ours["blocks"]) == len(theirs["blocks"])
-    assert [row[:2] + row[3:4] for row in ours["estimates"]] == [row[:2] + row[3:4] for row in theirs["estimates"]]
-    assert [row[:3] for row in ours["alarms"]] == [row[:3] for row in theirs["alarms"]]
 
 
 def test_a_monitor_that_is_killed_dies_by_its_will_and_is_born_with_the_next_number(

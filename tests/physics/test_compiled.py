@@ -19,7 +19,7 @@ from numba.core import config
 from numba.core.errors import TypingError
 
 import sealscope
-from sealscope import compiled
+from sealscope import compiled, numba_private
 from sealscope.compiled import source_hash
 
 PACKAGE = Path(sealscope.__file__).parent
@@ -231,12 +231,12 @@ def test_threads_that_import_kernels_at_once_cache_them_in_the_user_s_folder(tmp
         pytest.skip("compiled code is not cached here")
     monkeypatch.chdir(tmp_path)
 
-    class Slow(compiled._Cache):
+    class Slow(numba_private.PatientCache):
         def __init__(self, function):
             time.sleep(random.uniform(0.0, 0.01))
             super().__init__(function)
 
-    monkeypatch.setattr(compiled, "_Cache", Slow)
+    monkeypatch.setattr(numba_private, "PatientCache", Slow)
     with ThreadPoolExecutor(4) as threads:
         kernels = list(threads.map(lambda _: compiled.kernel(compiled.source_hash), range(48)))
     assert {Path(kernel._cache.cache_path).parent for kernel in kernels} == {folder}

@@ -22,7 +22,7 @@ from sealscope.physics.friction import (
 )
 from sealscope.simulation.batch.batch import simulate_batch
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 
 F_C, K_BRK, C_C, F_V, V_TH = 25.0, 3.0, 10.0, 300.0, 0.002
 SIGMA_0, SIGMA_1 = 1e6, 1e3
@@ -138,7 +138,7 @@ def test_karnopps_piston_stands_still_until_it_breaks_away():
     """A pump that hardly turns builds up pressure; the piston does not creep, then it moves in jerks."""
     rig = {"friction.law": "karnopp", "v_th": 0.002}
     sticking, creeping = (
-        simulate_with_truth(Experiment.of(command="0.05 sin(1t)", set=values, duration=6.0)).truth.outputs
+        simulate_experiment(Experiment.of(command="0.05 sin(1t)", set=values, duration=6.0)).truth.outputs
         for values in (rig, {})
     )
     early = slice(0, 100)
@@ -163,5 +163,5 @@ def test_other_laws_in_lanes_are_what_they_are_alone(check_rig, details_of, thro
     ]
     batch = simulate_batch(experiments, bounds=[0.0, 4.0])
     for k, one in enumerate(experiments):
-        alone = details_of(simulate_with_truth(one).recording, [0.0, 4.0])
+        alone = details_of(simulate_experiment(one).recording, [0.0, 4.0])
         np.testing.assert_allclose(batch.rms[k, 0], alone[0], rtol=1e-3)

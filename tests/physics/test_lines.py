@@ -35,7 +35,7 @@ from sealscope.simulation.batch.batch import simulate_batch
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults import Fault, parse_fault
 from sealscope.simulation.leaks import from_time
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 
 LINES = {"orifices": "present", "closed_A": "50 %", "closed_B": "50 %", "p_charge": "2 MPa"}
 LOSSES = {"T_f": 0.09, "C_f": 0.03, "C_h": 60.0, "C_st": 2e-5, "G_pump": 2e-13}
@@ -234,7 +234,7 @@ def test_the_supply_of_a_valve_turns_against_the_losses():
 def test_a_leak_passes_what_the_oil_s_viscosity_lets_it(warmer):
     """Q_L = G dp mu_0/mu, whatever was asked for: a mean is what flows while it is open."""
     leak, fault = "0.02 L/min", f"oil {warmer:+g} K"
-    truth = simulate_with_truth(Experiment.of(leak=leak, fault=fault, duration=1.0)).truth
+    truth = simulate_experiment(Experiment.of(leak=leak, fault=fault, duration=1.0)).truth
     assert truth.mean_leak_lpm == pytest.approx(0.02, rel=2e-3)
     dp = truth.outputs["p_A"] - truth.outputs["p_B"]
     G = truth.leaks[0].coefficient
@@ -278,7 +278,7 @@ def test_throttle_filter_and_bypass_share_the_pressure(total, g, R, bypass):
 def test_a_filter_s_pressure_drop_over_what_passed_until_its_bypass_opens():
     """One stroke, dp = R Q (1 - k V/2)^-2 with V the integral of the flow; the valve then takes what is above."""
     values = {**PARTS, "k_clog_A": 4e4, "k_clog_B": 1e4, "n_clog": 1.5, "p_bypass": "2 bar", "G_bypass": 1e-9}
-    run = simulate_with_truth(Experiment.of(set={**values, "open_B": 1.0}, command="5 sin(0.5t)", duration=3.0))
+    run = simulate_experiment(Experiment.of(set={**values, "open_B": 1.0}, command="5 sin(0.5t)", duration=3.0))
     o, t, line = run.truth.outputs, run.truth.t, rig_with(**values).line
     Q = np.abs(o["Q_A"])
     c = rig_numbers(rig_with(**values)).c_A_in
@@ -308,7 +308,7 @@ def test_lanes_run_all_parts_as_a_run_by_itself_does(details_of):
     runs = [Experiment.of(rig=rig_with(**{**clogging, **QUIET, **more}), **options) for more in ({}, other)]
     batch = simulate_batch(runs, bounds=[0.0, 2.0])
     for k, one in enumerate(runs):
-        np.testing.assert_allclose(batch.rms[k], details_of(simulate_with_truth(one).recording, [0.0, 2.0]), rtol=1e-6)
+        np.testing.assert_allclose(batch.rms[k], details_of(simulate_experiment(one).recording, [0.0, 2.0]), rtol=1e-6)
     assert np.abs(batch.rms[0] / batch.rms[1] - 1.0).max() > 0.01
 
 

@@ -12,12 +12,12 @@ from sealscope.reporting.charts import Mark
 from sealscope.reporting.index import write_index
 from sealscope.reporting.page import render_page
 from sealscope.reporting.printing import BROWSERS
-from sealscope.reporting.thesis.files import publish
-from sealscope.reporting.thesis.page import VERDICTS, write_thesis_page
 from sealscope.reporting.trend.page import render_trend_page
 from sealscope.thesis.engine.build import ItemStatus
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Claim, ThesisTable
+from sealscope.thesis.pages.files import publish
+from sealscope.thesis.pages.page import VERDICTS, write_thesis_page
 
 pytestmark = pytest.mark.slow
 BROWSER = next(filter(None, map(shutil.which, BROWSERS)), None)

@@ -19,7 +19,7 @@ from sealscope.simulation.batch.batch import simulate_batch
 from sealscope.simulation.batch.noise import half_turn_sine, keys, logarithm, normals
 from sealscope.simulation.bench.machines import draw
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 
 QUIET = {f"sensors.{channel}.{what}": 0.0 for channel in ("p_A", "p_B") for what in ("noise", "drift")}
 QUIET["sensors.common_noise"] = 0.0
@@ -63,7 +63,7 @@ def test_each_run_is_what_it_is_by_itself(check_rig, rms_of, throttled, volumes)
     ]
     batch = simulate_batch(experiments, bounds=bounds)
     for k, one in enumerate(experiments):
-        alone = simulate_with_truth(one)
+        alone = simulate_experiment(one)
         np.testing.assert_allclose(batch.rms[k], rms_of(alone.recording, bounds), rtol=1e-6)
         assert batch.mean_leak_lpm[k] == pytest.approx(alone.truth.mean_leak_lpm, rel=1e-4, abs=1e-12)
     assert np.all(batch.steps == 5e-4)
@@ -71,7 +71,7 @@ def test_each_run_is_what_it_is_by_itself(check_rig, rms_of, throttled, volumes)
     values = {"sensors.p_A.gain_error": 0.01, "sensors.p_A.offset": 4000.0, "sensors.p_B.range_hi": 4.9e5}
     observed = replace(experiments[1], rig=experiments[1].rig.with_overrides(values))
     changed = simulate_batch([observed], bounds=bounds)
-    np.testing.assert_allclose(changed.rms[0], rms_of(simulate_with_truth(observed).recording, bounds), rtol=1e-6)
+    np.testing.assert_allclose(changed.rms[0], rms_of(simulate_experiment(observed).recording, bounds), rtol=1e-6)
     assert np.abs(changed.rms[0] / batch.rms[1] - 1.0).max() > 1e-3
 
 
@@ -85,7 +85,7 @@ def test_single_rods_run_side_by_side(rms_of):
     ]
     batch = simulate_batch(experiments, bounds=[0.0, 4.0])
     for k, experiment in enumerate(experiments):
-        alone = rms_of(simulate_with_truth(experiment).recording, [0.0, 4.0])
+        alone = rms_of(simulate_experiment(experiment).recording, [0.0, 4.0])
         np.testing.assert_allclose(batch.rms[k], alone, rtol=2e-3)
     assert np.all(np.ptp(batch.rms, axis=0) > 0)
 
@@ -94,7 +94,7 @@ def test_hum_is_read_as_by_itself_up_to_its_phase(check_rig, rms_of):
     values = {**FINE, "sensors.p_A.hum": 1e5, "sensors.p_A.hum_frequency": 50.0}
     one = Experiment.of(rig=check_rig(**values), command="0 sin(t)", duration=8.0)
     batch = simulate_batch([one], bounds=[0.0, 8.0])
-    np.testing.assert_allclose(batch.rms[0, 0], rms_of(simulate_with_truth(one).recording, [0.0, 8.0])[0], rtol=2e-3)
+    np.testing.assert_allclose(batch.rms[0, 0], rms_of(simulate_experiment(one).recording, [0.0, 8.0])[0], rtol=2e-3)
     assert batch.rms[0, 0, 0, 2] > 1e4
 
 
@@ -107,21 +107,21 @@ def test_drifting_machines_are_what_they_are_by_themselves(rms_of, seed):
     bounds = [0.0, 6.0, 12.0]
     # drifts are held over other cells than in a run by itself, and the ringing answers to friction's last per cent
     np.testing.assert_allclose(
-        simulate_batch([one], bounds=bounds).rms[0], rms_of(simulate_with_truth(one).recording, bounds), rtol=3e-2
+        simulate_batch([one], bounds=bounds).rms[0], rms_of(simulate_experiment(one).recording, bounds), rtol=3e-2
     )
 
 
 def test_other_commands_are_what_they_are_by_themselves(rms_of):
     noisy = Experiment.of(command="prbs 1 every 0.5 s seed 4", set=QUIET, duration=8.0, **COMMON)
     result = simulate_batch([noisy], bounds=[0.0, 8.0]).rms[0]
-    np.testing.assert_allclose(result, rms_of(simulate_with_truth(noisy).recording, [0.0, 8.0]), rtol=1e-6)
+    np.testing.assert_allclose(result, rms_of(simulate_experiment(noisy).recording, [0.0, 8.0]), rtol=1e-6)
 
 
 def test_a_fault_of_the_machine_comes_in_when_it_does_by_itself(rms_of):
     one = Experiment.of(fault="friction x1.5 from 5.13 s", set=QUIET, duration=10.0, **COMMON)
     bounds = [0.0, 5.0, 10.0]
     result = simulate_batch([one], bounds=bounds).rms[0]
-    np.testing.assert_allclose(result, rms_of(simulate_with_truth(one).recording, bounds), rtol=1e-6)
+    np.testing.assert_allclose(result, rms_of(simulate_experiment(one).recording, bounds), rtol=1e-6)
     assert np.abs(result[0, 1] / result[0, 0] - 1.0).max() > 0.05
 
 
@@ -133,7 +133,7 @@ def test_valves_in_the_lines_move_as_they_do_by_themselves(check_rig, rms_of):
     bounds = [0.0, 2.2, 3.2, 5.0]
     batch = simulate_batch(experiments, bounds=bounds)
     for k, one in enumerate(experiments):  # cells are those of all runs of a set
-        np.testing.assert_allclose(batch.rms[k], rms_of(simulate_with_truth(one).recording, bounds), rtol=1e-4)
+        np.testing.assert_allclose(batch.rms[k], rms_of(simulate_experiment(one).recording, bounds), rtol=1e-4)
     assert np.abs(batch.rms[0, :, 1] / batch.rms[1, :, 1] - 1.0).min() > 0.05
     with pytest.raises(SimulationFailed, match="step must be"):  # where the pump's oil circulates
         stiff = rig.with_overrides({"G_circ": 2e-9})
@@ -155,7 +155,7 @@ def test_loads_push_side_by_side_as_they_do_by_themselves(check_rig, rms_of):
     bounds = [0.0, 3.0, 6.0]
     batch = simulate_batch(experiments, bounds=bounds)
     for k, experiment in enumerate(experiments):
-        alone = simulate_with_truth(experiment)
+        alone = simulate_experiment(experiment)
         np.testing.assert_allclose(batch.rms[k], rms_of(alone.recording, bounds), rtol=1e-6)
     assert np.ptp(batch.rms[:, 0, 1, 2]) > 1.0
 
@@ -165,7 +165,7 @@ def test_oil_boils_side_by_side_as_it_does_by_itself(check_rig, rms_of):
     values = {"p_vap": "2 kPa", "p_charge": "0 Pa", "F_v": 6000.0, **QUIET, "sensors.p_A.range_lo": -2e5}
     rig, bounds = check_rig(**values, **{"sensors.p_B.range_lo": -2e5}), [0.0, 6.0]
     one = Experiment.of(rig=rig, command="9 sin(4t)", duration=6.0, **COMMON)
-    alone = simulate_with_truth(one)
+    alone = simulate_experiment(one)
     assert alone.truth.outputs["p_B"].min() == 2e3 - 101325
     np.testing.assert_allclose(simulate_batch([one], bounds=bounds).rms[0], rms_of(alone.recording, bounds), rtol=1e-6)
 
@@ -193,7 +193,7 @@ def test_a_leak_of_a_stated_mean_has_it(check_rig):
     ]
     batch = simulate_batch(experiments)
     np.testing.assert_allclose(batch.mean_leak_lpm, [0.0042, 0.01, 0.05], rtol=2e-3)
-    alone = simulate_with_truth(experiments[1]).truth
+    alone = simulate_experiment(experiments[1]).truth
     assert batch.coefficients[1] == pytest.approx(alone.leaks[0].coefficient, rel=3e-3)
     with pytest.raises(SimulationFailed, match="to resolve the leak of run 0"):
         simulate_batch([Experiment.of(leak="1.5 L/min", command="1 sin(4t)", duration=2.0)])
@@ -268,7 +268,7 @@ def test_memory_does_not_grow_with_the_length_of_the_runs(check_rig):
 def test_the_changes_are_those_of_the_thesis_s_statistic(check_rig, rms_of):
     one = Experiment.of(rig=check_rig(**QUIET), leak="G = 3e-12 from 10 s", duration=20.0, step=5e-4)
     batch = simulate_batch([one])
-    expected = rms_of(simulate_with_truth(one).recording, [0.0, 10.0, 20.0])
+    expected = rms_of(simulate_experiment(one).recording, [0.0, 10.0, 20.0])
     changes = np.array([[batch.changes(channel, detail)[0] for detail in QUANTITIES] for channel in NAMES])
     np.testing.assert_allclose(changes, 100.0 * (expected[:, 1] / expected[:, 0] - 1.0), atol=1e-3)
     assert batch.changes("p_A", "d3")[0] < -5.0
@@ -309,8 +309,8 @@ def test_late_channels_are_read_late(check_rig, rms_of):
     prompt = Experiment.of(rig=check_rig(**QUIET), duration=6.0, step=5e-4)
     bounds = [0.0, 1.01, 3.0, 6.0]
     batch = simulate_batch([one, prompt], bounds=bounds)
-    np.testing.assert_allclose(batch.rms[0], rms_of(simulate_with_truth(one).recording, bounds), rtol=1e-6)
-    np.testing.assert_allclose(batch.rms[1], rms_of(simulate_with_truth(prompt).recording, bounds), rtol=1e-6)
+    np.testing.assert_allclose(batch.rms[0], rms_of(simulate_experiment(one).recording, bounds), rtol=1e-6)
+    np.testing.assert_allclose(batch.rms[1], rms_of(simulate_experiment(prompt).recording, bounds), rtol=1e-6)
     assert np.abs(batch.rms[0] / batch.rms[1] - 1.0).max() > 1e-5
 
 
@@ -331,7 +331,7 @@ def test_valve_controlled_runs_side_by_side_are_what_they_are_by_themselves(rms_
     ]
     batch = simulate_batch(experiments, bounds=bounds)
     for k, one in enumerate(experiments):
-        alone = simulate_with_truth(one)
+        alone = simulate_experiment(one)
         np.testing.assert_allclose(batch.rms[k], rms_of(alone.recording, bounds), rtol=1e-6)
         assert batch.mean_leak_lpm[k] == pytest.approx(alone.truth.mean_leak_lpm, rel=1e-4, abs=1e-12)
 

@@ -15,7 +15,7 @@ from sealscope.simulation.bench.machines import centred_start, draw
 from sealscope.simulation.bench.profile import Profile, load_profile
 from sealscope.simulation.changes import LONGEST_BLOCK, RESOLUTION, Schedule
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 
 PSI = 6894.757293168361
 
@@ -128,11 +128,11 @@ def test_the_same_seed_is_the_same_machine_and_the_same_bytes(bench):
     assert draw(bench, 7) == draw("bench", 7)
     assert draw(bench, 7) != draw(bench, 8)
     one, again = (
-        simulate_with_truth(draw("bench", 7, duration=4.0).experiment(leak="G = 6e-13 from 2 s")) for _ in range(2)
+        simulate_experiment(draw("bench", 7, duration=4.0).experiment(leak="G = 6e-13 from 2 s")) for _ in range(2)
     )
     for name in one.recording.channels:
         assert one.recording[name].tobytes() == again.recording[name].tobytes()
-    other = simulate_with_truth(draw("bench", 8, duration=4.0).experiment()).recording
+    other = simulate_experiment(draw("bench", 8, duration=4.0).experiment()).recording
     assert not np.array_equal(one.recording["p_A"], other["p_A"])
     assert "drift" not in str(dict(one.recording.provenance)["experiment"]).replace(".drift", "")
     assert len(one.truth.drifts) == len(draw("bench", 7).drifts)
@@ -162,7 +162,7 @@ def test_strokes_lie_about_the_middle(command):
     rig = load_rig().with_overrides({"omega_per_volt": 26.7})
     duration = 6.0 if "ramp" in command else 40.0
     x_0 = centred_start(rig, command, duration)
-    x = simulate_with_truth(Experiment.of(rig=rig, command=command, duration=duration, x_0=x_0)).truth.outputs["x"]
+    x = simulate_experiment(Experiment.of(rig=rig, command=command, duration=duration, x_0=x_0)).truth.outputs["x"]
     assert abs(x.max() + x.min()) < 0.02 * np.ptp(x) + 1e-3
     assert np.ptp(x) > 0.05
 
@@ -170,7 +170,7 @@ def test_strokes_lie_about_the_middle(command):
 def test_strokes_behind_a_valve_lie_about_the_middle():
     rig, command = load_rig("servo-valve"), "8 sin(t)"
     x_0 = centred_start(rig, command, 14.0)
-    x = simulate_with_truth(Experiment.of(rig=rig, command=command, duration=14.0, x_0=x_0)).truth.outputs["x"]
+    x = simulate_experiment(Experiment.of(rig=rig, command=command, duration=14.0, x_0=x_0)).truth.outputs["x"]
     assert abs(x.max() + x.min()) < 0.05 * np.ptp(x)  # friction and the supply take a little
     assert 0.3 < np.ptp(x) < 0.55
 

@@ -19,7 +19,7 @@ from sealscope.simulation.closed_loop import outputs_per_sample
 from sealscope.simulation.courses import parse_force, parse_position
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.integrate import trajectory
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 
 #: Friction up and stiffness down by 20 %, and the other way round: what the controller does not know.
 _STIFFER = {"F_pr": 20.0, "F_cfr": 0.8e-6, "F_v": 240.0, "K_oil": 827e6}
@@ -93,7 +93,7 @@ class Ladder:
 def test_a_voltage_acts_after_its_delay_until_the_next_and_the_encoder_counts():
     ladder = Ladder([])
     options = {"rig": "thesis-closed-loop", "command": "position 10 mm sin(10t)", "duration": 0.4}
-    run = simulate_with_truth(Experiment.of(controller=ladder, **options))
+    run = simulate_experiment(Experiment.of(controller=ladder, **options))
     steps = np.maximum(np.arange(200) // 2 - 1, 0)  # samples at 500 Hz, two a sample of the controller, late by two
     np.testing.assert_allclose(run.recording["u"], np.minimum(0.1 * steps, 10.0), atol=1e-12)
     x = np.array([measured.x for measured in ladder.observed])
@@ -123,7 +123,7 @@ def step_by_step(experiment, path):
 
 def test_a_closed_loop_is_the_same_again_whatever_the_steps():
     options = {"rig": "thesis-closed-loop", "command": "position 20 mm sin(3t)", "duration": 3.0, "seed": 3}
-    first, again = (simulate_with_truth(Experiment.of(**options)) for _ in range(2))
+    first, again = (simulate_experiment(Experiment.of(**options)) for _ in range(2))
     np.testing.assert_array_equal(first.recording["p_A"], again.recording["p_A"])
     fine = trajectory(Experiment.of(**options), (), step=2.5e-5)
     coarse = trajectory(Experiment.of(**options), ())
@@ -158,7 +158,7 @@ def test_a_load_that_is_there_from_the_start_is_carried_from_the_start(check_rig
 def test_faults_and_leaks_meet_a_closed_loop():
     """A changed duty changes the target, a leak is sized under the controller."""
     words = {"rig": "thesis-closed-loop", "command": "position 20 mm sin(2t)", "duration": 4.0}
-    run = simulate_with_truth(Experiment.of(**words, fault="duty amplitude x1.5 from 2 s", leak="0.05 L/min from 1 s"))
+    run = simulate_experiment(Experiment.of(**words, fault="duty amplitude x1.5 from 2 s", leak="0.05 L/min from 1 s"))
     assert run.truth.mean_leak_lpm == pytest.approx(0.05, rel=2e-3)
     assert run.truth.outputs["x"][run.truth.t < 2.0].max() == pytest.approx(0.02, rel=0.02)
     assert run.truth.outputs["x"].max() == pytest.approx(0.03, rel=0.02)

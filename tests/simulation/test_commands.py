@@ -23,7 +23,7 @@ from sealscope.simulation.commands import (
     step,
 )
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.simulate import simulate, simulate_with_truth
+from sealscope.simulation.simulate import simulate, simulate_experiment
 
 number = st.floats(-1e6, 1e6, allow_subnormal=False)
 positive = st.floats(1e-6, 1e6)
@@ -137,7 +137,7 @@ def test_a_command_beyond_the_converter_is_refused_with_value_and_time():
 def test_a_command_beyond_the_converter_between_samples_is_refused_too():
     # 12 V at 500 Hz, sampled at 500 Hz: zero at every sample
     with pytest.raises(InputError, match=r"within \+-10 V, got -?12 V"):
-        simulate_with_truth(Experiment.of(command=Sine(12.0, 1000.0 * np.pi), duration=1.0))
+        simulate_experiment(Experiment.of(command=Sine(12.0, 1000.0 * np.pi), duration=1.0))
     # and what it would be after the end is nobody's business
     simulate(command="ramp 20 from 0 s to 2 s", duration=1.0)
 

@@ -13,7 +13,7 @@ from sealscope.simulation.commands import Sine, recorded, tabulated
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.integrate import trajectory
 from sealscope.simulation.leaks import Leak
-from sealscope.simulation.simulate import prove, simulate, simulate_with_truth
+from sealscope.simulation.simulate import prove, simulate, simulate_experiment, simulate_with_truth
 
 THROTTLED = {"orifices": "present", "closed_A": "50 %", "closed_B": "50 %"}
 
@@ -67,7 +67,7 @@ def test_the_key_tells_experiments_apart_to_the_last_digit():
 
 
 def test_a_run_is_told_in_its_provenance():
-    result = simulate_with_truth(Experiment.of(duration=1.0, set={"V": "200[cm^3]"}, seed=9)).recording
+    result = simulate_experiment(Experiment.of(duration=1.0, set={"V": "200[cm^3]"}, seed=9)).recording
     reported = result.provenance
     assert reported["origin"] == "simulation"
     found_error = reported["solver"].pop("error_found_pa")
@@ -92,19 +92,19 @@ def test_a_smaller_error_is_a_finer_and_a_truer_run(values):
         steps.append(path.step)
         assert error(path) < (100.0 if allowed is None else allowed)
     assert steps[0] > steps[1] > steps[2]
-    reported = simulate_with_truth(replace(experiment, duration=1.0, error=3.0)).recording.provenance["solver"]
+    reported = simulate_experiment(replace(experiment, duration=1.0, error=3.0)).recording.provenance["solver"]
     assert reported["error_pa"] == 3.0
     assert reported["error_found_pa"] < 3.0
     assert (
         "error_pa"
-        not in simulate_with_truth(replace(experiment, duration=1.0, step=5e-4)).recording.provenance["solver"]
+        not in simulate_experiment(replace(experiment, duration=1.0, step=5e-4)).recording.provenance["solver"]
     )
 
 
 def test_an_error_is_positive_and_stands_alone():
     for wrong in (0.0, -20.0, float("nan"), float("inf")):
         with pytest.raises(InputError, match="error must be > 0 Pa, got"):
-            simulate_with_truth(Experiment.of(duration=1.0, error=wrong))
+            simulate_experiment(Experiment.of(duration=1.0, error=wrong))
     with pytest.raises(InputError, match=r"a stated step or a stated error, not both, got .* 0\.0005 s and error = 20"):
         Experiment.of(duration=1.0, error=20.0, step=5e-4)
 
@@ -139,7 +139,7 @@ def test_a_chattering_run_cannot_prove_itself():
 def test_progress_is_told_from_nothing_to_all(leak, words):
     """The last run that sizes a leak is the run."""
     reported: list[tuple[str, float]] = []
-    simulate_with_truth(
+    simulate_experiment(
         Experiment.of(duration=10.0, leak=leak), progress=lambda words, share: reported.append((words, share))
     )
     assert {words for words, _ in reported} == {words}
@@ -198,11 +198,14 @@ def test_simulate_names_itself():
     with pytest.raises(InputError, match="simulate: too many positional arguments"):
         simulate("3 sin(4t)")
     with pytest.raises(InputError, match="experiment must be an Experiment"):
-        simulate_with_truth("3 sin(4t)")
+        simulate_experiment("3 sin(4t)")
+    with pytest.raises(InputError, match="simulate_with_truth: too many positional arguments"):
+        simulate_with_truth(Experiment.of())
 
 
 def test_simulate_and_an_experiment_take_the_same_arguments():
     ours, theirs = (dict(inspect.signature(function).parameters) for function in (simulate, Experiment.of))
+    assert dict(inspect.signature(simulate_with_truth).parameters) == ours
     assert ours == theirs
 
 
@@ -213,11 +216,11 @@ def test_a_stated_step_is_checked_like_a_chosen_one():
     with pytest.raises(
         SimulationFailed, match=r"under-resolved: halving the step of 0\.00125 s \(rk4\) moves .*; take a "
     ):
-        simulate_with_truth(Experiment.of(**COARSE))
-    solver = simulate_with_truth(Experiment.of(**COARSE, allow_unresolved=True)).recording.provenance["solver"]
+        simulate_experiment(Experiment.of(**COARSE))
+    solver = simulate_experiment(Experiment.of(**COARSE, allow_unresolved=True)).recording.provenance["solver"]
     assert solver["allow_unresolved"]
     assert solver["error_found_pa"] > 100.0
-    fine = simulate_with_truth(Experiment.of(duration=4.0, step=5e-4)).recording.provenance["solver"]
+    fine = simulate_experiment(Experiment.of(duration=4.0, step=5e-4)).recording.provenance["solver"]
     assert 0.0 < fine["error_found_pa"] < 100.0
 
 
@@ -238,8 +241,8 @@ def test_a_proof_integrates_half_the_step_and_nothing_else_twice(monkeypatch):
     for module in ("simulate", "integrate"):
         monkeypatch.setattr(f"sealscope.simulation.{module}.trajectory", count)
     experiment = Experiment.of(duration=6.0, leak="0.01 L/min from 3 s")
-    simulate_with_truth(experiment)
+    simulate_experiment(experiment)
     without = len(counted)
-    run = simulate_with_truth(experiment, prove=True)
+    run = simulate_experiment(experiment, prove=True)
     assert run.proof is not None
     assert counted[without:] == [*counted[:without], run.proof.step / 2]

@@ -13,7 +13,7 @@ from sealscope.simulation.commands import Sine, step, tabulated
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults import Fault, parse_fault
 from sealscope.simulation.leaks import from_time, growing
-from sealscope.simulation.simulate import simulate_with_truth, write_truth
+from sealscope.simulation.simulate import simulate_experiment, write_truth
 
 PSI = 6894.757293168361
 LPM = 1e-3 / 60
@@ -108,7 +108,7 @@ def test_a_fault_that_cannot_be_on_this_rig_is_refused():
 def pair(fault: str, *, values: dict | None = None, duration: float = 8.0, **others):
     """The same experiment without and with a fault from half time on."""
     common = {"duration": duration, "set": values or {}, **others}
-    return simulate_with_truth(Experiment.of(**common)), simulate_with_truth(
+    return simulate_experiment(Experiment.of(**common)), simulate_experiment(
         Experiment.of(**common, fault=f"{fault} from {duration / 2:g} s")
     )
 
@@ -174,7 +174,7 @@ def test_a_rod_seal_loses_what_it_says():
 
 def test_a_faulty_sensor_errs_as_it_says_and_the_machine_does_not_know():
     common = {"duration": 4.0, "set": QUIET}
-    healthy = simulate_with_truth(Experiment.of(**common))
+    healthy = simulate_experiment(Experiment.of(**common))
     t = healthy.recording.t
     after = t >= 2.0
     for words, expected in (
@@ -184,7 +184,7 @@ def test_a_faulty_sensor_errs_as_it_says_and_the_machine_does_not_know():
         ("sensor p_A stuck from 2 s", lambda p: np.where(after, p[1000], p)),
         ("sensor p_A stuck from 2 s to 3 s", lambda p: np.where(after & (t < 3.0), p[1000], p)),
     ):
-        faulty = simulate_with_truth(Experiment.of(**common, fault=words))
+        faulty = simulate_experiment(Experiment.of(**common, fault=words))
         step = 3000 * PSI / 2**23
         np.testing.assert_allclose(
             faulty.recording["p_A"], expected(healthy.recording["p_A"]), atol=1.6 * step, err_msg=words
@@ -192,7 +192,7 @@ def test_a_faulty_sensor_errs_as_it_says_and_the_machine_does_not_know():
         for name in ("p_1", "p_2", "p_B", "x", "q_leak"):
             np.testing.assert_array_equal(faulty.recording[name], healthy.recording[name])
         np.testing.assert_array_equal(faulty.truth.outputs["p_A"], healthy.truth.outputs["p_A"])
-    shifted = simulate_with_truth(
+    shifted = simulate_experiment(
         Experiment.of(**common, fault=["sensor x offset 1 mm", "sensor q_leak offset 3 mL/min"])
     ).recording
     np.testing.assert_allclose(shifted["x"], healthy.recording["x"] + 1e-3, atol=21e-6)
@@ -210,7 +210,7 @@ def test_a_changed_duty_changes_size_and_pace_without_a_jump_in_phase():
     np.testing.assert_allclose(pace, 1.0 + np.clip((t - 5) / 5, 0, 1), atol=2e-3)
     assert np.abs(np.diff(gradual.volts(t))).max() < 6.5e-3
     assert step(1.0).volts(t).shape == Fault("duty", 2.0).commanded(step(1.0)).volts(t).shape
-    recorded = simulate_with_truth(
+    recorded = simulate_experiment(
         Experiment.of(duration=4.0, fault="duty amplitude x1.5 frequency x0.5 from 2 s")
     ).recording
     late = recorded.t >= 2.0
@@ -218,7 +218,7 @@ def test_a_changed_duty_changes_size_and_pace_without_a_jump_in_phase():
 
 
 def test_the_truth_lists_the_faults_and_the_recording_does_not(tmp_path):
-    made = simulate_with_truth(
+    made = simulate_experiment(
         Experiment.of(
             duration=4.0,
             leak="G = 6e-13 from 3 s",

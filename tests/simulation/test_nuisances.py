@@ -16,7 +16,7 @@ from sealscope.simulation.changes import (
 from sealscope.simulation.commands import tabulated
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.instruments import FILTER_REACH, decimate
-from sealscope.simulation.simulate import simulate, simulate_with_truth
+from sealscope.simulation.simulate import simulate, simulate_experiment
 
 PRESSURES = ("p_1", "p_2", "p_A", "p_B")
 QUIET = {"sensors.common_noise": 0.0, "bits": 24} | {
@@ -33,7 +33,7 @@ def test_a_drifting_viscous_friction_follows_the_equation_with_time_in_it():
     rig = load_rig().with_overrides(LINEAR)
     drift = ParameterDrift("friction.F_v", linear(0.3, 20.0))
     common = {"rig": rig, "duration": 20.0, "set": {"sample_rate": "100[Hz]"}}
-    drifting, constant = (simulate_with_truth(Experiment.of(**common, drifts=d)).truth for d in ((drift,), ()))
+    drifting, constant = (simulate_experiment(Experiment.of(**common, drifts=d)).truth for d in ((drift,), ()))
     m, c, d = rig.motor, rig.cylinder, rig.pump.q_b / (2 * np.pi)
     k = rig.fluid.K_oil / c.V
 
@@ -77,8 +77,8 @@ def test_a_drift_of_nothing_changes_no_byte():
 def test_a_number_that_steps_in_the_table_is_the_rig_with_that_number(throttled):
     """Pump leakage of three times from the start on is the rig with three times the pump leakage, to the last bit."""
     values = {"G_pump": 1e-13} | ({"orifices": "present", "closed_A": 0.5, "closed_B": 0.5} if throttled else {})
-    changed = simulate_with_truth(Experiment.of(duration=3.0, set=values, fault="pump leak x3")).truth.outputs
-    built = simulate_with_truth(Experiment.of(duration=3.0, set={**values, "G_pump": 3.0 * 1e-13})).truth.outputs
+    changed = simulate_experiment(Experiment.of(duration=3.0, set=values, fault="pump leak x3")).truth.outputs
+    built = simulate_experiment(Experiment.of(duration=3.0, set={**values, "G_pump": 3.0 * 1e-13})).truth.outputs
     for name in ("x", "p_A", "p_B", "p_1"):
         np.testing.assert_array_equal(changed[name], built[name])
 
@@ -86,7 +86,7 @@ def test_a_number_that_steps_in_the_table_is_the_rig_with_that_number(throttled)
 def test_the_oil_s_modulus_may_drift_without_making_oil():
     values = {"orifices": "present", "closed_A": 0.5, "closed_B": 0.5}
     drifts = (ParameterDrift("K_oil", Wander((0.1, -0.05), 5.0)), ParameterDrift("line.C_d", linear(-0.2, 5.0)))
-    o = simulate_with_truth(Experiment.of(duration=5.0, set=values, drifts=drifts)).truth.outputs
+    o = simulate_experiment(Experiment.of(duration=5.0, set=values, drifts=drifts)).truth.outputs
     rig = load_rig().with_overrides(values)
     held = rig.cylinder.V * (o["p_A"] + o["p_B"]) + rig.line.V_1 * (o["p_1"] + o["p_2"])
     np.testing.assert_allclose(held, held[0], rtol=1e-9)
@@ -137,7 +137,7 @@ def test_noise_bias_and_hum_drift_at_the_instruments_alone():
         ParameterDrift("sensors.p_B.hum", linear(1.0, 60.0)),
     )
     common = {"command": "step 0", "duration": 60.0, "set": values}
-    plain, drifting = (simulate_with_truth(Experiment.of(**common, drifts=d)) for d in ((), drifts))
+    plain, drifting = (simulate_experiment(Experiment.of(**common, drifts=d)) for d in ((), drifts))
     for name in plain.truth.outputs:
         np.testing.assert_array_equal(plain.truth.outputs[name], drifting.truth.outputs[name])
     read, t = drifting.recording, drifting.recording.t

@@ -13,7 +13,7 @@ from sealscope.simulation.commands import tabulated
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.integrate import sized_leaks, trajectory
 from sealscope.simulation.leaks import Leak, from_time, growing, parse_leak
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 from sealscope.units import LITRE_PER_MINUTE
 
 THROTTLED = {"orifices": "present", "closed_A": "50 %", "closed_B": "50 %"}
@@ -32,7 +32,7 @@ def flow(leak: Leak, path) -> np.ndarray:
 @pytest.mark.parametrize("lpm", [0.0042, 0.0163, 0.3])
 def test_the_mean_is_what_was_asked_for(law, values, lpm):
     experiment = Experiment.of(leak=f"{lpm} L/min {law} from 4 s", duration=12.0, set=values)
-    truth = simulate_with_truth(experiment).truth
+    truth = simulate_experiment(experiment).truth
     assert truth.mean_leak_lpm == pytest.approx(lpm, rel=1e-3)
     assert truth.onset_s == 4.0
     # recomputed from the truth's own pressures and from its flow
@@ -64,7 +64,7 @@ def test_two_leaks_at_once_each_get_their_mean():
 def test_a_growing_leak_and_a_table_are_sized_at_full_opening():
     for opening in (growing(2.0, 8.0), tabulated(np.array([0.0, 2.0, 8.0]), np.array([0.0, 0.0, 1.0]))):
         experiment = Experiment.of(leak=Leak(mean=0.02 * LITRE_PER_MINUTE, opening=opening), duration=12.0)
-        truth = simulate_with_truth(experiment).truth
+        truth = simulate_experiment(experiment).truth
         assert truth.mean_leak_lpm == pytest.approx(0.02, rel=1e-3)
         assert truth.onset_s == 2.0
         q = np.abs(truth.outputs["q_leak"])
@@ -75,24 +75,24 @@ def test_a_growing_leak_and_a_table_are_sized_at_full_opening():
 
 def test_a_leak_near_the_pump_s_flow_is_still_found():
     for law in ("laminar", "orifice"):
-        truth = simulate_with_truth(Experiment.of(leak=f"0.5 L/min {law}", duration=6.0)).truth
+        truth = simulate_experiment(Experiment.of(leak=f"0.5 L/min {law}", duration=6.0)).truth
         assert truth.mean_leak_lpm == pytest.approx(0.5, rel=1e-3)
 
 
 def test_a_leak_larger_than_the_pump_s_flow_is_refused():
     rule = r"smaller than the pump's mean flow, 0\.5\d* L/min for this command, got 3 L/min"
     with pytest.raises(InputError, match=rule):
-        simulate_with_truth(Experiment.of(leak="3 L/min", duration=6.0))
+        simulate_experiment(Experiment.of(leak="3 L/min", duration=6.0))
 
 
 def test_a_leak_that_never_opens_is_refused():
     with pytest.raises(InputError, match="must be open within the run"):
-        simulate_with_truth(Experiment.of(leak="0.01 L/min from 100 s", duration=6.0))
+        simulate_experiment(Experiment.of(leak="0.01 L/min from 100 s", duration=6.0))
 
 
 def test_no_leak_and_a_leak_of_nothing_have_no_onset():
     for leak in (None, "none", "G = 0", "0 L/min"):
-        truth = simulate_with_truth(Experiment.of(leak=leak, duration=2.0)).truth
+        truth = simulate_experiment(Experiment.of(leak=leak, duration=2.0)).truth
         assert (truth.onset_s, truth.mean_leak_lpm) == (None, 0.0)
         assert np.all(truth.outputs["q_leak"] == 0.0)
 

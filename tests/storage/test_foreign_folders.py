@@ -89,7 +89,7 @@ def test_a_reproduction_follows_no_link(name: str, outside: Path, tmp_path: Path
 
 @pytest.mark.parametrize("name", ["figures", "tables"])
 def test_products_go_into_no_linked_folder(name: str, outside: Path, tmp_path: Path) -> None:
-    from sealscope.reporting.thesis.files import publish
+    from sealscope.thesis.pages.files import publish
 
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / name).symlink_to(outside)
@@ -149,13 +149,12 @@ def test_what_is_written_is_on_the_disk_before_its_name_and_the_name_at_the_end(
     assert calls == [("sync", "new"), ("rename", "out.csv"), ("sync", tmp_path.name)]
 
 
-@pytest.mark.parametrize("kind", ["simulated", "recordings", "held out"])
+@pytest.mark.parametrize("kind", ["simulated", "recordings"])
 @pytest.mark.parametrize("name", ["../up", "a/b", ".hidden", "a" * 81])
 def test_a_plan_names_no_folder_elsewhere(kind: str, name: str, tmp_path: Path) -> None:
     more = {
         "simulated": 'duration = "6 s"\ndetectors = ["rms change"]\n[[records]]\ncount = 1',
         "recordings": 'detectors = ["rms change"]\n[recordings]\n[[recordings.sets]]\nfiles = "*.csv"',
-        "held out": '[held_out]\ndata = "appendix-c"\n[[held_out.detectors]]\nname = "a"\nfeatures = ["b"]',
     }[kind]
     (tmp_path / "plan.toml").write_text(f'[campaign]\nname = "{name}"\n{more}\n')
     with pytest.raises(InputError, match="name must be of at most 80 letters, digits"):

@@ -14,7 +14,6 @@ from sealscope.physics.rig import throttle_coefficients
 from sealscope.simulation.experiment import Experiment
 from sealscope.thesis.chapters.chapter4 import figures as chapter4
 from sealscope.thesis.chapters.chapter4.cases import (
-    AS_PRINTED,
     CASES,
     OURS,
     PERIOD,
@@ -106,12 +105,9 @@ def test_a_reading_sets_what_it_says(reading: Reading) -> None:
     assert rig.line.V_1 == rig.line.V_2 == pytest.approx(44e-6)
 
 
-def test_readings_are_all_different_and_open_throttles_do_not_know_them() -> None:
-    assert len(set(READINGS)) == 8
-    assert OURS in READINGS
-    assert AS_PRINTED in READINGS
+def test_the_readings_differ_and_open_throttles_do_not_know_them() -> None:
     assert spec("5 sin(2t)", 0.0, OURS).key() == spec("5 sin(2t)", 0.0, Reading("literal", "diameter")).key()
-    assert len({spec("5 sin(2t)", 25.0, reading).key() for reading in READINGS}) == 8
+    assert len({spec("5 sin(2t)", 25.0, reading).key() for reading in READINGS}) == 2
 
 
 @pytest.mark.parametrize("name", ["4.2-a", "4.3-a"])

@@ -1,4 +1,4 @@
-"""A campaign's result, from its folder or from measured data: rows judged, tables written."""
+"""A campaign's result, from its folder or from recordings: rows judged, tables written."""
 
 from __future__ import annotations
 
@@ -9,12 +9,10 @@ from pathlib import Path
 from sealscope.campaigns.cases.recordings import ProgressCallback, recorded_rows
 from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.execution import store
-from sealscope.campaigns.held_out.checks import HeldOutCheck, checks_of
-from sealscope.campaigns.held_out.classifiers import MeasuredSamples, held_out_rows
 from sealscope.campaigns.judging.judge import Judgement, judge
-from sealscope.campaigns.judging.tables import PriorKnowledge, TableRow, records_table, tables_of, write_tables
+from sealscope.campaigns.judging.tables import PriorKnowledge, records_table, tables_of, write_tables
 from sealscope.campaigns.plans.detectors import ALL_CHANNELS, plan_detector
-from sealscope.campaigns.plans.model import AnyPlan, HeldOutPlan, RecordedPlan, SimulatedPlan
+from sealscope.campaigns.plans.model import AnyPlan, RecordedPlan, SimulatedPlan
 from sealscope.errors import InputError
 from sealscope.storage.folders import make_folder
 
@@ -23,15 +21,14 @@ from sealscope.storage.folders import make_folder
 class CampaignResult:
     """A campaign and what it shows.
 
-    `missing`: records of the plan that have no row yet; `checks`: of classifiers that were held out; `mode`: how the
-    rows of a simulated campaign were made, "" for another; `known`: detector -> what it was given beside the record.
+    `missing`: records of the plan that have no row yet; `mode`: how the rows of a simulated campaign were
+    made, "" for another; `known`: detector -> what it was given beside the record.
     """
 
     plan: AnyPlan
     rows: tuple[CaseRow, ...]
     missing: int
     judgement: Judgement
-    checks: tuple[HeldOutCheck, ...] = ()
     mode: str = ""
     known: Mapping[str, PriorKnowledge] = field(default_factory=dict)
 
@@ -84,35 +81,10 @@ def simulated_result(plan: SimulatedPlan, folder: Path) -> CampaignResult:
     return CampaignResult(plan, rows, plan.size - len(rows), judgement, mode=mode, known=prior_knowledge(plan))
 
 
-def held_out_result(plan: HeldOutPlan, samples: MeasuredSamples) -> CampaignResult:
-    """Return the result of a campaign over measured data; an alarm is log odds over 0."""
-    rows = held_out_rows(plan, samples)
-    names = detectors_of(plan)
-    judgement = judge(rows, names, limits=dict.fromkeys(names, 0.0), confidence=plan.confidence)
-    return CampaignResult(plan, tuple(rows), 0, judgement, tuple(checks_of(plan, samples)))
-
-
 def recorded_result(plan: RecordedPlan, folder: Path, progress: ProgressCallback | None = None) -> CampaignResult:
     """Return the result of a campaign over the recordings in a folder."""
     rows = recorded_rows(plan, folder, progress)
     return CampaignResult(plan, tuple(rows), 0, _judged(plan, rows), known=prior_knowledge(plan))
-
-
-def detectors_of(plan: AnyPlan) -> list[str]:
-    """Return the names of a plan's detectors."""
-    return [detector if isinstance(detector, str) else detector.name for detector in plan.detectors]
-
-
-def _check_row(check: HeldOutCheck) -> TableRow:
-    return {
-        "detector": check.detector,
-        **dict(zip(("AUC, tests held out", "tests: low", "tests: high"), check.tests, strict=True)),
-        **dict(zip(("AUC, conditions held out", "conditions: low", "conditions: high"), check.conditions, strict=True)),
-        "AUC that 5 % of swapped labels reach": check.chance,
-        "swaps that reach the true labels' AUC": check.reached if check.swaps else None,
-        "swaps": check.swaps or None,
-        "chosen": "; ".join(f"{features}: {times}" for features, times in check.picks),
-    }
 
 
 def write_result(result: CampaignResult, folder: Path) -> list[Path]:
@@ -120,6 +92,5 @@ def write_result(result: CampaignResult, folder: Path) -> list[Path]:
     make_folder(folder)
     unit = result.plan.unit
     tables = tables_of(result.judgement, unit, result.known, getattr(result.plan, "part", ""))
-    tables["records"] = records_table(result.rows, detectors_of(result.plan), unit)
-    tables["held_out"] = [_check_row(check) for check in result.checks]
+    tables["records"] = records_table(result.rows, result.plan.detectors, unit)
     return write_tables(folder, tables)

@@ -29,7 +29,7 @@ from sealscope.recordings.recording import Recording
 from sealscope.simulation.bench.machines import centred_start
 from sealscope.simulation.courses import Position, command_or_target, parse_force
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 from sealscope.units import LITRE_PER_MINUTE
 
 #: Commands and constant loads that are tried beside the machine's own duty.
@@ -158,7 +158,7 @@ def findable(
     steps, separable_steps, pressures = [], [], []
     try:
         for seed in range(RECORDS):
-            recording = simulate_with_truth(experiment_of(rig, duty, duration, seed)).recording
+            recording = simulate_experiment(experiment_of(rig, duty, duration, seed)).recording
             step, apart, pressure = _detectable_in(recording, rig, false_alarm, detection)
             steps.append(step)
             separable_steps.append(apart)

@@ -16,7 +16,6 @@ import typer
 
 from sealscope.cli import (
     campaign,
-    datasets,
     fmu,
     machine,
     monitoring,
@@ -55,7 +54,6 @@ for command in (
     planning.plan,
     recordings.inspect,
     recordings.convert,
-    datasets.datasets,
     reproduction.reproduce,
     fmu.fmu,
 ):

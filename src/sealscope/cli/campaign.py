@@ -15,7 +15,6 @@ from sealscope.errors import InputError
 if TYPE_CHECKING:
     from sealscope.campaigns.cases.recordings import ProgressCallback
     from sealscope.campaigns.execution.store import CampaignProgress
-    from sealscope.campaigns.held_out.classifiers import MeasuredSamples
     from sealscope.campaigns.plans.model import AnyPlan
     from sealscope.campaigns.results import CampaignResult
 
@@ -37,7 +36,7 @@ PlanArgument = Annotated[
 ]
 _FOLDER = "Folder of the campaign; by default sealscope-campaigns/NAME."
 FolderOption = Annotated[Path | None, Option("--output", "-o", help=_FOLDER)]
-_DATA = "Folder of the measured data, for plans over recordings or data sets."
+_DATA = "Folder of the recordings, for plans over recordings."
 DataOption = Annotated[Path | None, Option("--data", help=_DATA)]
 _CLUSTER = "A Dask scheduler, e.g. tcp://host:8786."
 _BATCH = "Simulate side by side; for detectors of the details' RMS on both sides."
@@ -53,7 +52,6 @@ def run(
     retry: Annotated[bool, Option("--retry", help="Carry failed records out again.")] = False,
     batch: Annotated[bool, Option("--batch", help=_BATCH)] = False,
     trust: Annotated[bool, Option("--trust", help=_TRUST)] = False,
-    sheet: opt.SheetOption = None,
     data: DataOption = None,
 ) -> None:
     """Carry out what is missing of a plan, then report.
@@ -69,7 +67,7 @@ def run(
     if not isinstance(loaded, SimulatedPlan):
         if batch:
             raise InputError(f"a plan in batches must simulate its records; run it without --batch ({loaded.place})")
-        if _report(loaded, place, sheet, data):
+        if _report(loaded, place, data):
             raise Exit(1)
         return
     opt.say_jobs(jobs)
@@ -78,7 +76,7 @@ def run(
             loaded, place, jobs=jobs, cluster=cluster, retry=retry, progress=progress, batch=batch, trust=trust
         )  # fmt: skip
     echo(_progress_text(state))
-    _report(loaded, place, sheet, data)
+    _report(loaded, place, data)
     if state.failed:
         raise Exit(1)
 
@@ -98,14 +96,12 @@ def status(plan: PlanArgument, folder: FolderOption = None) -> None:
 
 
 @campaign.command()
-def report(
-    plan: PlanArgument, folder: FolderOption = None, sheet: opt.SheetOption = None, data: DataOption = None
-) -> None:
+def report(plan: PlanArgument, folder: FolderOption = None, data: DataOption = None) -> None:
     """Judge the rows that are there; write tables and page."""
     from sealscope.campaigns.plans.reader import load_plan
 
     loaded = load_plan(plan)
-    _report(loaded, _folder(loaded, folder), sheet, data)
+    _report(loaded, _folder(loaded, folder), data)
 
 
 def _folder(plan: AnyPlan, given: Path | None) -> Path:
@@ -136,12 +132,12 @@ def _progress() -> Iterator[ProgressCallback]:
         yield lambda done, total, failures: update(done, total, f"{failures} failed" if failures else "")
 
 
-def _report(plan: AnyPlan, folder: Path, sheet: Path | None, data: Path | None) -> int:
+def _report(plan: AnyPlan, folder: Path, data: Path | None) -> int:
     """Write tables and page; return how many records failed."""
     from sealscope.campaigns.results import write_result
     from sealscope.reporting.campaign.page import PAGE, campaign_text, write_campaign_page
 
-    result = _result(plan, folder, sheet, data)
+    result = _result(plan, folder, data)
     files = write_result(result, folder)
     write_campaign_page(result, folder / PAGE, [path.name for path in files])
     echo(campaign_text(result))
@@ -151,28 +147,16 @@ def _report(plan: AnyPlan, folder: Path, sheet: Path | None, data: Path | None) 
     return len(result.judgement.failed)
 
 
-def _result(plan: AnyPlan, folder: Path, sheet: Path | None, data: Path | None) -> CampaignResult:
-    """Return the plan's result: from the rows in its folder, or from the measured data that it is about."""
-    from sealscope.campaigns.held_out.data_sets import hydraulic_samples, needs_folder
-    from sealscope.campaigns.plans.model import RecordedPlan, SimulatedPlan
-    from sealscope.campaigns.results import held_out_result, recorded_result, simulated_result
+def _result(plan: AnyPlan, folder: Path, data: Path | None) -> CampaignResult:
+    """Return the plan's result: from the rows in its folder, or from the recordings in the folder `data`."""
+    from sealscope.campaigns.plans.model import SimulatedPlan
+    from sealscope.campaigns.results import recorded_result, simulated_result
 
     if isinstance(plan, SimulatedPlan):
         return simulated_result(plan, folder)
-    if isinstance(plan, RecordedPlan):
-        with _progress() as progress:
-            return recorded_result(plan, needs_folder(data, "recordings"), progress)
-    if plan.data == "hydraulic":
-        return held_out_result(plan, hydraulic_samples(needs_folder(data, "the hydraulic data set")))
-    return held_out_result(plan, _sheet_samples(sheet))
-
-
-def _sheet_samples(folder: Path | None) -> MeasuredSamples:
-    """Return the thesis's data sheet as samples; raise InputError where there is none."""
-    from sealscope.thesis.claims.evidence import samples_of
-    from sealscope.thesis.sheet import MISSING, find_sheet, read_sheet
-
-    path = find_sheet(folder)
-    if path is None:
-        raise InputError(MISSING)
-    return samples_of(read_sheet(path)[0])
+    if data is None:
+        raise InputError("the plan needs recordings: give their folder with --data")
+    if not data.is_dir():
+        raise InputError(f"--data must be the folder of recordings, got {data}")
+    with _progress() as progress:
+        return recorded_result(plan, data, progress)

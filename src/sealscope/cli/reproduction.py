@@ -40,10 +40,10 @@ def reproduce(
     if listing:
         _list(ids or ["all"], sheet)
         return
-    from sealscope.reporting.thesis.files import publish
-    from sealscope.reporting.thesis.page import write_thesis_page
-    from sealscope.reporting.thesis.plots import require_drawing
     from sealscope.thesis.engine.build import reproduce as build
+    from sealscope.thesis.pages.files import publish
+    from sealscope.thesis.pages.page import write_thesis_page
+    from sealscope.thesis.pages.plots import require_drawing
     from sealscope.thesis.sheet import MISSING, find_sheet
 
     if not ids:

@@ -35,7 +35,7 @@ def simulate(
     """Simulate the rig, or run somebody else's unit, and record it as the rig's instruments would."""
     from sealscope.recordings import write
     from sealscope.recordings.files import check_target
-    from sealscope.simulation.simulate import simulate_with_truth, write_truth
+    from sealscope.simulation.simulate import simulate_experiment, write_truth
 
     check_target(output)
     opt.check_folder(output)
@@ -49,7 +49,7 @@ def simulate(
         raise InputError("--map names the variables of a unit, got it without --fmu")
     with opt.progress() as report:
         if fmu is None:
-            run = simulate_with_truth(experiment, report, prove=prove)
+            run = simulate_experiment(experiment, report, prove=prove)
             recording, (by, *lines) = run.recording, run.lines()
         else:
             from sealscope.fmu.recording import record_fmu

@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
-from sqlalchemy import Connection
 from sqlalchemy.exc import IntegrityError
 
 from sealscope.diagnosis.live.estimates import BlockEstimate
@@ -157,7 +156,7 @@ class WatchedActuators:
         self._changes, self.changed, self.closed = itertools.count(1), 0, False
         self.supervisor = Supervisor(away, self._tell)
         self._lock = threading.RLock()
-        self._actuators = {name: self._restored(self.settings[name]) for name in self.settings if name in self.held}
+        self._actuators = {name: self._restored(self.settings[name]) for name in self.settings}
 
     def _restored(self, settings: ActuatorSettings) -> _Actuator:
         """Return an actuator as its last transaction left it, or begun anew where it is new or the settings changed."""
@@ -239,10 +238,6 @@ class WatchedActuators:
         self.count("blocks stored already", len(blocks) - len(fresh))
         self._tell()
 
-    def _own(self, blocks: Sequence[SourceBlock], connection: Connection) -> Sequence[SourceBlock]:
-        """Return the blocks that are this monitor's to store, in the transaction that stores them."""
-        return blocks
-
     def _stored(self, blocks: Sequence[SourceBlock]) -> None:
         """Take blocks in one transaction.
 
@@ -250,7 +245,7 @@ class WatchedActuators:
         """
         rows = StoredRows()
         with self.store.writing() as connection:
-            mine = [(block, self._actuator(block.actuator)) for block in self._own(blocks, connection)]
+            mine = [(block, self._actuator(block.actuator)) for block in blocks]
             numbers = {actuator.settings.name: itertools.count(actuator.taken + 1) for _, actuator in mine}
             numbered = [(block.actuator, block.identity, next(numbers[block.actuator])) for block, _ in mine]
             if numbered:
@@ -316,8 +311,6 @@ class WatchedActuators:
         with self._lock:
             if name not in self.settings:
                 raise InputError(f"the settings must have the actuator {name[:60]!r}, got none")
-            if name not in self.held:
-                raise InputError(f"{name} is watched by another monitor; mark its alarm on that one's page")
             actuator, rows = self._actuator(name), StoredRows()
             at = getattr(actuator.last, "t", getattr(actuator.judge.alarm, "updated_s", 0.0))
             kept = list(actuator.kept)
@@ -340,11 +333,6 @@ class WatchedActuators:
             self.store.keep(rows)
         self._tell()
         return alarm
-
-    @property
-    def held(self) -> frozenset[str]:
-        """The actuators that this monitor watches."""
-        return frozenset(self.settings)
 
     @property
     def false_alarms_per_1000_h(self) -> float:

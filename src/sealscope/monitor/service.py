@@ -7,25 +7,22 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, TextIO, TypeVar
 
-from sqlalchemy.exc import SQLAlchemyError
 from threadpoolctl import threadpool_limits
 
 from sealscope.errors import InputError
 from sealscope.monitor.actuators import DROPPED, WatchedActuators
-from sealscope.monitor.database.sharing import Share
 from sealscope.monitor.database.store import MonitorStore, away
 from sealscope.monitor.outputs.events import EventLines, Webhook
 from sealscope.monitor.outputs.sparkplug_node import SparkplugNode
 from sealscope.monitor.page.live import LiveSamples
 from sealscope.monitor.page.site import PageServer
 from sealscope.monitor.settings import MonitorSettings, secret_of
-from sealscope.monitor.shared import SharedActuators
 from sealscope.monitor.sources.broker import broker_of
 from sealscope.monitor.sources.folder import folders_of
 from sealscope.monitor.sources.lines import lines_of
@@ -85,16 +82,10 @@ class Service:
             self.store = MonitorStore(settings.database)
             watched = settings.actuator, self.store, settings.keep_days
             with threadpool_limits(limits=1):  # as in `run`: sums in another order end in other digits
-                if settings.share is None:
-                    self.actuators = WatchedActuators(*watched)
-                else:
-                    share = Share(self.store, settings.share, [actuator.name for actuator in settings.actuator])
-                    self.actuators = SharedActuators(*watched, share)
+                self.actuators = WatchedActuators(*watched)
             own = self.actuators
             self.supervisor, self.count, self.plain = own.supervisor, own.count, own.plain
             self.stopping, self._database = self.supervisor.stopping, self.supervisor.part(DATABASE)
-            if isinstance(own, SharedActuators):
-                own.renew()
             self._live = LiveSamples(self.store.last_samples)
             self._lines = EventLines(self.store, stdout or sys.stdout)
             self.page: PageServer | None = None
@@ -157,9 +148,6 @@ class Service:
             for thread in ending:
                 if thread.name != _LINES:  # which may wait for a line for ever
                     thread.join(max(0.0, deadline - time.monotonic()))
-            if isinstance(self.actuators, SharedActuators):
-                with suppress(SQLAlchemyError):
-                    self.actuators.share.give_back()
             if self.page is not None:
                 self.page.close()
             self.close()
@@ -178,11 +166,9 @@ class Service:
         return sources
 
     def _outputs(self) -> list[threading.Thread]:
-        """Start what sends, and what renews the share in the actuators."""
+        """Start the threads that send events and states."""
         repeat = self.supervisor.repeat
         threads = [repeat("standard output", self._pass_on, _LOOK_S, last=self._pass_on)]
-        if isinstance(own := self.actuators, SharedActuators):
-            repeat("share", own.renew, own.share.lease_s / 4.0)
         if (settings := self.settings.sparkplug) is not None and (broker := self.settings.mqtt) is not None:
             password = secret_of(broker.password_file, "mqtt.password_file")
             node = SparkplugNode(self.store, self.plain, self.count, broker, settings, password)

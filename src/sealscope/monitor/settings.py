@@ -133,13 +133,6 @@ class WebhookSettings(_Part):
     timeout_s: float = Field(default=10.0, gt=0, le=300)
 
 
-class ShareSettings(_Part):
-    """A monitor's part where several share the actuators of a database."""
-
-    name: _Text
-    lease_s: float = Field(default=12.0, ge=1, le=3600)
-
-
 class MonitorSettings(_Part):
     """All settings of a monitor."""
 
@@ -154,7 +147,6 @@ class MonitorSettings(_Part):
     opcua: OpcUaSettings | None = None
     sparkplug: SparkplugSettings | None = None
     webhook: WebhookSettings | None = None
-    share: ShareSettings | None = None
     actuator: list[ActuatorSettings] = Field(min_length=1, max_length=10_000)
 
     @model_validator(mode="before")
@@ -175,7 +167,7 @@ class MonitorSettings(_Part):
 
     @model_validator(mode="after")
     def _fits_together(self) -> MonitorSettings:
-        actuators, mqtt, share, page = self.actuator, self.mqtt, self.share, self.page
+        actuators, mqtt, page = self.actuator, self.mqtt, self.page
         topics = [each.topic for each in actuators if each.topic is not None]
         paths = [each.sparkplug for each in actuators if each.sparkplug is not None]
         for values, rule in (
@@ -203,10 +195,6 @@ class MonitorSettings(_Part):
         own = None if self.sparkplug is None else [self.sparkplug.group, self.sparkplug.node]
         if any(path.split("/")[:2] == own for path in paths):
             raise ValueError("the node of the alarms must be none of the actuators' nodes")
-        if share is not None and "://" not in self.database:
-            raise ValueError(f"monitors that share actuators need a database by URL, got the file {self.database!r}")
-        if share is not None and mqtt is not None and mqtt.host_id is not None:
-            raise ValueError("monitors that share actuators are no primary host of Sparkplug: leave mqtt.host_id out")
         if page is not None and page.host not in ("127.0.0.1", "localhost", "::1") and page.token_file is None:
             raise ValueError(f"a page beyond this machine needs page.token_file, got host {page.host!r} without")
         return self

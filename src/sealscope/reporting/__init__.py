@@ -1,1 +1,1 @@
-"""Pages and texts of diagnoses, campaigns and the reproduced thesis."""
+"""Pages and texts of diagnoses and campaigns."""

@@ -7,7 +7,7 @@ import os
 import re
 from base64 import b64encode
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, partial
 from hashlib import sha256
 from importlib import metadata, resources
 from pathlib import Path
@@ -22,43 +22,48 @@ if TYPE_CHECKING:
     import jinja2
     from markupsafe import Markup
 
+_PACKAGE = "sealscope.reporting"
 #: Signs that a terminal or a browser obeys and nobody sees: controls, and what turns the direction of writing.
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
 _SUFFIXES = (".html", ".htm", ".pdf", ".png")
 
 
 @cache
-def _environment() -> jinja2.Environment:
+def _environment(package: str) -> jinja2.Environment:
+    """Set up the templates of a package, which may extend and include those of this one."""
     import jinja2
 
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("sealscope.reporting"),
+        loader=jinja2.ChoiceLoader([jinja2.PackageLoader(name) for name in dict.fromkeys((package, _PACKAGE))]),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
     )
-    environment.globals |= {"packaged": packaged, "symbols": SYMBOLS, "version": _version()}
+    environment.globals |= {"packaged": partial(packaged, package=package), "symbols": SYMBOLS, "version": _version()}
     environment.filters |= {"script_hash": _script_hash, "script_json": _script_json}
     return environment
 
 
-def render(template: str, *, chart_data: Any = None, scripts: Sequence[str] = (), **context: Any) -> str:
-    """Return a template of this package filled in.
+def render(
+    template: str, *, package: str = _PACKAGE, chart_data: Any = None, scripts: Sequence[str] = (), **context: Any
+) -> str:
+    """Fill in a template of a package.
 
-    `scripts`: files of this package that the page runs; with `chart_data`, plain JSON values, those of the charts.
+    `scripts`: files of the package that the page runs; with `chart_data`, plain JSON values, those of the charts.
     Control characters that a file's name or description brought are replaced.
     """
     names = scripts if chart_data is None else ("vendor/uPlot.iife.min.js", "templates/charts.js", *scripts)
-    page = _environment().get_template(template)
-    text = page.render(context, chart_data=chart_data, scripts=[packaged(name) for name in names])
+    page = _environment(package).get_template(template)
+    text = page.render(context, chart_data=chart_data, scripts=[packaged(name, package) for name in names])
     return _CONTROLS.sub("\N{REPLACEMENT CHARACTER}", text)
 
 
-def packaged(name: str) -> Markup:
-    """Return a file of this package that goes into a page as it is."""
+def packaged(name: str, package: str = _PACKAGE) -> Markup:
+    """Read a file that goes into a page as it is, from a package or else from this one."""
     from markupsafe import Markup
 
-    return Markup((resources.files("sealscope.reporting") / name).read_text(encoding="utf-8"))
+    file = resources.files(package) / name
+    return Markup((file if file.is_file() else resources.files(_PACKAGE) / name).read_text(encoding="utf-8"))
 
 
 def _script_hash(code: str) -> Markup:

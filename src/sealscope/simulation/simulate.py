@@ -123,9 +123,8 @@ class Run:
         return lines
 
 
-@checked_call
-def simulate_with_truth(experiment: Experiment, progress: Progress | None = None, *, prove: bool = False) -> Run:
-    """Simulate an experiment and keep its truth beside the recording.
+def simulate_experiment(experiment: Experiment, progress: Progress | None = None, *, prove: bool = False) -> Run:
+    """Simulate an experiment, and keep its truth apart from the recording.
 
     Parameters
     ----------
@@ -149,13 +148,6 @@ def simulate_with_truth(experiment: Experiment, progress: Progress | None = None
     SimulationFailed
         The run diverged, fell below vacuum, or is not resolved by its step; with `prove`, also where halving the step
         moves more than it may, unless the experiment allows it.
-
-    Examples
-    --------
-    >>> import sealscope as ss
-    >>> run = ss.simulate_with_truth(ss.Experiment.of(leak="0.05 L/min from 1 s", duration=2.0))
-    >>> run.truth.onset_s, round(run.truth.mean_leak_lpm, 3)
-    (1.0, 0.05)
     """
     if not isinstance(experiment, Experiment):
         raise InputError(f"experiment must be an Experiment (Experiment.of(...) makes one), got {experiment!r}")
@@ -285,7 +277,7 @@ def prove(experiment: Experiment, progress: Progress | None = None) -> Proof:
     >>> ss.prove(ss.Experiment.of(duration="6 s")).resolved
     True
     """
-    proof = simulate_with_truth(experiment, progress, prove=True).proof
+    proof = simulate_experiment(experiment, progress, prove=True).proof
     assert proof is not None
     return proof
 
@@ -327,7 +319,7 @@ def _drift_of(drift: ParameterDrift, t: Array) -> dict[str, Any]:
 
 
 @with_arguments_of(Arguments)
-def simulate(given: Arguments) -> Recording:
+def simulate(arguments: Arguments) -> Recording:
     """Simulate a rig under a command and record it as its instruments would.
 
     A quantity is a number in the SI unit stated below, or a text with a unit of its own ("3 min", "20[Pa]"), as on the
@@ -336,7 +328,7 @@ def simulate(given: Arguments) -> Recording:
     Returns
     -------
     Recording
-        What the instruments recorded. `simulate_with_truth` returns the truth beside it.
+        What the instruments recorded. `simulate_with_truth` returns the truth, too.
 
     Raises
     ------
@@ -352,4 +344,30 @@ def simulate(given: Arguments) -> Recording:
     >>> recording.rate, len(recording)
     (500.0, 1000)
     """
-    return simulate_with_truth(Experiment.of(**vars(given))).recording
+    return simulate_experiment(Experiment.of(**vars(arguments))).recording
+
+
+@with_arguments_of(Arguments)
+def simulate_with_truth(arguments: Arguments) -> Run:
+    """Simulate a rig as `simulate` does, and return its truth with the recording.
+
+    Returns
+    -------
+    Run
+        `recording`; `truth`: leaks with their coefficients, onset, mean leak and every state without noise.
+
+    Raises
+    ------
+    InputError
+        An argument breaks a rule, or is not known.
+    SimulationFailed
+        The run diverged, fell below vacuum, or is not resolved by its step.
+
+    Examples
+    --------
+    >>> import sealscope as ss
+    >>> run = ss.simulate_with_truth(leak="0.05 L/min from 1 s", duration=2.0)
+    >>> run.truth.onset_s, round(run.truth.mean_leak_lpm, 3)
+    (1.0, 0.05)
+    """
+    return simulate_experiment(Experiment.of(**vars(arguments)))

@@ -9,13 +9,13 @@ sigma is independent of it and has the RMS sigma in each detail d_j, so the RMS 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
-from sealscope.campaigns.cases.bound import noise_covariance
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
@@ -65,8 +65,13 @@ def log_rms(squares: Array, sigma: float) -> Array:
 
 
 def noise_of(rig: Rig, chamber: str) -> float:
-    """Return the deviation of a sample [psi] in a chamber's channel by own noise, common noise and conversion."""
-    return float(np.sqrt(noise_covariance(rig, [chamber])[0, 0])) / PSI
+    """Compute the standard deviation [psi] of one sample of a chamber's pressure.
+
+    Own noise, common noise and the conversion's step, white with variance step^2/12, add up in squares.
+    """
+    sensor, daq = getattr(rig.sensors, chamber), rig.daq
+    step = daq.step * (sensor.range_hi - sensor.range_lo) / (daq.sensor_volts_hi - daq.sensor_volts_lo)
+    return math.sqrt(sensor.noise**2 + rig.sensors.common_noise**2 + step**2 / 12.0) / PSI
 
 
 def log_residuals(rig: Rig, sheet: DataSheet) -> Array:

@@ -105,19 +105,15 @@ def error_text(error: Exception) -> str:
 class CaseRow(CaseInputs):
     """What a campaign stores of a case: its inputs and the scores; or the `error` of it.
 
-    `flow_lpm`: mean leak [L/min] while open, as the run really had it; `bound_lpm`: standard deviation [L/min] of the
-    best unbiased estimate of the change at the onset, from pressures and command (`bound.change_bound`), None where it
-    was not asked for (`bounded`) or there is none; `scores` and `statements` by the plan's name of a detector;
-    `seconds`: processor time, which takes no part in the result.
+    `flow_lpm`: mean leak [L/min] while open, as the run really had it; `scores` and `statements` by the
+    plan's name of a detector; `seconds`: processor time, which takes no part in the result.
     """
 
     flow_lpm: float | None = None
-    bounded: bool = False
     scores: Scores = field(default_factory=dict)
     error: str | None = None
     seconds: float = 0.0
     statements: Mapping[str, Statement] = field(default_factory=dict)
-    bound_lpm: float | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return the row as plain JSON values."""

@@ -6,15 +6,12 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
-from sealscope.campaigns.cases.bound import change_bound
 from sealscope.campaigns.cases.case import CampaignCase
 from sealscope.campaigns.cases.machines import experiment_of
 from sealscope.campaigns.cases.row import CaseRow, error_text
 from sealscope.campaigns.cases.scoring import judged_record
 from sealscope.campaigns.plans.model import SimulatedPlan
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 
 
 def work(plan: SimulatedPlan, case: CampaignCase, folder: Path | None = None) -> CaseRow:
@@ -28,18 +25,11 @@ def work(plan: SimulatedPlan, case: CampaignCase, folder: Path | None = None) ->
 
 
 def _work(plan: SimulatedPlan, case: CampaignCase, folder: Path | None) -> CaseRow:
-    experiment = experiment_of(plan, case)
-    simulated = simulate_with_truth(experiment)
+    simulated = simulate_experiment(experiment_of(plan, case))
     if folder is not None:
         from sealscope.recordings import write
 
         write(simulated.recording, folder / f"{case.id}.nc")
     scores, statements = judged_record(simulated.recording, plan.onset_s, plan, plan.assumed)
-    bound, bounded = None, case.leak_lpm in plan.bounded
-    if bounded:
-        truth = simulated.truth
-        healthy = truth.t < plan.onset_s
-        dp = float(np.mean(np.abs(truth.outputs["p_A"] - truth.outputs["p_B"])[healthy]))
-        bound = change_bound(experiment, plan.onset_s, plan.duration_s - plan.onset_s, dp)
     flow = simulated.truth.mean_leak_lpm if case.leak_lpm else 0.0
-    return CaseRow.of(case, flow_lpm=flow, scores=scores, statements=statements, bounded=bounded, bound_lpm=bound)
+    return CaseRow.of(case, flow_lpm=flow, scores=scores, statements=statements)

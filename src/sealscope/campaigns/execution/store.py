@@ -107,7 +107,7 @@ def read_rows(folder: Path) -> dict[str, CaseRow]:
 def rows_of(plan: SimulatedPlan, folder: Path) -> dict[str, CaseRow]:
     """Return the folder's rows that belong to the plan, by case id in rising order.
 
-    A row without one of the plan's detectors, or without a bound that it asks for, is not among them. Raises InputError
+    A row without one of the plan's detectors is not among them. Raises InputError
     where the rows were made from something else than the plan says, by whatever sources; UnreadableFile for a row that
     says another input than its case has.
     """
@@ -123,7 +123,7 @@ def rows_of(plan: SimulatedPlan, folder: Path) -> dict[str, CaseRow]:
         if any(getattr(row, of.name) != getattr(case, of.name) for of in fields(CaseInputs)):
             place = folder / rows.ROWS
             raise UnreadableFile(f"a row must say the inputs of its case, got others of {case.id} ({place})")
-        if row.error is not None or (wanted <= set(row.scores) and (row.bounded or case.leak_lpm not in plan.bounded)):
+        if row.error is not None or wanted <= set(row.scores):
             of_plan[row.id] = row
     return of_plan
 

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from sealscope.campaigns.cases.bound import smallest_detectable
 from sealscope.campaigns.cases.case import FAMILY
 from sealscope.campaigns.cases.row import cause_of, covers, named_cause
 from sealscope.campaigns.judging.verdicts import JudgedRow, Verdicts, grouped, without_fault
@@ -18,8 +17,6 @@ from sealscope.evaluation.table import CANNOT_TELL, events_per_hour
 ALWAYS, NEVER = "always fire", "never fire"
 #: What stands for all families together, and for all laws of a leak.
 ALL, ANY_LAW = "all", "any"
-#: Probability with which the best test finds a leak that the bound allows.
-ALLOWED_DETECTION = 0.9
 
 
 @dataclass(frozen=True)
@@ -30,9 +27,7 @@ class AlarmShares:
     the factors: what they have in common, where it was asked for. `coverage`: how often a stated interval holds the
     flow that there was; `false_alarm` and `per_hour`: of that detector on its leak-free records, None where there are
     none, or no hours; `named`: alarms that name the fault's cause, alone or with the piston, None where the detector
-    names no cause; `reachable`: records whose leak the Cramer-Rao bound of their machine allows to find, over those
-    that have a bound, and `allowed`: alarms over these, both None where there is no bound; `failed`: records without a
-    result, which are among those that cannot be told.
+    names no cause; `failed`: records without a result, which are among those that cannot be told.
     """
 
     detector: str
@@ -47,8 +42,6 @@ class AlarmShares:
     family: str = ALL
     levels: Mapping[str, str | float] = field(default_factory=dict)
     named: Proportion | None = None
-    reachable: Proportion | None = None
-    allowed: Proportion | None = None
     failed: int = 0
 
     @property
@@ -64,11 +57,10 @@ class AlarmShares:
 
 @dataclass(frozen=True)
 class Alarms:
-    """What alarms add up to; `false_alarm`: the probability at which the bound's best test is taken."""
+    """Counts of the alarms in the verdicts of each detector, with intervals of `confidence`."""
 
     verdicts: Verdicts
     confidence: float
-    false_alarm: float
 
     def _with_references(self) -> Verdicts:
         """Return the verdicts, and after them those of the two detectors that do not look."""
@@ -130,20 +122,12 @@ class Alarms:
             judged.alarm and covers(named_cause(statement), cause_of(judged.row.fault)) for judged, statement in stated
         ]
         silent = [False] * (len(alike) - len(stated))
-        bounded = [judged for judged in alike if judged.row.bound_lpm is not None] if common.get("leak_lpm") else []
         return AlarmShares(
             detector=detector,
             alarms=self._share(judged.alarm for judged in alike),
             cannot_tell=self._share(judged.verdict == CANNOT_TELL for judged in alike),
             coverage=self._share(ends[0] <= flow <= ends[1] for flow, ends in intervals if ends is not None),
             named=self._share(named + silent) if stated else None,
-            reachable=self._share(map(self._allowed, bounded)) if bounded else None,
-            allowed=self._share(judged.alarm for judged in bounded if self._allowed(judged)) if bounded else None,
             failed=sum(judged.row.error is not None for judged in alike),
             **common,
         )
-
-    def _allowed(self, judged: JudgedRow) -> bool:
-        """Whether the best test at this false-alarm probability finds the leak of a row nine times in ten."""
-        bound = judged.row.bound_lpm
-        return bound is not None and smallest_detectable(bound, self.false_alarm, ALLOWED_DETECTION) <= judged.flow_lpm

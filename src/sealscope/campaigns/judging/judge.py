@@ -62,8 +62,7 @@ def judge(
     A detector's verdict is the one it stated, or its score's against a threshold: that in `limits`, that of the scorer,
     else the one from the leak-free rows of the row's duty (`thresholds_of`), which are not asked where there are
     `limits`. `onset_s` [s]: true onset in leaky records, `hours`: operating time of a record; without them no errors of
-    onsets or alarms per hour are given. `false_alarm` is also the probability at which the bound's best test is taken.
-    Raises InputError where there is no row to judge.
+    onsets or alarms per hour are given. Raises InputError where there is no row to judge.
     """
     judged = sorted((row for row in rows if row.use == "judge"), key=lambda row: row.id)
     if not judged:
@@ -74,7 +73,7 @@ def judge(
         limits = {name: own.threshold for name, own in scorers.items() if own is not None and own.threshold is not None}
     verdicts = verdicts_of(judged, detectors, limits, thresholds)
     of_leaks = without_fault(verdicts)
-    alarms = Alarms(verdicts, confidence, false_alarm)
+    alarms = Alarms(verdicts, confidence)
     return Judgement(
         thresholds=thresholds,
         leak_free=sum(row.use == "calibrate" and row.error is None for row in rows) if thresholds else 0,

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from sealscope.campaigns.cases.row import CaseRow
-from sealscope.campaigns.judging.alarms import ALLOWED_DETECTION
 from sealscope.campaigns.judging.judge import Judgement
 from sealscope.storage.csv_file import write_csv
 
@@ -99,7 +98,7 @@ def tables_of(
             if content.startswith("known ") and given:
                 cells[column] = attribute_of(given.get(attribute_of(row, "detector")), content.removeprefix("known "))
             elif not content.startswith("known "):
-                name = column.format(unit=unit, allowed=ALLOWED_DETECTION)
+                name = column.format(unit=unit)
                 cells |= _cells(name, content, row, factors)
         return cells
 

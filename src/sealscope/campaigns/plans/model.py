@@ -1,4 +1,4 @@
-"""The three kinds of plan: simulated records, recordings of a real machine, and measured data held out in turn.
+"""The two kinds of plan: simulated records, and recordings of a real machine.
 
 Fields are the entries of a plan's file, under their names there or their `alias`, and `place`, the file.
 """
@@ -9,7 +9,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -18,13 +17,10 @@ from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
 from sealscope.evaluation.thresholds import Promise
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import CHANNEL_UNITS
-from sealscope.storage.plain_values import as_type
 from sealscope.units import parse_quantity
 
 Use = Literal["calibrate", "judge"]
 LeakLaw = Literal["laminar", "orifice", "mixture"]
-DataSet = Literal["appendix-c", "hydraulic"]
-LeaveOut = Literal["test", "condition"]
 
 _LONGEST_NAME = 80
 
@@ -72,7 +68,6 @@ def _view(name: str) -> str:
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Share = Annotated[Number, Field(gt=0, lt=1)]
-Ridge = Annotated[Number, Field(gt=0)]
 Whole = Annotated[int, Field(strict=True, ge=0)]
 Flag = Annotated[bool, Field(strict=True)]
 Text = Annotated[str, Field(pattern=r"^[^\n]*$")]
@@ -97,8 +92,7 @@ class RecordGroup(_Entries):
 
     `use`: `calibrate` sets thresholds (leak-free), `judge` is judged by them, on seeds of its own; `leak_lpm`: mean
     flow [L/min] of a leak of that `law` (`mixture`: half of each) from the plan's onset on, 0 for none; `fault`:
-    another fault, as text; `bound`: whether the rows of leaks of this size say what the Cramer-Rao bound of their
-    machine allows, which does not depend on the size, as the plan says where it is None.
+    another fault, as text.
     """
 
     count: Annotated[Whole, Field(ge=1)]
@@ -106,7 +100,6 @@ class RecordGroup(_Entries):
     leak_lpm: Annotated[Number, Field(ge=0, alias="leak"), _quantity("L/min")] = 0.0
     law: LeakLaw = "laminar"
     fault: Text = ""
-    bound: Flag | None = None
 
     def __post_init__(self) -> None:
         if self.use == "calibrate" and (self.leak_lpm or self.fault):
@@ -156,7 +149,7 @@ class SimulatedPlan(_JudgedPlan):
     record draws, "" for the rig without drift; `onset_s`: of the leaks, nan for half of the duration; `factors`: name
     -> levels, every combination is a cell; `command` and `closed` are the duty, `family` names families of the profile,
     other names are parameters of the rig; `seed`: the base of every case's seed; `part`: what the plan is for, such as
-    development or judging; `bound`: of groups of records that do not say it.
+    development or judging.
     """
 
     rig_name: Annotated[Text, Field(alias="rig")] = "thesis"
@@ -170,7 +163,6 @@ class SimulatedPlan(_JudgedPlan):
     records: Annotated[tuple[RecordGroup, ...], Field(min_length=1)]
     factors: Mapping[str, Annotated[tuple[Level, ...], Field(min_length=1)]] = field(default_factory=dict)
     part: Text = ""
-    bound: Flag = False
 
     @cached_property
     def rig(self) -> Rig:
@@ -188,12 +180,6 @@ class SimulatedPlan(_JudgedPlan):
     def size(self) -> int:
         """Number of records."""
         return sum(group.count for group in self.records)
-
-    @property
-    def bounded(self) -> frozenset[float]:
-        """Sizes of leaks [L/min] whose rows get the bound of their machine."""
-        wanted = (group for group in self.records if (self.bound if group.bound is None else group.bound))
-        return frozenset(group.leak_lpm for group in wanted if group.leak_lpm)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -230,68 +216,4 @@ class RecordedPlan(_JudgedPlan):
         return self._assumed(None)
 
 
-@dataclass(frozen=True)
-class LogisticClassifier(_Entries):
-    """A logistic regression on `features` with a `ridge` on the standardised coefficients."""
-
-    name: Text
-    features: Names
-    ridge: Ridge = 1.0
-
-    def candidates(self) -> list[LogisticClassifier]:
-        """Return itself: nothing is chosen."""
-        return [self]
-
-
-@dataclass(frozen=True)
-class ChosenClassifier(_Entries):
-    """A logistic regression whose features and ridge are chosen within the training samples.
-
-    Candidates are the unions of `groups` of features with each of `ridges`; the one with the smallest loss on tests
-    held out within the training samples is taken.
-    """
-
-    name: Text
-    groups: Annotated[tuple[Names, ...], Field(min_length=1, max_length=8, alias="choose")]
-    ridges: Annotated[tuple[Ridge, ...], Field(min_length=1)]
-
-    def candidates(self) -> list[LogisticClassifier]:
-        """Return every union of groups with every ridge, few features first and of these the larger ridge first."""
-        unions = [union for size in range(1, len(self.groups) + 1) for union in combinations(self.groups, size)]
-        return [
-            LogisticClassifier(self.name, tuple(feature for group in union for feature in group), ridge)
-            for union in unions
-            for ridge in sorted(self.ridges, reverse=True)
-        ]
-
-
-Classifier = LogisticClassifier | ChosenClassifier
-
-
-def _classifier(entries: Any) -> Classifier:
-    chosen = isinstance(entries, Mapping) and "choose" in entries
-    return as_type(ChosenClassifier, entries) if chosen else as_type(LogisticClassifier, entries)
-
-
-@dataclass(frozen=True, kw_only=True)
-class HeldOutPlan(_Plan):
-    """A campaign over a measured data set.
-
-    `leave_out`: what is held out whole in turn, a test (its part without and its part with the leak, or its unbroken
-    block of cycles) or all tests of one operating condition; `permutations`: how often labels are swapped within tests
-    to estimate what chance reaches, 0 for no such check; `seed`: of the swaps.
-    """
-
-    data: DataSet
-    detectors: Annotated[tuple[Annotated[Classifier, BeforeValidator(_classifier)], ...], Field(min_length=1)]
-    leave_out: LeaveOut = "test"
-    permutations: Annotated[Whole, Field(le=100_000)] = 0
-    seed: Whole = 0
-
-    @property
-    def unit(self) -> str:
-        """Unit of the sizes of its faults."""
-        return "grade" if self.data == "hydraulic" else "L/min"
-
-
-AnyPlan: TypeAlias = SimulatedPlan | HeldOutPlan | RecordedPlan
+AnyPlan: TypeAlias = SimulatedPlan | RecordedPlan

@@ -20,7 +20,7 @@ from sealscope.campaigns.plans.duty import (
     fault_of,
     voltage_in,
 )
-from sealscope.campaigns.plans.model import AnyPlan, HeldOutPlan, RecordedPlan, SimulatedPlan
+from sealscope.campaigns.plans.model import AnyPlan, RecordedPlan, SimulatedPlan
 from sealscope.diagnosis.diagnose import check_probability
 from sealscope.errors import InputError
 from sealscope.evaluation.thresholds import records_needed
@@ -36,11 +36,6 @@ MOST_RECORDS, MOST_CELLS = 1_000_000, 100_000
 #: What holds the records of a plan -> its kind, the tables that it has, and the entries of the last of them.
 _KINDS: Mapping[str, tuple[type[AnyPlan], tuple[str, ...], tuple[str, ...]]] = {
     "recordings": (RecordedPlan, ("campaign", "views", "recordings"), ("map", "rate", "unit", "sets")),
-    "held_out": (
-        HeldOutPlan,
-        ("campaign", "held_out"),
-        ("data", "leave_out", "permutations", "seed", "detectors"),
-    ),
     "records": (SimulatedPlan, ("campaign", "factors", "views", "records"), ()),
 }
 
@@ -64,10 +59,6 @@ def read_plan(tree: Mapping[str, Any], place: str = "plan") -> AnyPlan:
     """Read the plan in a TOML file's tables; its kind follows from the tables that are there."""
     plan = _entries(tree, place)
     plan = replace(plan, title=plan.title or plan.name)
-    if isinstance(plan, HeldOutPlan):
-        if len({classifier.name for classifier in plan.detectors}) < len(plan.detectors):
-            raise InputError(f"held_out.detectors must have names of their own ({place})")
-        return plan
     without_view = {} if plan.channels is None else {"": plan.channels}
     plan = replace(plan, views={**plan.views, **without_view}, assume=plan.assume and _beside(plan.assume, place))
     if isinstance(plan, SimulatedPlan):

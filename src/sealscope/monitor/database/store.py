@@ -90,7 +90,6 @@ class MonitorStore:
 
     def __init__(self, database: str) -> None:
         self.tables = tables
-        self.sends = True  # False while another monitor that shares the database sends for all
         is_file = "://" not in database
         # of the threads here one at a time writes to a file, which SQLite would let wait and then refuse
         self._writing_lock: AbstractContextManager[object] = threading.RLock() if is_file else nullcontext()
@@ -294,7 +293,7 @@ class MonitorStore:
 
     def pass_on(self, output: str, send: Callable[[dict[str, Any]], bool]) -> None:
         """Hand events to `send` in their order until it returns False, and store how far the output is after each."""
-        for number, event in self.events_since(self.position(output)) if self.sends else ():
+        for number, event in self.events_since(self.position(output)):
             if not send(event):
                 return
             self.keep_position(output, number)

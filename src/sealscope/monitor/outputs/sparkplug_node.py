@@ -57,10 +57,7 @@ class SparkplugNode:
         self._next = 0.0
 
     def pass_on(self) -> None:
-        """Send what has happened; a monitor that does not send for all others is not connected."""
-        if not self._store.sends:
-            self._link.close()
-            return
+        """Send what has happened."""
         if not self._link.is_open:
             self._born = self._store.position(_BIRTHS)
             self._link.open(clean_start=True)

@@ -55,12 +55,11 @@ class _Connection:
     """The connection of a service to its broker."""
 
     def __init__(self, settings: BrokerSettings, password: str | None, service: BlockReceiver) -> None:
-        self._settings, self._service, share = settings, service, service.settings.share
+        self._settings, self._service = settings, service
         self._broker = service.supervisor.part(BROKER)
         self._names = {actuator.topic: actuator.name for actuator in service.settings.actuator if actuator.topic}
-        name = settings.client_id if share is None else f"{settings.client_id}-{share.name}"  # a session of its own
         will = None if settings.host_id is None else self._offline
-        self._link = MqttLink(settings, name, password, will, retain=True)
+        self._link = MqttLink(settings, settings.client_id, password, will, retain=True)
         self._client = self._link.client
         self._host: SparkplugHost | None = None
         if any(actuator.sparkplug is not None for actuator in service.settings.actuator):
@@ -188,7 +187,7 @@ class _Connection:
     def _pass_on(self) -> None:
         """Publish the alarms of new events, and the states that have changed, each retained."""
         store = self._service.store
-        if self._settings.alarms_topic is None or not store.sends or not self._client.is_connected():
+        if self._settings.alarms_topic is None or not self._client.is_connected():
             return
         store.pass_on(
             _NAME, lambda event: self._published(event["alarm"]["actuator"], "alarm", json.dumps(event["alarm"]))

@@ -16,7 +16,7 @@ from sealscope.campaigns.judging.curves import DetectorPod, SizeRoc
 from sealscope.campaigns.judging.judge import Judgement
 from sealscope.campaigns.judging.tables import PriorKnowledge
 from sealscope.campaigns.plans.detectors import DIAGNOSE, plan_detector
-from sealscope.campaigns.plans.model import HeldOutPlan, RecordedPlan, SimulatedPlan
+from sealscope.campaigns.plans.model import RecordedPlan, SimulatedPlan
 from sealscope.campaigns.results import CampaignResult
 from sealscope.diagnosis.registry import detectors
 from sealscope.evaluation.roc import Area
@@ -127,20 +127,16 @@ def _notes(result: CampaignResult) -> list[str]:
     judgement, plan = result.judgement, result.plan
     simulated = isinstance(plan, SimulatedPlan)
     notes = [_say("intervals", share=100 * plan.confidence, unit=plan.unit)]
-    if isinstance(plan, HeldOutPlan):
-        notes.append(_say("held_out", group=plan.leave_out))
-    else:
-        share = 100 * plan.false_alarm
-        if judgement.thresholds:
-            key = "thresholds_of_records" if simulated else "thresholds_of_recordings"
-            notes.append(_say(key, share=share, leak_free=judgement.leak_free, judged=judgement.judged))
-        own = [name for name in plan.detectors if plan_detector(name).scorer is None]
-        notes += [_say("own_verdict", share=share, detectors=", ".join(own))] if own else []
+    share = 100 * plan.false_alarm
+    if judgement.thresholds:
+        key = "thresholds_of_records" if simulated else "thresholds_of_recordings"
+        notes.append(_say(key, share=share, leak_free=judgement.leak_free, judged=judgement.judged))
+    stating = [name for name in plan.detectors if plan_detector(name).scorer is None]
+    notes += [_say("own_verdict", share=share, detectors=", ".join(stating))] if stating else []
     with_onset = [name for name, known in result.known.items() if known.onset]
     notes += [_say("true_onset", detectors=", ".join(with_onset))] if with_onset else []
     notes += _known_notes(result)
     notes += [_say("batched", mode=result.mode)] if _batched(result) else []
-    notes += [check.sentence() for check in result.checks]
     notes += [plan.note] if plan.note else []
     notes += [_say("missing", count=result.missing)] if result.missing else []
     notes += [_say("failed", count=len(judgement.failed))] if judgement.failed else []
@@ -208,12 +204,6 @@ def _facts(result: CampaignResult) -> list[tuple[str, str]]:
     plan, judgement = result.plan, result.judgement
     if isinstance(plan, RecordedPlan):
         return [(group.label or group.files, f"{group.use}, size {group.size:g} {plan.unit}") for group in plan.sets]
-    if isinstance(plan, HeldOutPlan):
-        return [
-            ("data", plan.data),
-            ("held out", f"one {plan.leave_out} at a time"),
-            ("samples", str(judgement.judged)),
-        ]
     machines = f"machines drawn from profile {plan.profile}" if plan.profile else "no drift, every machine alike"
     facts = [
         ("rig", f"{plan.rig.name}; {machines}"),

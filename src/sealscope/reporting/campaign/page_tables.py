@@ -20,14 +20,6 @@ def percent(proportion: Proportion | None) -> str:
     return f"{_p(proportion.value)} % ({_p(proportion.low)}–{_p(proportion.high)})"
 
 
-def _of(proportion: Proportion | None) -> str:
-    return "–" if proportion is None else f"{proportion.count} of {proportion.n}"
-
-
-def _counted(proportion: Proportion | None) -> str:
-    return _of(proportion) if proportion is None or not proportion.n else f"{_of(proportion)}, {percent(proportion)}"
-
-
 def _p(share: float) -> str:
     value = 100.0 * share
     digits = 2 if value < 9.95 else 0 if value > 99.95 or value == round(value) else 1
@@ -106,7 +98,5 @@ def _quantile(quantile: IntervalEstimate) -> str:
 _FORMATS: Mapping[str, Callable[[Any], str]] = {
     "size": lambda size: f"{size:g}" if size else "no leak",
     "percent": percent,
-    "count": _of,
-    "counted": _counted,
     "quantile": _quantile,
 }

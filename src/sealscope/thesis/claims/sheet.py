@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from sealscope.errors import MissingExtra
 from sealscope.evaluation.binomial import at_least
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.thesis.chapters.chapter5 import NOMINAL_LPM, TESTS, ShownTest
@@ -129,8 +130,15 @@ def _identified(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _without_baseline(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
-    of = ("test", "condition")
-    return {f"{name}s": "{:.2f} (AUC {:.3f})".format(*ev.separation_by_levels(sheet, name)) for name in of}
+    texts = {}
+    groups: tuple[Literal["test", "condition"], ...] = ("test", "condition")
+    for name in groups:
+        try:
+            text = "{:.2f} (AUC {:.3f})".format(*ev.separation_by_levels(sheet, name))
+        except MissingExtra:
+            text = "? (needs scikit-learn)"
+        texts[f"{name}s"] = text
+    return texts
 
 
 def _at_5_percent(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:

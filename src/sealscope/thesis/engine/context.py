@@ -12,7 +12,7 @@ import numpy as np
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.recording import Array, Recording
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.simulate import simulate_with_truth
+from sealscope.simulation.simulate import simulate_experiment
 from sealscope.storage.atomic import atomic_write
 from sealscope.storage.folders import locked
 from sealscope.thesis.engine.products import Claim, Product, ThesisTable
@@ -49,7 +49,7 @@ class SimulatedRun:
 def simulated_run(experiment: Experiment, prove: bool) -> SimulatedRun:
     """Simulate a run, and `prove` it: halve its step, too; one that diverged or is not resolved says so."""
     try:
-        simulated = simulate_with_truth(replace(experiment, allow_unresolved=True), prove=prove)
+        simulated = simulate_experiment(replace(experiment, allow_unresolved=True), prove=prove)
     except SimulationFailed as error:
         return SimulatedRun(None, np.empty(0), {}, 0.0, False if prove else None, diverged=str(error))
     truth, proof = simulated.truth, simulated.proof

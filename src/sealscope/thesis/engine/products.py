@@ -11,7 +11,7 @@ from pydantic import PlainValidator
 
 from sealscope.recordings.recording import Array
 
-#: What a curve stands for. `reporting.thesis.plot_style` gives each role a line, a grey and a colour, readable without
+#: What a curve stands for. `thesis.pages.plot_style` gives each role a line, a grey and a colour, readable without
 #: the colour.
 Role = Literal[
     "command", "A", "B", "literal", "converged", "no leak", "leak", "measured", "simulated",

@@ -102,17 +102,7 @@ class Reading:
 OURS = Reading()
 #: The reading that takes eqs. (4.11), (4.12) and the text's "3.75 mm of 5 mm" at their word.
 AS_PRINTED = Reading(metering="literal", closed_means="diameter", d_line_mm=5.0)
-#: Both readings of "closed", both areas of eqs. (4.11), (4.12), both line diameters.
-READINGS: tuple[Reading, ...] = tuple(
-    replace(reading, d_line_mm=d_line)
-    for reading in (OURS, Reading(closed_means="diameter"), Reading("literal"), Reading("literal", "diameter"))
-    for d_line in (7.0, 5.0)
-)
-
-
-def readings(quick: bool) -> tuple[Reading, ...]:
-    """Return the readings that are tried: all eight, or, where it must be quick, ours and the printed one."""
-    return (OURS, AS_PRINTED) if quick else READINGS
+READINGS = (OURS, AS_PRINTED)
 
 
 def spec(

@@ -9,11 +9,11 @@ from dataclasses import astuple, fields
 from itertools import zip_longest
 from pathlib import Path
 
-from sealscope.reporting.thesis.plots import draw, visible
 from sealscope.storage.atomic import atomic_write
 from sealscope.storage.folders import inner_folder
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Claim, Figure, Product, ThesisTable
+from sealscope.thesis.pages.plots import draw, visible
 
 _NAME = re.compile(r"[a-z0-9]+([-.][a-z0-9]+)*")
 

@@ -16,15 +16,15 @@ import numpy as np
 import pytest
 
 from sealscope.errors import MissingExtra
-from sealscope.reporting.thesis.files import figure_rows, publish
-from sealscope.reporting.thesis.page import VERDICTS, cell, write_thesis_page
-from sealscope.reporting.thesis.plot_style import STYLES, caption, typeset
-from sealscope.reporting.thesis.plots import MOST_SVG_BYTES, UNRESOLVED, draw, grid_of, visible
 from sealscope.thesis.engine.build import ItemStatus
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Claim, Figure, FigureCurve, Image, Number, Panel, Role, ThesisTable
+from sealscope.thesis.pages.files import figure_rows, publish
+from sealscope.thesis.pages.page import VERDICTS, cell, write_thesis_page
+from sealscope.thesis.pages.plot_style import STYLES, caption, typeset
+from sealscope.thesis.pages.plots import MOST_SVG_BYTES, UNRESOLVED, draw, grid_of, visible
 
-from .pages import Reader
+from ..reporting.pages import Reader
 
 pytest.importorskip("matplotlib", reason="figures need the extra 'report'")
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sealscope.errors import MissingExtra
-from sealscope.reporting.thesis.plot_style import SAME_ROLE, SETTINGS, STYLES, caption, typeset
 from sealscope.thesis.engine.products import Figure, FigureCurve, Panel, Role, thinned
+from sealscope.thesis.pages.plot_style import SAME_ROLE, SETTINGS, STYLES, caption, typeset
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

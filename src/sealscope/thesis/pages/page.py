@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 from sealscope.reporting import template
-from sealscope.reporting.thesis.plot_style import caption
-from sealscope.reporting.thesis.plots import UNRESOLVED
 from sealscope.thesis.engine.build import ItemStatus
 from sealscope.thesis.engine.products import Claim, Figure, ThesisTable, Verdict
+from sealscope.thesis.pages.plot_style import caption
+from sealscope.thesis.pages.plots import UNRESOLVED
 
 THESIS = "Understanding Effect and Diagnosis of Internal Leakage in Hydrostatic Actuation Systems"
 VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
@@ -72,6 +72,7 @@ def write_thesis_page(
     claims_files = [name for status in statuses if status.item.id == "claims" for name in status.files]
     page = template.render(
         "thesis.html.j2",
+        package="sealscope.thesis.pages",
         scripts=["templates/thesis.js"],
         title="The thesis reproduced",
         thesis=THESIS,
