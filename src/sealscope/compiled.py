@@ -61,7 +61,8 @@ from numba.extending import intrinsic
 config._config_fname = ""  # numba's settings in the working folder may be hostile, and name a library to load
 config.reload_config()
 _F = TypeVar("_F", bound=Callable[..., Any])
-_COMPILED_PACKAGES = ("compiled.py", "physics", "signals", "control", "simulation", "diagnosis")
+_WALK = "monitor/sources/message_limits.py"
+_COMPILED_PACKAGES = ("compiled.py", "physics", "signals", "control", "simulation", "diagnosis", _WALK)
 _KEPT_GENERATIONS = 4
 _log = logging.getLogger(__name__)
 
