@@ -38,9 +38,10 @@ from platformdirs import user_cache_path
 numba.config._config_fname = ""
 numba.config.reload_config()
 _F = TypeVar("_F", bound=Callable[..., Any])
+_WALK = "monitor/sources/message_limits.py"
 _COMPILED_PACKAGES = (
     *("compiled.py", "numba_pipeline.py", "numba_private.py"),
-    *("physics", "signals", "control", "simulation", "diagnosis"),
+    *("physics", "signals", "control", "simulation", "diagnosis", _WALK),
 )
 _KEPT_GENERATIONS = 4
 #: Versions of numba whose private names are known: from the first to before the second.

@@ -20,7 +20,7 @@ FEW = {
     "campaign folders": 15,
     "kept files": 60,
 }
-FEW |= {"machines": 60, "monitor messages": 400, "Sparkplug messages": 400}
+FEW |= {"machines": 60, "monitor messages": 400, "CBOR messages": 4000, "Sparkplug messages": 400}
 MANY = {
     "options": 6000,
     "rigs": 2000,
@@ -30,7 +30,7 @@ MANY = {
     "campaign folders": 500,
     "kept files": 1500,
 }
-MANY |= {"machines": 3000, "monitor messages": 50_000, "Sparkplug messages": 50_000}
+MANY |= {"machines": 3000, "monitor messages": 50_000, "CBOR messages": 500_000, "Sparkplug messages": 50_000}
 
 
 def some(kind: str, folder: Path, seeds: range, capfd: pytest.CaptureFixture[str]) -> None:

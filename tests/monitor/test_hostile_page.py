@@ -125,6 +125,33 @@ def test_a_page_with_a_token_answers_guesses_later(service: Service, tmp_path: P
     assert page.get("/metrics", headers=right).status_code == 200
 
 
+@pytest.mark.parametrize("proxies", [[], ["192.0.2.1"], ["127.0.0.1"]])
+def test_who_asks_is_who_connects_unless_a_proxy_is_named(service: Service, tmp_path: Path, monkeypatch, proxies):
+    """300 guesses, each for another address: looked at are five, or all where the settings believe this machine."""
+    monkeypatch.setattr("sealscope.monitor.page.guard._FIRST_S", 50.0)
+    (tmp_path / "token").write_text("s3cret")
+    service.stopping.clear()
+    server = PageServer(service.actuators, PageSettings(port=0, token_file=tmp_path / "token", proxies=proxies))
+    try:
+        statuses = list[int]()
+        for k in range(300):
+            line = http.client.HTTPConnection("127.0.0.1", server.port, timeout=20.0)
+            headers = {"X-Forwarded-For": f"10.0.{k // 100}.{k % 100}", "Forwarded": f"for=10.1.0.{k % 100}"}
+            line.request("GET", "/metrics", headers={"Authorization": f"Bearer guess {k}", **headers})
+            statuses.append(line.getresponse().status)
+            line.close()
+    finally:
+        server.close()
+        service.actuators.closed = False
+    assert statuses == ([401] * 300 if proxies == ["127.0.0.1"] else [401] * 5 + [429] * 295)
+
+
+def test_a_proxy_is_an_address(tmp_path: Path):
+    for wrong in ("*", "proxy.example", "10.0.0.0/8"):
+        with pytest.raises(InputError, match=r"page.proxies"):
+            settings_in(tmp_path, f'[page]\nproxies = ["{wrong}"]\n')
+
+
 def test_a_session_of_an_earlier_token_is_taken_from_the_browser(service: Service, tmp_path: Path):
     settings = PageSettings(host="0.0.0.0", token_file=tmp_path)
     old, new = (TestClient(site(service.actuators, settings, token), base_url="http://a") for token in ("old", "new"))

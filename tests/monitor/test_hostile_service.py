@@ -24,9 +24,9 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from sealscope.monitor.service import Service
+from sealscope.monitor.sources.message_limits import MOST_SAMPLES
 from sealscope.monitor.sources.source_block import (
     LARGEST,
-    MOST_SAMPLES,
     NO_CLOCK,
     NO_MAPPING,
     NO_SAMPLES,

@@ -32,7 +32,7 @@ def proxy(tmp_path: Path) -> Iterator[http.client.HTTPSConnection]:
     signed(tmp_path, "page", signed(tmp_path, "authority"))
     (tmp_path / "token.txt").write_text("the token\n")
     service = Service(settings_in(tmp_path), once=True)
-    page = PageServer(service.actuators, PageSettings(port=0, token_file=tmp_path / "token.txt"))
+    page = PageServer(service.actuators, PageSettings(port=0, token_file=tmp_path / "token.txt", proxies=["127.0.0.1"]))
     port, (site,) = free_port(), re.findall(r"```nginx\n(.*?)```", GUIDE.read_text("utf-8"), re.DOTALL)
     for given, here in (
         ("listen 443", f"listen 127.0.0.1:{port}"),

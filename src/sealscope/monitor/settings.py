@@ -8,7 +8,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, IPvAnyAddress, ValidationInfo, model_validator
 
 from sealscope.diagnosis.live.joining import CHANNELS, in_words, ways_to_watch
 from sealscope.errors import InputError
@@ -85,11 +85,12 @@ class ActuatorSettings(WatchSettings):
 
 
 class PageSettings(_Part):
-    """The page."""
+    """The page; `proxies`: addresses that are believed for whom they forward a request."""
 
     host: str = "127.0.0.1"
     port: int = Field(default=8765, ge=0, le=65535)
     token_file: _File | None = None
+    proxies: list[IPvAnyAddress] = Field(default_factory=list, max_length=100)
 
 
 class BrokerSettings(_Part):

@@ -213,6 +213,21 @@ class MonitorStore:
         rows = self._rows(select(tables.refused).order_by(tables.refused.c.number.desc()).limit(most))
         return [dict(row._mapping) for row in rows]
 
+    def begin_decoding(self, reader: str, digest: str) -> int:
+        """Note that a reader begins to decode a message; return how often it began before and did not end."""
+        table, of = tables.decodings, tables.decodings.c
+        before = select(of.attempts).where(of.reader == reader, of.digest == digest)
+        with self.writing() as connection:
+            attempts = int(connection.execute(before).scalar() or 0)
+            self.put(connection, table, [{"reader": reader, "digest": digest, "attempts": attempts + 1}])
+        return attempts
+
+    def end_decoding(self, reader: str, digest: str) -> None:
+        """Forget that a reader began to decode a message."""
+        of = tables.decodings.c
+        with self.writing() as connection:
+            connection.execute(tables.decodings.delete().where(of.reader == reader, of.digest == digest))
+
     def last_number(self, table: sa.Table, actuator: str) -> int:
         """Return the number of an actuator's last row of a table, `tables.blocks` or `tables.estimates`."""
         return self._value(select(func.max(table.c.number)).where(table.c.actuator == actuator))

@@ -50,3 +50,5 @@ events = _table(
 )
 #: The last messages and files that could not be taken: when [s], from where, why, their size and how they begin.
 refused = _table("refused", "number int counted, at double, reason 120, message text, size int, beginning bytes")
+#: Messages whose decoding has not ended: who reads them, their digest, and how often it was begun.
+decodings = _table("decodings", "reader 240 key, digest 40 key, attempts int")

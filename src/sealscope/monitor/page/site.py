@@ -305,6 +305,7 @@ class PageServer:
         token = secret_of(settings.token_file, "page.token_file")
         self._actuators, self._host, self.port = actuators, settings.host, settings.port
         self._application = site(actuators, settings, token, waits, live)
+        self._proxies = [str(address) for address in settings.proxies]
         self._socket: socket.socket | None = self._opened()
         self.port = int(self._socket.getsockname()[1])
         self.address = f"http://{settings.host}:{self.port}/"
@@ -331,7 +332,8 @@ class PageServer:
             access_log=False,
             backlog=BACKLOG,
             timeout_graceful_shutdown=1,
-            forwarded_allow_ips=",".join(_LOCAL),
+            proxy_headers=bool(self._proxies),
+            forwarded_allow_ips=self._proxies,
         )
         self._server = uvicorn.Server(config)
         self._server.should_exit = self._actuators.closed

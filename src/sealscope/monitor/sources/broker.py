@@ -2,8 +2,10 @@
 
 The session outlives the connection (QoS 1, no clean start): what was in flight at a crash comes again, and is known by
 its identity. The thread of the connection only takes messages in; another one decodes them and waits where the service
-does. Of QoS 0 those are dropped and counted for which there is no room. Where a broker sends more of QoS 1 than agreed
-(as mosquitto 2.0.11 does), that one and all after it are left to it, and come again in order over a new connection.
+does. That the decoding of a large or repeated message begins is stored until it ends: one during which the process has
+died twice is refused unread. Of QoS 0 those are dropped and counted for which there is no room. Where a broker sends
+more of QoS 1 than agreed (as mosquitto 2.0.11 does), that one and all after it are left to it, and come again in order
+over a new connection.
 """
 
 from __future__ import annotations
@@ -15,14 +17,23 @@ import ssl
 import sys
 import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any
 
+from sqlalchemy.exc import SQLAlchemyError
+
 from sealscope.monitor.mqtt_client import MqttLink, check_mqtt
 from sealscope.monitor.settings import BrokerSettings, secret_of, topic_part
-from sealscope.monitor.sources.source_block import BlockReceiver, RefusedMessage, decoded
+from sealscope.monitor.sources.source_block import (
+    UNENDED,
+    BlockReceiver,
+    RefusedMessage,
+    SourceBlock,
+    decoded,
+    digest_of,
+)
 from sealscope.monitor.sources.sparkplug_host import SparkplugHost
 from sealscope.monitor.sparkplug import NAMESPACE
 from sealscope.monitor.supervisor import BROKER
@@ -34,6 +45,8 @@ _SESSION_S, _IN_FLIGHT, _LARGEST = 30 * 86_400, 64, 16_000_000
 #: Messages that wait to be decoded and their bytes, at most, as one more of QoS 0 is taken in, and as one of QoS 1 is.
 _ROOM, _ROOM_BYTES = 256, 64_000_000
 _ASSURED_ROOM, _ASSURED_BYTES = 2048, 192_000_000
+#: Messages whose decoding is noted: larger ones [bytes], and those that come again; how often it is begun at most.
+_LARGE, _ATTEMPTS = 256_000, 2
 _NAME = "mqtt"
 #: How long the decoder is waited for at the end [s].
 _END_S = 2.0
@@ -58,8 +71,9 @@ class _Connection:
         self._settings, self._service = settings, service
         self._broker = service.supervisor.part(BROKER)
         self._names = {actuator.topic: actuator.name for actuator in service.settings.actuator if actuator.topic}
+        self._name = settings.client_id
         will = None if settings.host_id is None else self._offline
-        self._link = MqttLink(settings, settings.client_id, password, will, retain=True)
+        self._link = MqttLink(settings, self._name, password, will, retain=True)
         self._client = self._link.client
         self._host: SparkplugHost | None = None
         if any(actuator.sparkplug is not None for actuator in service.settings.actuator):
@@ -175,14 +189,38 @@ class _Connection:
         try:
             with suppress(UnicodeDecodeError):
                 topic = message.topic
-            if self._host is None or not topic.startswith(f"{NAMESPACE}/"):
-                block = decoded(message.payload, self._names.get(topic))
-            else:
-                block = self._host.taken(topic, message.payload)
+            with self._noted(message):
+                block = self._decoded(topic, message.payload)
         except RefusedMessage as error:  # it would be no better a second time: it is kept, and acknowledged
             self._service.hand(RefusedMessage(error.reason, f"{topic[:100]}: {error}", message.payload, done))
         else:
             done() if block is None else self._service.hand(replace(block, done=done))
+
+    def _decoded(self, topic: str, payload: bytes) -> SourceBlock | None:
+        """Return the block of a message, None for one of Sparkplug without; raises RefusedMessage."""
+        if self._host is not None and topic.startswith(f"{NAMESPACE}/"):
+            return self._host.taken(topic, payload)
+        return decoded(payload, self._names.get(topic))
+
+    @contextmanager
+    def _noted(self, message: Any) -> Iterator[None]:
+        """Store, while a message is decoded that is large or comes again, that this was begun.
+
+        Raises RefusedMessage where it was begun twice before and never ended: the process died meanwhile.
+        """
+        if not message.qos or not (message.dup or len(message.payload) > _LARGE):
+            yield
+            return
+        store, digest, before = self._service.store, digest_of(message.payload), 0
+        with suppress(SQLAlchemyError):  # it is away: storing waits for it, and says so
+            before = store.begin_decoding(self._name, digest)
+        try:
+            if before >= _ATTEMPTS:
+                raise RefusedMessage(UNENDED, f"a message must be decoded in {_ATTEMPTS} attempts, got no end of them")
+            yield
+        finally:
+            with suppress(SQLAlchemyError):
+                store.end_decoding(self._name, digest)
 
     def _pass_on(self) -> None:
         """Publish the alarms of new events, and the states that have changed, each retained."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sealscope.monitor.sources.source_block import MOST_SAMPLES
+from sealscope.monitor.sources.message_limits import MOST_SAMPLES
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
 
 #: How long a channel may say nothing before it counts as unchanged [s].

@@ -18,6 +18,15 @@ import numpy as np
 
 from sealscope.diagnosis.live.joining import CHANNELS
 from sealscope.errors import InputError, MissingExtra
+from sealscope.monitor.sources.message_limits import (
+    FLOAT_ARRAYS,
+    MOST_SAMPLES,
+    MessageLimit,
+    check_cbor,
+    check_json,
+    check_json_keys,
+    check_keys,
+)
 from sealscope.monitor.supervisor import place_of
 from sealscope.recordings.channels import CHANNEL_UNITS, SLOW
 from sealscope.recordings.recording import Recording
@@ -27,10 +36,10 @@ if TYPE_CHECKING:
     from sealscope.monitor.settings import MonitorSettings
     from sealscope.monitor.supervisor import Supervisor
 
-#: Largest message [bytes], and most samples of a channel in it.
-LARGEST, MOST_SAMPLES = 16_000_000, 1_000_000
-#: Tags of CBOR for arrays of numbers (RFC 8746) -> how their bytes are to be read.
-_TYPED = {81: ">f4", 82: ">f8", 85: "<f4", 86: "<f8"}
+#: Largest message [bytes].
+LARGEST = 16_000_000
+#: Tags of CBOR for arrays of numbers -> how their bytes are to be read.
+_TYPED = dict(zip(FLOAT_ARRAYS, (">f4", ">f8", "<f4", "<f8"), strict=True))
 #: Bytes of a refused message that are kept.
 _BEGINNING = 4000
 _KNOWN = {"actuator", "t", "rate", "units", "id", *CHANNELS}
@@ -91,6 +100,7 @@ REASONS = (
     OUT_OF_SEQUENCE := "Sparkplug messages out of sequence",
     STALE_DEATH := "Sparkplug deaths of an earlier connection",
     UNFORESEEN := "messages whose decoding raised an error",
+    UNENDED := "messages whose decoding was begun twice and did not end",
     UNREADABLE_FILE := "files that could not be read",
 )
 
@@ -207,14 +217,22 @@ def _mapping(payload: bytes) -> Mapping[str, Any]:
         if payload.lstrip()[:1] == b"{":
             import orjson
 
+            check_json(payload)
             values = orjson.loads(payload)
+            check_json_keys(values, payload)
         else:
             import cbor2
 
+            pairs = check_cbor(payload)
             values = cbor2.loads(payload)
+            check_keys(values, pairs)
     except ImportError as error:
         needed = f"a message needs {error.name}: pip install 'sealscope[serve,mqtt]'"
         raise RefusedMessage(UNREADABLE, needed) from None
+    except MessageLimit as error:
+        raise RefusedMessage(
+            OVERSIZED if error.oversized else UNREADABLE, f"a message must keep its limits: {error}"
+        ) from None
     except Exception as error:  # a damaged message makes the libraries raise whatever they like
         reason = " ".join(str(error).split())[:80]
         raise RefusedMessage(UNREADABLE, f"a message must be JSON or CBOR: {reason}") from None

@@ -21,6 +21,7 @@ from sealscope.diagnosis.live.joining import CHANNELS
 from sealscope.monitor import sparkplug as spb
 from sealscope.monitor.settings import ActuatorSettings
 from sealscope.monitor.sources import source_block as blocks
+from sealscope.monitor.sources.message_limits import MOST_SAMPLES
 from sealscope.monitor.sources.source_block import RefusedMessage, SourceBlock, digest_of, in_si, refusing
 from sealscope.recordings.channels import SLOW
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
@@ -220,8 +221,8 @@ class SparkplugHost:
             piece = _piece(groups[at], birth, by_name)
             size = next(iter(piece.values())).size
             pieces.append({"t": self._clock(actuator.name, at / 1000.0, size, rate), **piece})
-        if (count := sum(piece["t"].size for piece in pieces)) > blocks.MOST_SAMPLES:
-            raise RefusedMessage(blocks.OVERSIZED, f"{blocks.MOST_SAMPLES} samples are the most, got {count}")
+        if (count := sum(piece["t"].size for piece in pieces)) > MOST_SAMPLES:
+            raise RefusedMessage(blocks.OVERSIZED, f"{MOST_SAMPLES} samples are the most, got {count}")
         values = {
             name: np.concatenate([piece.get(name, np.full(piece["t"].size, np.nan)) for piece in pieces])
             for name in ("t", *CHANNELS)
