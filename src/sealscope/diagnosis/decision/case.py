@@ -109,18 +109,19 @@ class Case:
 
     @cached_property
     def other_event(self) -> OtherEvent | None:
-        """The event that is no leak, surely explains what was observed, and has a name; None where there is none."""
+        """The event that is no leak and surely explains the rarest change it can; None where none does."""
         allowed = self.context.false_alarm_probability / max(len({own.data for own in self.observables}), 1)
-        for event in self.explanations[0].events if self.observables else ():
-            if event.cause is None or event.name in LEAK_EVENTS:
-                continue
-            moved = [own for own in self.observables if event.does_move(own)]
-            rarest = min(moved, key=self.null.chance, default=None)
-            sure = probability_of(self.explanations, cause=event.cause)
-            if rarest is None or sure <= _PRIORS["explanation"]["sure"]:
-                continue
-            if (chance := self.null.chance(rarest)) < allowed:
-                return OtherEvent(event.cause, event.words, sure, rarest, chance)
+        chances = {id(own): self.null.chance(own) for own in self.observables}
+        for observable in sorted(self.observables, key=lambda own: chances[id(own)]):
+            if chances[id(observable)] >= allowed:
+                return None
+            moving = [event for event in load_events() if event.does_move(observable)]
+            causes = dict.fromkeys(event.cause for event in moving if event.name not in LEAK_EVENTS)
+            for cause in (own for own in causes if own is not None):
+                sure = probability_of(self.explanations, cause=cause, data=observable.data)
+                if sure > _PRIORS["explanation"]["sure"]:
+                    words = max((e for e in moving if e.cause == cause), key=lambda e: e.probability).words
+                    return OtherEvent(cause, words, sure, observable, chances[id(observable)])
         return None
 
 

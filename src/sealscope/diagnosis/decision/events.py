@@ -40,6 +40,11 @@ class Event:
     disturbs: tuple[str, ...]
     words: str
 
+    @property
+    def is_sized(self) -> bool:
+        """Return whether the event has a size that its observables' `advantage` judges; what has no name has none."""
+        return self.cause is not None
+
     def does_move(self, observable: Observable) -> bool:
         """Return whether an observable shows the event."""
         return _matches(observable, self.moves)

@@ -81,7 +81,7 @@ def explain(
         The most probable first; their probabilities add up to one.
     """
     events = load_events()
-    weighted = [(own, log_bayes_factor(chance(own)) + 0.5 * own.advantage) for own in observables]
+    weighted = [(own, log_bayes_factor(chance(own))) for own in observables]
     ways = {event.name: _ways_of(event, weighted, rise) for event in events}
     telling = [event for event in events if max(sum(gains.values()) for gains in ways[event.name]) > LEAST]
     groups = [(event,) for event in events]
@@ -119,6 +119,7 @@ def _ways_of(event: Event, weighted: Sequence[tuple[Observable, float]], rise: L
         disturbed = [pair for pair in weighted if event.does_disturb(pair[0])] if most > LEAST else []
         for own, gain in moved + disturbed:
             if _coincide(own, anchor):
+                gain += 0.5 * own.advantage if event.is_sized else 0.0
                 gains[own.data] = max(gain, gains.get(own.data, 0.0))
     ways: list[_Gains] = [gains]
     if rise is not None and event.name in LEAK_EVENTS:

@@ -48,21 +48,18 @@ class BalanceLeak:
     @cached_property
     def step_flow(self) -> Flow:
         """Mean flow of the step while it lasts, its law between laminar and an orifice's, by their likelihoods."""
-        balance = self.balance
-        laminar, orifice = balance.test, balance.through_orifice
-        if laminar is None:
+        balance, laws = self.balance, self.balance.laws
+        if balance.test is None or not laws:
             return Flow(0.0, np.inf)
-        flows, deviations, scores = [], [], []
-        for test, mean in ((laminar, balance.mean_pressure), (orifice, balance.mean_root)):
-            if test is not None:
-                driving = mean(laminar.onset().value)
-                flows.append(test.fitted[0] * driving)
-                deviations.append(test.fitted[1] * driving)
-                scores.append(test.score)
-        weights = np.exp(0.5 * (np.array(scores) - max(scores)))
+        onset = balance.test.onset().value
+        driving = [balance.mean_of_blocks(law.driving, onset) for law in laws]
+        flows, deviations = (
+            np.array([law.test.fitted[k] * mean for law, mean in zip(laws, driving, strict=True)]) for k in (0, 1)
+        )
+        weights = np.exp(0.5 * np.array([law.test.score - max(law.test.score for law in laws) for law in laws]))
         weights /= weights.sum()
         value = float(weights @ flows)
-        spread = float(np.sqrt(weights @ (np.square(deviations) + (np.array(flows) - value) ** 2)))
+        spread = float(np.sqrt(weights @ (deviations**2 + (flows - value) ** 2)))
         return self._with_law(Flow(value, spread))
 
     @property

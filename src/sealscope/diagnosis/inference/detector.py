@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,8 +12,10 @@ from sealscope.diagnosis.inference.blocks import Columns
 from sealscope.diagnosis.inference.circuit.store import lost_beside
 from sealscope.diagnosis.inference.circuit.without_position import circulations
 from sealscope.diagnosis.inference.balance_leak import BalanceLeak
+from sealscope.diagnosis.inference.differences import difference
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.inference.recorded import RecordedBalance
+from sealscope.diagnosis.inference.rivals import rival_rises
 from sealscope.diagnosis.inference.scatter import RecordingSums, Rise, motion_change, rise
 from sealscope.diagnosis.inference.terms import CYLINDER, LOCKED, circulation, equations, locked
 from sealscope.diagnosis.inference.weak_form import STRIDE, stride_samples
@@ -145,17 +147,20 @@ class VolumeBalance:
         share = float(rows.mean() / max(rows.max(), 1.0)) if is_whole else 1.0
         observables = balance.observables
         if healthy and len(balance.columns) == 1 and is_whole:
-            observables += (_motion_observable(balance, healthy),)
+            observables += (*_motion_observable(balance, healthy), *rival_rises(balance.recording_sums, healthy, balance.columns))
         return Observed(self.name, observables, leak, share=share)
 
 
-def _motion_observable(balance: RecordedBalance, healthy: Sequence[RecordingSums]) -> Observable:
+def _motion_observable(balance: RecordedBalance, healthy: Sequence[RecordingSums]) -> Iterator[Observable]:
     """Compare the flow that motion takes with the healthy recordings: another machine, or another scale."""
-    change = motion_change(balance.recording_sums.sums[0], [own.sums[0] for own in healthy], balance.columns[0])
-    chance = 2.0 * min(change.chance, 1.0 - change.chance)
-    return Observable(
-        name="motion", data="motion", score=2.0 * change.log_ratio(change.value), chance=chance, size=change.value
-    )
+    columns, sums = balance.columns[0], [recording.sums[0] for recording in healthy]
+    change = motion_change(balance.recording_sums.sums[0], sums, columns)
+    known = [
+        motion_change(own, sums[:k] + sums[k + 1 :], columns) * (len(sums) - 1) / len(sums)
+        for k, own in enumerate(sums if len(sums) > 1 else ())
+    ]
+    observable = difference("motion", "motion", change, known, priors("inference")["size"]["motion"])
+    yield from () if observable is None else (observable,)
 
 
 def _later(recorded: RecordingSums, times: int) -> float | None:

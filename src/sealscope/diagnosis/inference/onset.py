@@ -242,16 +242,27 @@ class NullLaw(NamedTuple):
         return min(1.0, 0.5 * float(betainc(0.5 * (n - 1), 0.5, away)) + tube)
 
 
-def step_test(information: Information, signs: Sequence[float] = (1.0,)) -> StepTest | None:
+def step_test(
+    information: Information, signs: Sequence[float] = (1.0,), shape: Array | None = None
+) -> StepTest | None:
     """Return the likeliest test of a step of one of the `signs`; None where too few blocks say anything.
 
     The chance of one of two is twice that stated.
     """
-    return max(step_tests(information, signs), key=lambda test: test.score, default=None)
+    return max(step_tests(information, signs, shape), key=lambda test: test.score, default=None)
 
 
-def step_tests(information: Information, signs: Sequence[float]) -> list[StepTest]:
-    """Return the tests of a step of each of the `signs`; none where too few blocks say anything."""
+def step_tests(information: Information, signs: Sequence[float], shape: Array | None = None) -> list[StepTest]:
+    """Return the tests of a step of each of the `signs`; none where too few blocks say anything.
+
+    Parameters
+    ----------
+    information : Information
+    signs : sequence of float
+        1 for steps up, -1 for steps down.
+    shape : array of float, shape (K,), optional
+        What a step of one adds to the coefficient in each block while it lasts, by default one.
+    """
     time, precision, vector = _with_level(information)
     count = len(time)
     values, vectors = np.linalg.eigh(precision)
@@ -273,6 +284,8 @@ def step_tests(information: Information, signs: Sequence[float]) -> list[StepTes
     eigen, basis = np.linalg.eigh(unit * covariance)
     at = np.arange(EDGE, count - EDGE + 1e-9, 1.0 / PARTS)
     steps = np.clip(index[:, None] + 1.0 - at, 0.0, 1.0)
+    if shape is not None:
+        steps[count - len(shape) :] *= shape[:, None]
     z, steps, eigen = basis.T @ (free @ z), basis.T @ (inner @ steps), np.maximum(eigen, 0.0)
     onsets, believed = _onset_times(time, at), -np.log1p(WALKS * unit * count / information.walk**2)
     return [_scan(sign * z, steps, eigen, onsets, unit, believed) for sign in signs]

@@ -11,10 +11,11 @@ import numpy as np
 
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, information, mean_of, zero_of
 from sealscope.diagnosis.inference.changes.volumes import volume_observables
+from sealscope.diagnosis.inference.leak_law import LeakLaw, leak_laws
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import WITHIN_95, Course, Information, Interval, StepTest, course, step_test
 from sealscope.diagnosis.inference.scatter import RecordingSums
-from sealscope.diagnosis.inference.terms import LAG, ORIFICE, PUMP, Equation
+from sealscope.diagnosis.inference.terms import LAG, PUMP, Equation
 from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.evidence import RAREST
 from sealscope.diagnosis.verdict.machine import measures_flow
@@ -74,10 +75,9 @@ class RecordedBalance:
         return step_test(self.leak)
 
     @cached_property
-    def through_orifice(self) -> StepTest | None:
-        """Test of a step of the flow through an orifice."""
-        column = self.columns[0]
-        return step_test(information(self.blocks, self.columns, column.names.index(ORIFICE), column.leak))
+    def laws(self) -> tuple[LeakLaw, ...]:
+        """Tests of a step of the leak under each law of its flow over the pressure difference."""
+        return leak_laws(self.blocks, self.columns, self.leak)
 
     @cached_property
     def observables(self) -> tuple[Observable, ...]:
@@ -96,11 +96,6 @@ class RecordedBalance:
         return zero_of(self.blocks, self.columns)
 
     @cached_property
-    def root_zero(self) -> float:
-        """Zero of the root of p_A - p_B [Pa^0.5], as a change of a leak through an orifice shows it."""
-        return zero_of(self.blocks, self.columns, self.columns[0].names.index(ORIFICE))
-
-    @cached_property
     def delay(self) -> tuple[float, float] | None:
         """How much later x is recorded than the flow [s], by the share of its lag in the motion, with its deviation."""
         column = self.columns[0]
@@ -113,18 +108,15 @@ class RecordedBalance:
 
     def mean_pressure(self, since: float = -np.inf) -> float:
         """Return the mean size of p_A - p_B about its zero [Pa], over the blocks whose middle is `since` or later."""
-        return self._mean(self.blocks.driving(self.zero), since)
-
-    def mean_root(self, since: float = -np.inf) -> float:
-        """Return the mean root of the size of p_A - p_B [Pa^0.5], likewise."""
-        return self._mean(self.blocks.driving(self.root_zero, root=True), since)
+        return self.mean_of_blocks(self.blocks.driving(self.zero), since)
 
     @cached_property
     def mean_flow(self) -> float:
         """Mean size of the pump's flow [m^3/s]."""
-        return self._mean(self.blocks.flow)
+        return self.mean_of_blocks(self.blocks.flow)
 
-    def _mean(self, values: Array, since: float = -np.inf) -> float:
+    def mean_of_blocks(self, values: Array, since: float = -np.inf) -> float:
+        """Return the mean of a value of each block (K,), over the blocks whose middle is `since` or later."""
         chosen = self.blocks.time >= since
         if not chosen.any():
             chosen[-1] = True

@@ -255,24 +255,19 @@ def _level(sums: Array, columns: Sequence[Columns]) -> tuple[float, float]:
     return (max(vector, 0.0) / precision, precision**-0.5) if precision > 0.0 else (0.0, 0.0)
 
 
-def motion_change(judged: Array, baseline: Sequence[Array], columns: Columns) -> Rise:
-    """Return the logarithm of the flow that motion takes in a recording, over that in healthy ones, as they scatter.
+def motion_change(judged: Array, baseline: Sequence[Array], columns: Columns) -> float:
+    """Compute the logarithm of the flow that motion takes in a recording over that in others, by sums (m, m).
 
-    Of the sums (m, m) of one equation. Area over displacement differs by it: another machine, or another scale.
+    Area over displacement differs by it: another machine, or another scale.
     """
     everything, motion = np.sum(baseline, axis=0), list(columns.motion)
     chosen = list(columns.nuisance)
-
-    def logarithm(own: Array, reference: Array) -> float:
-        flows = [
-            np.diag(own)[motion] @ solve(of[np.ix_(chosen, chosen)], of[chosen, columns.left])[at]
-            for of in (own, reference)
-        ]
-        return float(np.log(np.maximum(np.abs(flows), np.finfo(float).tiny)) @ [1.0, -1.0])
-
-    at = [chosen.index(k) for k in motion]
-    apart = [logarithm(own, everything - own) for own in baseline] if len(baseline) > 1 else [0.0]
-    return student(logarithm(judged, everything), apart, priors("inference")["between"]["motion"])
+    places = [chosen.index(k) for k in motion]
+    flows = [
+        np.diag(judged)[motion] @ solve(sums[np.ix_(chosen, chosen)], sums[chosen, columns.left])[places]
+        for sums in (judged, everything)
+    ]
+    return float(np.log(np.maximum(np.abs(flows), np.finfo(float).tiny)) @ [1.0, -1.0])
 
 
 def student(value: float, deviations: Sequence[float] | Array, believed: float) -> Rise:

@@ -7,26 +7,29 @@ it went down (p_A) or up (p_B). Here d2..d4 of all chambers are tested for a ste
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from sealscope.diagnosis.inference.differences import difference
 from sealscope.diagnosis.inference.observable import Observable, Observed, Ringing
 from sealscope.diagnosis.inference.onset import step_tests
 from sealscope.diagnosis.learnt import Healthy, Lesson, lessons_of
 from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.rms_change.blocks import JUDGED, RmsBlocks, columns_of, cut, judged_chambers, whole
 from sealscope.diagnosis.rms_change.ringing import information, rises
-from sealscope.recordings.chambers import chambers_of
+from sealscope.recordings.chambers import CHAMBERS, chambers_of
 from sealscope.recordings.hydraulics import lack_of_chambers
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.motion import constant
 from sealscope.recordings.recording import Array, Recording
-from sealscope.signals.details import shortest
+from sealscope.signals.details import QUANTITIES, shortest
 
 #: Name of the data that these observables describe.
 DETAILS = "details"
+#: Details that ringing, and no noise alone, fills.
+RINGING = ("d2", "d3")
 
 
 class RmsChange:
@@ -155,7 +158,26 @@ def compare_lessons(
             )
         )
         bounds += [size.bound()] if is_judged else []
+    observables += _sides(judged, lessons, chambers)
     return tuple(observables), min(bounds)
+
+
+def _sides(judged: Lesson, lessons: Sequence[Lesson], chambers: Sequence[str]) -> Iterator[Observable]:
+    """Yield how the ringing of one chamber stands to the other's, which the machine moves alike."""
+    if len(chambers) != len(CHAMBERS):
+        return
+    rows = [(QUANTITIES.index(name), len(QUANTITIES) + QUANTITIES.index(name)) for name in RINGING]
+
+    def beside(lesson: Lesson) -> float:
+        levels = _levels(lesson, chambers)
+        return float(np.mean([levels[first] - levels[second] for first, second in rows]))
+
+    error: float = priors("rms_change")["recordings"]["error"]
+    observable = difference("p_A beside p_B", "sides", beside(judged), [beside(own) for own in lessons], error)
+    if observable is not None:
+        filtered = priors("rms_change")["filtered"]
+        away = np.log(max(abs(observable.size), error) / filtered["size"]) / filtered["spread"]
+        yield replace(observable, advantage=-float(min(away, 0.0) ** 2))
 
 
 def _name_of(quantity: str, change: float) -> str:

@@ -20,6 +20,7 @@ from sealscope.diagnosis.inference.blocks import (
     total,
     zero_of,
 )
+from sealscope.diagnosis.inference.leak_law import law_shapes
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import StepTest, step_tests
 from sealscope.diagnosis.inference.terms import AIR, BIAS, LEAK, MADE_UP, ORIFICE, PUMP, Equation, Term
@@ -66,22 +67,24 @@ def volume_observables(
     for index, term in enumerate(balances[0].terms):
         if not _is_tested(term, index, first, bool(lost)):
             continue
-        replaced = first.leak if term.name == ORIFICE else None
-        coarse = about if term.name in (LEAK, ORIFICE, PUMP) else recorded
+        coarse = about if term.name in (LEAK, PUMP) else recorded
         signs = (1.0,) if term.cause in _ONE_WAY and term.name != BIAS else (1.0, -1.0)
-        tests.append((_name_of(term), signs, information(coarse, columns, index, replaced)))
+        tests.append((_name_of(term), signs, information(coarse, columns, index), None))
+    leak = information(about, columns, first.leak)
+    shapes = law_shapes(about, columns).items()
+    tests += [(f"{LEAK} of exponent {exponent:g}", (1.0,), leak, shape) for exponent, shape in shapes if exponent < 1.0]
     scaled = information(_with_scale(recorded, columns, orifice), columns, orifice)
-    tests.append((SCALE, (1.0, -1.0), scaled))
-    cost = _cost_of_zero(blocks, columns)
+    tests.append((SCALE, (1.0, -1.0), scaled, None))
+    cost = cost_of_zero(zero_of(blocks, columns))
     observables = []
-    for name, signs, values in tests:
-        steps = step_tests(values, signs)
+    for name, signs, values, shape in tests:
+        steps = step_tests(values, signs, shape)
         if not steps:
             continue
         best = max(range(len(steps)), key=lambda k: steps[k].score)
         step = steps[best]
         advantage = 0.0
-        if name in (LEAK, ORIFICE, PUMP):
+        if name.startswith(LEAK) or name == PUMP:
             advantage = -cost
         elif name == SCALE:
             advantage = -_rarity_of_size("scale", step.fitted[0])
@@ -102,8 +105,8 @@ def _is_tested(term: Term, index: int, columns: Columns, has_lost: bool) -> bool
     """Return whether a term's coefficient is tested by itself."""
     if term.drift == "motion" and index in columns.motion and term.name.startswith("motion"):
         return False  # area and displacement change together, as a scale
-    if term.compared:
-        return False  # it is zero within a recording
+    if term.compared or term.name == ORIFICE:
+        return False  # zero within a recording; by its shape
     if AIR in columns.names and term.cause == "air in the oil" and term.nuisance:
         return False  # free air changes them together
     return not (has_lost and term.name == BIAS)  # an accumulator's pressure drives what leaves its circuit
@@ -113,14 +116,6 @@ def _name_of(term: Term) -> str:
     if term.name != BIAS:
         return term.name
     return OUTSIDE if term.cause == "external leak" else "zero of the flow"
-
-
-def _cost_of_zero(blocks: Blocks, columns: Sequence[Columns]) -> float:
-    """Compute what the zero of p_A - p_B costs a leak; its law lies between two, and needs the lesser zero."""
-    root = 2.0 * float(np.mean(blocks.driving(root=True)))  # dp over d sqrt(p)
-    orifice = columns[0].names.index(ORIFICE)
-    of_root = root * zero_of(blocks, columns, orifice) + float(np.mean(blocks.zero))
-    return min(map(cost_of_zero, (zero_of(blocks, columns), of_root)))
 
 
 def _rarity_of_size(table: str, step: float, above: bool = False) -> float:

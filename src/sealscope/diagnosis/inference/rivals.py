@@ -1,0 +1,61 @@
+"""What else than a leak past piston or pump may have changed since the healthy recordings: rivals of its rise.
+
+Each term whose coefficient a fault changes is fitted to what a recording's rows leave of the healthy coefficients, all
+others tied to theirs within what recordings of a machine differ by (`priors.toml`), the leak's as well. The scatter of
+the same number between the healthy recordings is its null (`differences`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sealscope.diagnosis.inference.blocks import Columns, solve
+from sealscope.diagnosis.inference.differences import difference
+from sealscope.diagnosis.inference.observable import Observable
+from sealscope.diagnosis.inference.scatter import RecordingSums
+from sealscope.diagnosis.inference.terms import AIR, LEAK
+from sealscope.diagnosis.priors import priors
+from sealscope.recordings.recording import Array
+
+#: Name of the data that they describe: the leakage against healthy recordings.
+RISE = "rise"
+
+
+def rival_rises(
+    judged: RecordingSums, healthy: Sequence[RecordingSums], columns: Sequence[Columns]
+) -> tuple[Observable, ...]:
+    """Compare each rival's coefficient in a recording with the healthy recordings'."""
+    names = columns[0].names
+    tested = [k for k, name in enumerate(names) if name == AIR or name.startswith("external leak")]
+    everything = np.sum([recording.sums for recording in healthy], axis=0)
+    observables = []
+    for k in tested:
+        values = [
+            _shift(own.sums, everything - own.sums if own is not judged else everything, columns, k)
+            for own in (judged, *healthy)
+        ]
+        observable = difference(names[k], RISE, values[0], values[1:], above=names[k] != AIR)
+        observables += [] if observable is None else [observable]
+    return tuple(observables)
+
+
+def _shift(sums: Array, reference: Array, columns: Sequence[Columns], test: int) -> float:
+    """Compute by how much a column's coefficient in one recording's sums (E, m, m) is beyond that of others."""
+    precision, vector = 0.0, 0.0
+    leak_width: float = priors("inference")["between"]["pump"]
+    for e, column in enumerate(columns):
+        width = column.between.copy()
+        width[column.names.index(LEAK)] = leak_width
+        chosen = [k for k in column.compared if k != test and np.isfinite(width[k])]
+        coefficients = solve(reference[e][np.ix_(chosen, chosen)], reference[e][chosen, column.left])
+        residual = sums[e][:, column.left] - sums[e][:, chosen] @ coefficients
+        with np.errstate(divide="ignore", over="ignore"):
+            prior = 1.0 / (np.abs(coefficients) * width[chosen]) ** 2
+        matrix, along = sums[e][np.ix_(chosen, chosen)], sums[e][chosen, test]
+        tied = matrix + np.diag(np.minimum(prior, 1e9 * np.diag(matrix)))
+        solved = solve(tied, np.column_stack([along, residual[chosen]]))
+        precision += float(sums[e][test, test] - along @ solved[:, 0])
+        vector += float(residual[test] - along @ solved[:, 1])
+    return vector / precision if precision > 0.0 else 0.0
