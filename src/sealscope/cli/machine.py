@@ -26,6 +26,9 @@ def commission(
             "--add", help="Add recordings that are confirmed healthy to the machine's file; the old one is kept (.bak)."
         ),
     ] = False,
+    keep: Annotated[
+        bool, typer.Option("--keep", help="Keep recordings that the others call leaking; else they are left out.")
+    ] = False,
     since: Annotated[
         str | None,
         typer.Option("--since", metavar="DATE", help="With --add: forget recordings before DATE, as after a repair."),
@@ -45,6 +48,8 @@ def commission(
         raise InputError("--since must stand with --add, for a machine that is known")
     check_folder(output)
     if add:
+        if keep:
+            raise InputError("--keep must not stand beside --add: what is added is confirmed healthy")
         if stated != StatedMachine():
             raise InputError("what states the machine must not stand beside --add: the machine's file states it")
         repair = None if since is None else _date(since)
@@ -64,7 +69,7 @@ def commission(
             raise InputError(f"a machine's file must be new, got {output}, which exists; --add adds recordings to it")
         machine = commissioned(
             files, rig=stated.rig, map=stated.channel_map or None, rate=stated.rate, limit=stated.limit,
-            name=output.stem,
+            name=output.stem, keep=keep,
         )  # fmt: skip
         write_machine(machine, output)
     say(f"{output}:\n{machine}")

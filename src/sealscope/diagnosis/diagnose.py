@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.inspection import comparable, inspected
-from sealscope.diagnosis.inference.changes.signals import SIGNALS, observe_signals
-from sealscope.diagnosis.inference.observable import Observed
 from sealscope.diagnosis.decision.case import Context
 from sealscope.diagnosis.decision.combination import ORDER, combine, is_decided, rank
 from sealscope.diagnosis.decision.decide import decide
 from sealscope.diagnosis.decision.null import HealthyNull
+from sealscope.diagnosis.inference.changes.signals import SIGNALS, observe_signals
+from sealscope.diagnosis.inference.observable import Observed
+from sealscope.diagnosis.inspection import comparable, inspected
 from sealscope.diagnosis.learnt import Healthy, Learnt
 from sealscope.diagnosis.observation import null_of, run_detector
 from sealscope.diagnosis.priors import priors

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 import numpy as np
 
 from sealscope.calls import checked_call
+from sealscope.diagnosis.commissioned.cross_check import find_outliers, with_remarks, without_leaks
 from sealscope.diagnosis.detector import failure, unusable
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY, diagnose
 from sealscope.diagnosis.inspection import inspected
@@ -21,6 +22,7 @@ from sealscope.diagnosis.learnt import Learnt, Lesson
 from sealscope.diagnosis.observation import RARITIES, rarities_of
 from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
+from sealscope.diagnosis.verdict.evidence import LEAK
 from sealscope.diagnosis.verdict.machine import assumed_rig
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError, SealscopeError, UnreadableFile
@@ -40,6 +42,9 @@ NO_RECORDINGS = frozenset(
 #: How a trend, or a verdict, that was written beside the recordings begins.
 _WRITTEN = re.compile(rb'\s*\{\s*"(verdict|file)":|file,time[, ]')
 
+
+#: Samples that are kept in memory between learning and judging; recordings beyond are read again.
+_KEPT_SAMPLES = 20_000_000
 
 #: What a person may say of an alarm's leak.
 Judgement = Literal["valid", "invalid", "repaired"]
@@ -163,7 +168,7 @@ class CommissionedMachine:
         be trusted.
         """
         added = self._with(recording, file, checksum)
-        if self.healthy and (result := self.diagnose(recording)).verdict == "leak":
+        if self.healthy and (result := self.diagnose(recording)).verdict == LEAK:
             raise InputError(f"a healthy recording must not leak, got one that does: {result.reason} ({file})")
         start_s = start_seconds(recording, file)
         if start_s is not None and (leak := self._leak_in(start_s, start_s + recording.duration)) is not None:
@@ -289,6 +294,7 @@ def commission(
     rate: float | None = None,
     limit: str | None = None,
     name: str = "machine",
+    keep: bool = False,
 ) -> CommissionedMachine:
     """Commission a machine on its healthy recordings: learn once what every later diagnosis compares with.
 
@@ -306,6 +312,8 @@ def commission(
         Leak from which the machine is to be repaired, such as ``"5 mL/min"``.
     name : str, optional
         Name of the machine.
+    keep : bool, optional
+        Whether recordings that the others call leaking are kept; by default they are left out.
 
     Returns
     -------
@@ -333,14 +341,28 @@ def commission(
     known = None if rig is None else load_rig(rig)
     channel_map = map if map is not None else {} if known is None else known.channel_map
     machine, problems = CommissionedMachine(name, (), known, channel_map, rate, limit), list[str]()
+    places, recordings, samples = dict[str, Path](), dict[str, Recording](), 0
     for path in recordings_in(paths):
         try:
-            machine = machine._with(machine.read(path), path.name, checksum_of(path))
+            recording = machine.read(path)
+            machine = machine._with(recording, path.name, checksum_of(path))
         except SealscopeError as error:
             problems.append(str(error))
+            continue
+        places[path.name], samples = path, samples + len(recording) * len(recording.channels)
+        if samples < _KEPT_SAMPLES:
+            recordings[path.name] = recording
     if not machine.healthy:
         raise InputError(f"a machine must have a healthy recording that can be used, got none: {problems[0]}")
-    return replace(machine, left_out=tuple(problems))
+    machine = replace(machine, left_out=tuple(problems))
+
+    def judge(learnt: Learnt, others: tuple[Learnt, ...]) -> Diagnosis:
+        recording = recordings.get(learnt.file) or machine.read(places[learnt.file])
+        return replace(machine, healthy=others).diagnose(recording)
+
+    outliers = find_outliers(machine.healthy, judge)
+    healthy, leaking = (machine.healthy, ()) if keep else without_leaks(machine.healthy, outliers)
+    return replace(machine, healthy=with_remarks(healthy, outliers), left_out=(*machine.left_out, *leaking))
 
 
 def checksum_of(path: str | os.PathLike[str]) -> str:

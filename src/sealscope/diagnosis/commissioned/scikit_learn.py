@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sealscope.diagnosis.commissioned.machine import CommissionedMachine, commission
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
+from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, LEAK, NO_LEAK
 from sealscope.errors import MissingExtra
 from sealscope.recordings.recording import Array
 
@@ -74,7 +75,7 @@ class LeakDetector(OutlierMixin, BaseEstimator):  # type: ignore[misc]
 
     def predict(self, X: Paths) -> NDArray[np.int64]:
         """Return -1 for each file with a leak, 1 for one without, 0 where it cannot be told."""
-        labels = {"leak": -1, "no leak": 1, "cannot tell": 0}
+        labels = {LEAK: -1, NO_LEAK: 1, CANNOT_TELL: 0}
         return np.array([labels[own.verdict] for own in self._diagnoses(X)], dtype=np.int64)
 
     def _diagnoses(self, X: Paths) -> list[Diagnosis]:

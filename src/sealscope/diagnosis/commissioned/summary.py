@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.commissioned.cross_check import BY_OTHERS
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY
 from sealscope.diagnosis.inference.blocks import Columns, solve
 from sealscope.diagnosis.inference.detector import VolumeBalance
@@ -95,6 +96,9 @@ class Summary:
         else:
             needs = "speed or angle of the pump, flow or command, and two recordings"
             rows.append(("smallest leak", f"not known, that needs {needs}; the ringing alone judges"))
+        alarms = sum(BY_OTHERS in problem for problem in self.problems)
+        promised = f"1 in {len(healthy) + 1} by the ranks of {len(healthy)} healthy recordings alone, whatever their law"
+        rows.append(("false alarms", f"{promised}; {alarms or 'none'} of them stand out of the others"))
         rows += [("check", problem) for problem in self.problems]
         return "\n".join(paragraphs(rows, 16))
 
@@ -162,12 +166,6 @@ def summarised(healthy: Sequence[Learnt], rig: Rig | None, left_out: Sequence[st
     terms = _terms([np.asarray(lesson["sums"], dtype=float)[0] for lesson in lessons], rig, channels)
     if len(alike) == 1:
         return Summary(terms, noise, None, problems)
-    rises = balance.rises(lessons, channels)
-    problems += [
-        f"{own.file} is not like the others: its leakage differs from theirs by {abs(rise.score):.2g} deviations"
-        for own, rise in zip(alike, rises, strict=True)
-        if len(rises) > 2 and 2.0 * min(rise.chance, 1.0 - rise.chance) < FALSE_ALARM_PROBABILITY
-    ]
     return Summary(terms, noise, _smallest(balance, lessons, channels), problems)
 
 

@@ -17,10 +17,11 @@ from sealscope.diagnosis.decision.case import WITHIN, Case, Context, Question, s
 from sealscope.diagnosis.decision.explanations import probability_of
 from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.decision.reasons import reason_of
+from sealscope.diagnosis.decision.verdicts import bound_worth_stating, decide_verdict
 from sealscope.diagnosis.inference.observable import Flow, LeakMeasure, Observed
 from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.priors import priors
-from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, LEAK, NO_LEAK, RAREST, Cause, Evidence, Verdict
+from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, LEAK, NO_LEAK, RAREST, Cause, Evidence
 
 _PRIORS = priors("decision")
 
@@ -53,7 +54,7 @@ def decide(judge: Observed, reports: Sequence[Observed], null: HealthyNull, cont
         return _leak_evidence(case, shown)
     alarm, leak = next(iter(case.alarms), None), case.leak
     bound = _bound(case, alarm)
-    verdict: Verdict = NO_LEAK if _is_worth_stating(case, bound) else CANNOT_TELL
+    verdict = decide_verdict(False, *_bound_and_worth(case, bound))
     other = case.other_event
     questions = case.questions
     evidence = Evidence(verdict, "", cause=None if other is None else other.cause)
@@ -128,15 +129,14 @@ def _bound(case: Case, alarm: Question | None) -> float:
     return bound
 
 
-def _is_worth_stating(case: Case, bound: float) -> bool:
-    """Return whether a bound is small enough to be worth a verdict."""
+def _bound_and_worth(case: Case, bound: float) -> tuple[float, float]:
+    """Return a bound and the largest one that is worth stating: of the leak's flow, else of the ringing's fall."""
     if case.leak is not None:
-        flow = case.leak.pump_flow[1]
-        return flow > 0.0 and bound <= _PRIORS["worth"]["share"] * flow
+        return bound, bound_worth_stating(case.leak.pump_flow[1])
     ringing, details = case.judge.ringing, priors("rms_change")
-    if ringing is None or case.alarms:
-        return False
-    return ringing.bound <= details["recordings"]["worth"] and ringing.rate >= details["rate"]["ringing"]
+    if ringing is None or case.alarms or ringing.rate < details["rate"]["ringing"]:
+        return np.inf, 0.0
+    return ringing.bound, details["recordings"]["worth"]
 
 
 def _findable(case: Case) -> float | None:

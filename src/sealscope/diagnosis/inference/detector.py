@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.diagnosis.inference.balance import blocks_of, shortest
+from sealscope.diagnosis.inference.balance_leak import BalanceLeak
 from sealscope.diagnosis.inference.blocks import Columns
 from sealscope.diagnosis.inference.circuit.store import lost_beside
 from sealscope.diagnosis.inference.circuit.without_position import circulations
-from sealscope.diagnosis.inference.balance_leak import BalanceLeak
 from sealscope.diagnosis.inference.differences import difference
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.inference.recorded import RecordedBalance
@@ -113,11 +113,6 @@ class VolumeBalance:
         scale = own.size.scale if own.size.stated else 0.0
         known = {name: value for name, value in own.recording_sums._asdict().items() if value is not None}
         return {"terms": list(own.columns[0].names), "scale": scale, **known}
-
-    def rises(self, lessons: Sequence[Lesson], channels: frozenset[str]) -> list[Rise]:
-        """Return how far each of several healthy recordings of the same channels is above the others."""
-        columns, healthy = self._columns(channels), [_sums_of(lesson) for lesson in lessons]
-        return [rise(own, healthy[:k] + healthy[k + 1 :], columns) for k, own in enumerate(healthy)]
 
     def next_rise(self, lessons: Sequence[Lesson], channels: frozenset[str], repeated: int = 1) -> Rise:
         """Return the rise of a healthy recording like these on a later day, as after `repeated` times as many days."""

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sealscope.calls import checked_call
+from sealscope.diagnosis.decision.texts import text_of
+from sealscope.diagnosis.decision.verdicts import bound_worth_stating, decide_verdict
 from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.live.balance import LEARNED, BlockConductance, LiveBalance, NotJudged, Shown
 from sealscope.diagnosis.live.estimates import BaselineLearning, BlockEstimate, WatchBaseline, WatchedLeak, within
@@ -19,7 +21,7 @@ from sealscope.diagnosis.live.joining import SampleJoiner, ways_to_watch
 from sealscope.diagnosis.live.pressures import PressureEstimator
 from sealscope.diagnosis.live.sequential import RECENT, StepDetector, StepEstimate
 from sealscope.diagnosis.priors import priors
-from sealscope.diagnosis.verdict.evidence import Evidence
+from sealscope.diagnosis.verdict.evidence import NO_LEAK, Evidence
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
 from sealscope.storage.plain_state import part_of, recall, restored, saved
@@ -139,18 +141,18 @@ class Watch:
         if leak is not None:
             figures: dict[str, Any] = {name: getattr(leak, name) for name in _FIGURES}
             cause: Any = None if leak.cause == PressureEstimator.cause else leak.cause
-            return Evidence("leak", leak.reason, cause=cause, **figures)
+            return Evidence(decide_verdict(True, math.inf, 0.0), leak.reason, cause=cause, **figures)
         bound = self._detector.bound() if own is not None and len(self._last) else math.inf
         if own is None or not math.isfinite(bound):
             why = f": {', '.join(self.counters)}" if self.counters else ""
-            return Evidence("cannot tell", f"waits for the first blocks{why}")
+            return Evidence(decide_verdict(False, math.inf, 0.0), f"waits for the first blocks{why}")
         last = self._last[-1]
         bound, pump = own.orifice * bound * float(last["flow"]), math.exp(last["motion"]) / LITRE_PER_MINUTE
         limit = f"{bound:.2g} L/min" if own.litres else f"{100.0 * bound / pump:.2g} % of the pump's flow"
-        enough = bound <= priors("inference")["worth"]["share"] * pump
+        verdict = decide_verdict(False, bound, bound_worth_stating(pump))
         return Evidence(
-            "no leak" if enough else "cannot tell",
-            f"no leak above {limit} (95 %)" if enough else f"a leak of up to {limit} would not show (95 %)",
+            verdict,
+            text_of("bound", "none" if verdict == NO_LEAK else "hidden", limit=limit),
             score=max(2.0 * self._detector.log_e(), 0.0),
             threshold=-2.0 * math.log(self._probability("step", self.block_seconds)),
             bound_lpm=bound if own.litres else None,

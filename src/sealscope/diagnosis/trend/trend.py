@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sealscope.calls import checked_call
+from sealscope.diagnosis.decision.verdicts import decide_verdict
 from sealscope.diagnosis.inference.onset import WITHIN_95, Interval
 from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.trend.reading import (
@@ -24,7 +25,7 @@ from sealscope.diagnosis.trend.reading import (
     timeline,
 )
 from sealscope.diagnosis.trend.wear import Episode, Levels, Wear, beyond, episodes
-from sealscope.diagnosis.verdict.evidence import Verdict
+from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, LEAK, NO_LEAK, Verdict
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.diagnosis.verdict.states import state_of
@@ -37,6 +38,10 @@ from sealscope.units import DAY, LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
+
+
+#: Fewest comparable recordings of which a trend is stated.
+FEWEST = 3
 
 
 @dataclass(frozen=True)
@@ -130,12 +135,12 @@ class Trend:
     @property
     def next_check(self) -> str:
         """What to check next on the machine."""
-        if self.verdict == "no leak":
+        if self.verdict == NO_LEAK:
             return "Nothing needs a check; go on recording under the same duty."
-        if self.verdict == "leak":
-            return state_of("leak", "piston or pump leak").action
+        if self.verdict == LEAK:
+            return state_of(LEAK, "piston or pump leak").action
         if self.wear is None:
-            return state_of("cannot tell").action
+            return state_of(CANNOT_TELL).action
         return "Go on recording under the same duty, and compare the level with what a new machine passes."
 
     def as_dict(self) -> dict[str, Any]:
@@ -260,7 +265,7 @@ def _judged(points: Sequence[TrendPoint], apart: tuple[str, ...], **stated: Any)
     kept = [points[k] for k in rows]
     flows = bool(kept) and all(own.states_flow for own in kept)
     trend = Trend(
-        verdict="cannot tell",
+        verdict=decide_verdict(False, math.inf, 0.0),
         reason="",
         basis=kept[0].basis if kept else None,
         unit="L/min" if flows else "%",
@@ -339,37 +344,41 @@ def _levels(trend: Trend) -> tuple[Levels, float | None]:
 
 
 def _verdict(trend: Trend) -> tuple[Verdict, str]:
-    """Return the verdict and why."""
+    """Decide on a trend by its alarm and by the step that would have shown, and say why."""
     rate, wear = f"1 false alarm in {trend.years:g} machine-years", trend.wear
     if wear is None:
-        reasons = dict.fromkeys(point.note for point in trend.points if point.note)
-        return "cannot tell", ": ".join(["no recording states a level", *list(reasons)[:1]])
-    last = trend.episodes[-1]
-    beyond_scatter = f"beyond the machine's own scatter ({rate})"
+        notes = dict.fromkeys(point.note for point in trend.points if point.note)
+        reason = ": ".join(["no recording states a level", *list(notes)[:1]])
+        return decide_verdict(False, math.inf, 0.0), reason
+    last, beyond_scatter = trend.episodes[-1], f"beyond the machine's own scatter ({rate})"
     if trend.basis == "ringing":
         ringing = "the damping of the pressures' ringing"
-        if last.alarm is None:
-            return "cannot tell", f"{ringing} did not change {beyond_scatter}; it states no flow"
-        return "cannot tell", (
-            f"{ringing} rose {beyond_scatter}: a leak, warmer oil, or another machine; without angle and position, or "
-            "command, they cannot be told apart"
-        )
+        reason = f"{ringing} did not change {beyond_scatter}; it states no flow"
+        if last.alarm is not None:
+            reason = (
+                f"{ringing} rose {beyond_scatter}: a leak, warmer oil, or another machine; without angle and position, "
+                "or command, they cannot be told apart"
+            )
+        return decide_verdict(False, math.inf, 0.0), reason
     if last.alarm is not None:
         shape = "grows" if wear.step is None else "stepped up"
-        return "leak", f"the leakage {shape} {beyond_scatter}; pump and piston are not told apart"
+        reason = f"the leakage {shape} {beyond_scatter}; pump and piston are not told apart"
+        return decide_verdict(True, math.inf, 0.0), reason
     count = last.end - last.begin
-    if count < 3:
-        return "cannot tell", f"{count} comparable recordings are too few, 3 are needed"
-    detectable = priors("trend")["course"]["detectable"] * max(
-        wear.scatter, (wear.healthy.high - wear.healthy.low) / (2.0 * WITHIN_95)
-    )
-    if trend.limit is not None and wear.healthy.value + detectable > trend.limit:
-        return "cannot tell", (
-            f"the level scatters so much from recording to recording that a rise to the limit would not surely show: "
-            f"{detectable:.2g} {trend.unit} would"
+    if count < FEWEST:
+        reason = f"{count} comparable recordings are too few, {FEWEST} are needed"
+        return decide_verdict(False, math.inf, 0.0), reason
+    half = (wear.healthy.high - wear.healthy.low) / (2.0 * WITHIN_95)
+    detectable = priors("trend")["course"]["detectable"] * max(wear.scatter, half)
+    allowed = math.inf if trend.limit is None else trend.limit - wear.healthy.value
+    verdict = decide_verdict(False, detectable, allowed)
+    if verdict == NO_LEAK:
+        since = " since the repair" if last.fell else ""
+        return verdict, (
+            f"no rise beyond the machine's own scatter{since} ({rate}); a step of {detectable:.2g} {trend.unit} would "
+            "have shown"
         )
-    since = " since the repair" if last.fell else ""
-    return "no leak", (
-        f"no rise beyond the machine's own scatter{since} ({rate}); a step of {detectable:.2g} {trend.unit} would "
-        "have shown"
+    return verdict, (
+        f"the level scatters so much from recording to recording that a rise to the limit would not surely show: "
+        f"{detectable:.2g} {trend.unit} would"
     )

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sealscope.diagnosis.verdict.evidence import LEAKS, RMS_CHANGE, Evidence
+from sealscope.diagnosis.verdict.evidence import LEAK, LEAKS, NO_LEAK, RMS_CHANGE, Evidence
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.severity import RepairLimit, Severity, beside_the_pump, severity
 from sealscope.diagnosis.verdict.states import MachineState, state_of
@@ -74,7 +74,7 @@ class Diagnosis(Evidence):
     Diagnosis('leak', file='recording', onset_s=29.95, leak_lpm=0.05199, score=169.3, threshold=15.47)
     >>> diagnosis.cause, f"{diagnosis.severity.creep_mm_per_min[0]:.0f} mm/min"
     ('piston or pump leak', '82 mm/min')
-    >>> [evidence.detector for evidence in diagnosis.parts if evidence.verdict == "cannot tell"]
+    >>> [evidence.detector for evidence in diagnosis.parts if evidence.abstains]
     ['rms change']
     >>> [round(end, 1) for end in diagnosis.as_dict()["onset_interval_s"]]
     [27.9, 31.4]
@@ -159,7 +159,7 @@ class Diagnosis(Evidence):
     @property
     def _condition(self) -> str:
         """The condition of `states.toml` that the verdict is."""
-        if self.verdict != "no leak" or self.known_healthy:
+        if self.verdict != NO_LEAK or self.known_healthy:
             return self.verdict
         return "no change of RMS" if self.detector == RMS_CHANGE else "no change"
 
@@ -173,14 +173,14 @@ class Diagnosis(Evidence):
         """State of the machine as NAMUR NE 107 names it, a failure where the leak is surely over the repair limit."""
         over = self.severity is not None and self.severity.level == "repair"
         condition = "leak over the limit" if over else self._condition
-        cause = self.cause if self.verdict == "leak" or self.cause not in LEAKS else None
+        cause = self.cause if self.verdict == LEAK or self.cause not in LEAKS else None
         return state_of(condition, cause, since_s=plain(self.onset_s), action=self.next_check)
 
     @property
     def known_healthy(self) -> bool:
         """Whether leak-free recordings or the rig show that the level is that of a healthy machine."""
         by_rig = self.total_leakage is not None and self.total_leakage.healthy
-        return self.verdict == "no leak" and (self.baselines > 0 or by_rig)
+        return self.verdict == NO_LEAK and (self.baselines > 0 or by_rig)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the diagnosis as plain JSON values, keys in the order of the output contract.
@@ -268,7 +268,7 @@ class Diagnosis(Evidence):
         except ImportError:
             raise MissingExtra("a drawing needs matplotlib: pip install 'sealscope[report]'") from None
         axes = Figure(layout="constrained").subplots() if ax is None else ax
-        axes.plot(course.t, course.lpm, label="pump and piston together" if course.whole else "leak")
+        axes.plot(course.t, course.lpm, label="pump and piston together" if course.whole else LEAK)
         axes.fill_between(course.t, course.low, course.high, alpha=0.3, label="95 % interval")
         if self.onset_s is not None:
             axes.axvline(self.onset_s, color="C3", label="onset")

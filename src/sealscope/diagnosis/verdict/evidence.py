@@ -163,14 +163,14 @@ class Evidence:
     @property
     def abstains(self) -> bool:
         """Whether the next detector judges: `cannot tell`, and no change was seen."""
-        return self.verdict == "cannot tell" and self.cause is None and not self.alarmed
+        return self.verdict == CANNOT_TELL and self.cause is None and not self.alarmed
 
     @property
     def summary(self) -> str:
         """The verdict in words; a change with another cause than a leak past piston or pump stands before it."""
-        if self.cause is None or self.cause in LEAKS or self.verdict == "leak":
+        if self.cause is None or self.cause in LEAKS or self.verdict == LEAK:
             return self.verdict
-        if self.verdict == "cannot tell":
+        if self.verdict == CANNOT_TELL:
             return f"cannot tell ({self.cause})"
         return f"{self.cause} ({'none' if self.cause.endswith('leak') else 'no leak'} across the piston)"
 

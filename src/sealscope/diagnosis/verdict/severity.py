@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from sealscope.diagnosis.priors import priors
-from sealscope.diagnosis.verdict.evidence import Evidence, RelativeLeak
+from sealscope.diagnosis.verdict.evidence import LEAK, Evidence, RelativeLeak
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
@@ -101,7 +101,7 @@ class Severity:
 
 def severity(evidence: Evidence, limit: RepairLimit) -> Severity | None:
     """Return how bad the leak is that the evidence states; None where it states none, or nothing of its size."""
-    if evidence.verdict != "leak" or (evidence.leak_lpm is None and evidence.relative is None):
+    if evidence.verdict != LEAK or (evidence.leak_lpm is None and evidence.relative is None):
         return None
     relative = evidence.relative or RelativeLeak()
     flow = _figure(evidence.leak_lpm, evidence.leak_interval_lpm, LITRE_PER_MINUTE)

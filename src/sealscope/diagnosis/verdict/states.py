@@ -14,8 +14,10 @@ from functools import cache, lru_cache
 from importlib.resources import files
 from typing import Any
 
+from sealscope.diagnosis.verdict.evidence import LEAK
+
 #: Conditions of a machine that leaks past piston or pump: the cause does not change their state.
-LEAKING = ("leak", "leak over the limit")
+LEAKING = (LEAK, "leak over the limit")
 
 
 @dataclass(frozen=True, kw_only=True)
