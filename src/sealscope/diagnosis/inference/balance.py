@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -11,14 +11,21 @@ from sealscope.control.drive import Drive
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, Weighting, solve
 from sealscope.diagnosis.inference.distribution import distribution
 from sealscope.diagnosis.inference.onset import FEWEST
+from sealscope.diagnosis.inference.regimes import apply_regime, has_rests, shut_odds
 from sealscope.diagnosis.inference.row_weights import RIDGE, SUPPORT
 from sealscope.diagnosis.inference.terms import (
+    AVERAGED,
+    CYLINDER,
     HALF_DIFFERENCE,
     LEAST_ABSOLUTE,
+    LEAST_REST,
+    REST_LEAK,
     START,
     Equation,
     Signals,
     equations,
+    shut_at_rest,
+    with_rests,
 )
 from sealscope.diagnosis.inference.weak_form import OVERLAP, SPAN, STRIDE, rows, stride_samples, weights_beside_holes
 from sealscope.diagnosis.inference.zero import about_zero
@@ -78,6 +85,10 @@ class BlockStream:
         self._stride = stride_samples(rate)
         self._strides = max(SPAN, round(seconds / STRIDE))
         self._margin = max(1, round(HALF_DIFFERENCE * rate)) + 2
+        self._finds_rests = any(REST_LEAK in columns.names for columns in self.columns)
+        if self._finds_rests:
+            self._margin += round(AVERAGED * rate) + round(LEAST_REST * rate)
+        self._still = (-1.0, -1.0)
         self._weighting, self._support = Weighting(self.columns), support
         self._zeros: dict[str, float] | None = None
         self._signs: tuple[float, ...] = ()
@@ -173,6 +184,9 @@ class BlockStream:
         if self._zeros is None:
             early = slice(0, (self._support or end) * length)
             self._zeros = {name: _gauge_to_absolute(samples[name][early]) for name in ("p_A", "p_B") if name in samples}
+        if self._finds_rests and self._still[0] < 0.0:
+            whole = Signals(samples, self._rate, self._zeros)
+            self._still = tuple(_still_rate(of, self._rate) for of in (self._balances[0].left(whole), whole.step("x")))
         each = max(1, AT_ONCE // length)
         cuts = [self._cut(samples, k, min(k + each, end)) for k in range(first, end, each)]
         weights = np.concatenate([cut.weights for cut in cuts])
@@ -197,7 +211,7 @@ class BlockStream:
         stop = end * length + (SPAN - 1) * self._stride + 1
         reach = stop + self._margin - self._first
         cut = {name: values[begin - self._first : reach] for name, values in samples.items()}
-        signals = Signals(cut, self._rate, self._zeros or {}, self._zero)
+        signals = Signals(cut, self._rate, self._zeros or {}, self._zero, self._still)
         inner = slice(start - begin, stop - 1 - begin)
         whole = np.ones((end - first) * self._strides, dtype=bool)
         cut_rows, lefts = [], [balance.left(signals) for balance in self._balances]
@@ -229,9 +243,9 @@ class _Cut(NamedTuple):
 
 
 def _in_deviations(products: Array) -> float:
-    """Return the sum of products of two numbers a row over its deviation, were they independent."""
-    size = float(np.linalg.norm(products) * np.sqrt(OVERLAP))
-    return float(products.sum()) / max(size, float(np.finfo(float).tiny))
+    """Return the sum of products of two numbers a row over its deviation; sums over `LONGEST` are independent."""
+    sums = np.add.reduceat(products, np.arange(0, len(products), round(LONGEST / STRIDE)))
+    return float(sums.sum()) / max(float(np.linalg.norm(sums)), float(np.finfo(float).tiny))
 
 
 def _odds(z: float, what: str) -> float:
@@ -253,6 +267,15 @@ def _leaks(gram: Array, columns: Columns, count: int) -> float:
         return 0.0
     variance = OVERLAP * max(square - lead**2 / along, 0.0) / (count - len(others) - 1)
     return lead / max(float(np.sqrt(variance * along)), np.finfo(float).tiny)
+
+
+def _still_rate(increments: Array, rate: float) -> float:
+    """Compute the largest mean rate at rest of what moves by increments: a share of that in motion, or its noise."""
+    flow = increments[np.isfinite(increments)] * rate
+    size = np.abs(flow)
+    moving = float(size @ size) / max(float(size.sum()), np.finfo(float).tiny)
+    noise = float(np.median(np.abs(np.diff(flow, 6)))) / 0.6745 / np.sqrt(924.0) if len(flow) > 6 else 0.0
+    return max(float(priors("inference")["rest"]["share"]) * moving, 3.0 * noise / np.sqrt(max(1.0, AVERAGED * rate)))
 
 
 def _gauge_to_absolute(pressure: Array) -> float:
@@ -314,34 +337,104 @@ def shortest(rate: float) -> int:
     return FEWEST * max(SPAN, round(SHORTEST / STRIDE)) * stride + (SPAN - 1) * stride + 1
 
 
-def blocks_of(recording: Recording, rig: Rig) -> tuple[Blocks, Blocks, tuple[Columns, ...]] | None:
-    """Return the blocks of a recording and where their columns stand; None where its channels allow no balance.
+class RegimeBlocks(NamedTuple):
+    """Blocks of a recording by one hypothesis of what rests do (`regimes`), with its equations and columns.
 
-    They come twice: about the zero of p_A - p_B that a change of the leak needs, and as recorded.
+    `blocks` are about the zero of p_A - p_B that a change of the leak needs, `plain` as recorded; `shut`: the pump is
+    cut off at rest.
     """
-    names = [name for name in recording.channels if name in _READ]
-    balances = equations(rig, frozenset(names))
+
+    blocks: Blocks
+    plain: Blocks
+    equations: tuple[Equation, ...]
+    columns: tuple[Columns, ...]
+    shut: bool = False
+
+
+class RecordedBlocks(NamedTuple):
+    """Blocks of a recording by either hypothesis, `shut` None where the pump never rests.
+
+    `odds`: logarithm of those of the pump being cut off at rest.
+    """
+
+    open: RegimeBlocks
+    shut: RegimeBlocks | None
+    odds: float
+
+    def regime(self, odds: float) -> RegimeBlocks:
+        """Return the blocks by the hypothesis that has the `odds` of all that is known of the machine."""
+        return self.shut if self.shut is not None and odds > 0.0 else self.open
+
+
+def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
+    """Return the blocks of a recording by either hypothesis of what rests do; None where it allows no balance."""
+    names = frozenset(name for name in recording.channels if name in _READ)
+    balances = equations(rig, names)
     if not balances:
         return None
+    pumped = balances[0].name == CYLINDER and not balances[0].by_command
+    streamed = tuple(with_rests(balance) for balance in balances) if pumped else balances
     needed = {"x", "p_A", "p_B", str(flow_source(names))}
     needed |= {name for balance in balances for term in balance.terms for name in term.needs}
     samples = bridged_samples(recording, needed)
     if balances[0].by_command:
         samples = commanded(samples, rig, recording.rate)
     seconds = min(LONGEST, max(SHORTEST, recording.duration / _BLOCKS["wanted"]))
-    zero = 0.0
-    blocks, plain = None, None
-    for _ in range(TURNS):
-        stream = BlockStream(balances, recording.rate, seconds, None, float(recording.t[0]), zero)
+
+    def close(zero: float) -> tuple[Blocks, tuple[Columns, ...]] | None:
+        stream = BlockStream(streamed, recording.rate, seconds, None, float(recording.t[0]), zero)
         blocks = stream.push(samples, last=True)
-        if blocks is None:
-            return None
-        plain = blocks if plain is None else plain
-        blocks = about_zero(blocks, stream.columns)
-        zero, before = float(blocks.zero[0]), zero
-        if abs(zero - before) < NEAR * priors("inference")["zero"]["pressure"]:
+        return None if blocks is None else (blocks, stream.columns)
+
+    recorded = close(0.0)
+    if recorded is None:
+        return None
+    if not pumped:
+        return RecordedBlocks(_in_regime(recorded, balances, close, shut=None), None, 0.0)
+    odds = shut_odds(recorded[0], recorded[1][0])
+    return RecordedBlocks(
+        _in_regime(recorded, balances, close, shut=False),
+        _in_regime(recorded, balances, close, shut=True) if has_rests(recorded[0], recorded[1][0]) else None,
+        odds,
+    )
+
+
+def _in_regime(
+    recorded: tuple[Blocks, tuple[Columns, ...]],
+    balances: tuple[Equation, ...],
+    close: Callable[[float], tuple[Blocks, tuple[Columns, ...]] | None],
+    shut: bool | None,
+) -> RegimeBlocks:
+    """Return recorded blocks by a hypothesis, about their zero; None: the only one."""
+    balances = tuple(shut_at_rest(balance) for balance in balances) if shut else balances
+    columns = tuple(Columns(balance) for balance in balances)
+
+    def turned(blocks: Blocks, streamed: tuple[Columns, ...]) -> Blocks:
+        return blocks if shut is None else apply_regime(blocks, streamed[0], shut)
+
+    plain = turned(*recorded)
+    blocks = about_zero(plain, columns)
+    for _ in range(TURNS - 1):
+        zero = float(blocks.zero[0])
+        if abs(zero) < NEAR * priors("inference")["zero"]["pressure"]:
             break
-    return None if blocks is None or plain is None else (blocks.merged(), plain.merged(), stream.columns)
+        again = close(zero)
+        if again is None:
+            break
+        blocks = about_zero(turned(*again), columns)
+    return RegimeBlocks(blocks.merged(), plain.merged(), balances, columns, bool(shut))
+
+
+def blocks_of(recording: Recording, rig: Rig) -> tuple[Blocks, Blocks, tuple[Columns, ...]] | None:
+    """Return the blocks of a recording and where their columns stand; None where its channels allow no balance.
+
+    They come twice: about the zero of p_A - p_B that a change of the leak needs, and as recorded.
+    """
+    recorded = recorded_blocks(recording, rig)
+    if recorded is None:
+        return None
+    own = recorded.regime(recorded.odds)
+    return own.blocks, own.plain, own.columns
 
 
 _READ = ("u", "omega", "theta", "q_pump", "x", "p_1", "p_2", "p_A", "p_B")

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from sealscope.diagnosis.inference.onset import Information
 from sealscope.diagnosis.inference.row_weights import MOST_TURNS, RIDGE, SUPPORT, TOLERANCE, weighted
-from sealscope.diagnosis.inference.terms import BIAS, LEAK, Equation
+from sealscope.diagnosis.inference.terms import BIAS, LEAK, REST_LEAK, RESTS, Equation
 from sealscope.diagnosis.inference.weak_form import OVERLAP
 from sealscope.diagnosis.priors import priors
 from sealscope.errors import InputError
@@ -133,6 +133,8 @@ class Columns:
         self.motion = tuple(k for k in self.nuisance if equation.terms[k].drift in ("motion", "edge"))
         self.support = tuple(k for k in self.nuisance if equation.terms[k].drift not in UNSTEADY)
         self.fast = tuple(k for k in self.nuisance if k not in self.support)
+        self.rest = tuple(self.names.index(name) for name in RESTS) if REST_LEAK in self.names else None
+        self.support = (*self.support, *(self.rest or ()))
         self.bias = self.names.index(BIAS) if BIAS in self.names else None
         self.driven = tuple(term.driven for term in equation.terms)
         self.healthy = priors("inference")["healthy"][equation.healthy] if equation.healthy else float("inf")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sealscope.diagnosis.inference.balance import blocks_of, shortest
+from sealscope.diagnosis.inference.balance import RecordedBlocks, RegimeBlocks, recorded_blocks, shortest
 from sealscope.diagnosis.inference.balance_leak import BalanceLeak
 from sealscope.diagnosis.inference.blocks import Columns
 from sealscope.diagnosis.inference.circuit.store import lost_beside
@@ -15,9 +15,18 @@ from sealscope.diagnosis.inference.circuit.without_position import circulations
 from sealscope.diagnosis.inference.differences import difference
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.inference.recorded import RecordedBalance
+from sealscope.diagnosis.inference.regimes import shut_without_rests
 from sealscope.diagnosis.inference.rivals import rival_rises
 from sealscope.diagnosis.inference.scatter import RecordingSums, Rise, motion_change, rise
-from sealscope.diagnosis.inference.terms import CYLINDER, LOCKED, circulation, equations, locked
+from sealscope.diagnosis.inference.terms import (
+    CYLINDER,
+    LOCKED,
+    TURNING,
+    circulation,
+    equations,
+    locked,
+    shut_at_rest,
+)
 from sealscope.diagnosis.inference.weak_form import STRIDE, stride_samples
 from sealscope.diagnosis.learnt import Healthy, Lesson, lessons_of
 from sealscope.diagnosis.priors import priors
@@ -81,10 +90,11 @@ class VolumeBalance:
                 return f"{name} is constant or missing"
         return None
 
-    def balance(self, recording: Recording) -> RecordedBalance | None:
+    def balance(self, recording: Recording, odds: float = 0.0) -> RecordedBalance | None:
         """Return the recording's balance, that of the smallest bound where it has several; None where it has none.
 
         Where the position is not recorded a balance says nothing unless the pump makes good what a pump loses.
+        `odds`: logarithm of those by other recordings that the pump is cut off at rest.
         """
         balances = equations(self.rig, frozenset(recording.channels))
         if not balances:
@@ -95,45 +105,57 @@ class VolumeBalance:
             ]
             answering = [own for own in recorded if own.equations[0].name == LOCKED or made_good(own)]
             return min(answering, key=lambda own: BalanceLeak(self.name, own).bound_flow, default=None)
-        blocks = remembered(recording, (self.name, self.rig), lambda own: blocks_of(own, self.rig), _READ)
-        if blocks is None:
-            return None
-        zero = float(blocks[0].zero[0])
+        recorded = self._recorded(recording)
+        return None if recorded is None else self._balance(recording, recorded.regime(recorded.odds + odds))
+
+    def _recorded(self, recording: Recording) -> RecordedBlocks | None:
+        return remembered(recording, (self.name, self.rig), lambda own: recorded_blocks(own, self.rig), _READ)
+
+    def _balance(self, recording: Recording, regime: RegimeBlocks) -> RecordedBalance:
+        zero = float(regime.blocks.zero[0])
         lost = remembered(recording, ("lost oil", self.rig), lambda own: lost_beside(own, self.rig, zero), _READ)
-        return RecordedBalance(blocks[0], balances, blocks[2], self.rig, recording, lost, blocks[1])
+        blocks, plain, balances, columns, shut = regime
+        return RecordedBalance(blocks, balances, columns, self.rig, recording, lost, plain, shut)
 
     def learn(self, recording: Recording) -> Lesson | None:
         """Return what a healthy recording teaches (`scatter.RecordingSums`), by the terms of its balance.
 
-        `scale` makes flows by the rig's displacement the machine's, 0 where its size is not stated.
+        `scale` makes flows by the rig's displacement the machine's, 0 where its size is not stated. Where the machine
+        rests, `shut_sums` are those of a pump that is cut off then, `shut_odds` the log odds that it is.
         """
-        own = self.balance(recording)
+        recorded = self._recorded(recording) if equations(self.rig, frozenset(recording.channels)) else None
+        own = self.balance(recording) if recorded is None else self._balance(recording, recorded.open)
         if own is None:
             return None
         scale = own.size.scale if own.size.stated else 0.0
         known = {name: value for name, value in own.recording_sums._asdict().items() if value is not None}
+        if recorded is not None and recorded.shut is not None:
+            shut = self._balance(recording, recorded.shut)
+            known |= {"shut_sums": shut.recording_sums.sums, "shut_odds": recorded.odds}
         return {"terms": list(own.columns[0].names), "scale": scale, **known}
 
     def next_rise(self, lessons: Sequence[Lesson], channels: frozenset[str], repeated: int = 1) -> Rise:
         """Return the rise of a healthy recording like these on a later day, as after `repeated` times as many days."""
-        healthy = [_sums_of(lesson) for lesson in lessons]
+        shut = _odds_of(lessons) > 0.0
+        healthy = [_sums_of(lesson, shut) for lesson in lessons]
         later = [own._replace(start_s=_later(own, k)) for k in range(repeated) for own in healthy]
         flow, pressure = (float(np.median([lesson[of] for lesson in lessons])) for of in ("flow", "pressure"))
         middle = RecordingSums(healthy[0].sums, flow, pressure, oil_degC=healthy[0].oil_degC)
         dated = next((own for own in healthy if own.start_s is not None), middle)
-        return rise(middle._replace(start_s=_later(dated, repeated)), later, self._columns(channels))
+        return rise(middle._replace(start_s=_later(dated, repeated)), later, self._columns(channels, shut))
 
-    def _columns(self, channels: frozenset[str]) -> list[Columns]:
-        return [Columns(equation) for equation in equations(self.rig, channels)]
+    def _columns(self, channels: frozenset[str], shut: bool) -> list[Columns]:
+        balances = equations(self.rig, channels)
+        return [Columns(shut_at_rest(equation) if shut else equation) for equation in balances]
 
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
         """Return the steps of the balance's terms, and the leak against healthy recordings."""
-        balance = self.balance(recording)
+        lessons = lessons_of(self, baseline)
+        balance = self.balance(recording, _odds_of(lessons))
         if balance is None:
             return Observed(self.name, lack=_NO_BALANCE["x" in recording].format(recording.duration))
-        names = list(balance.columns[0].names)
-        lessons = [lesson for lesson in lessons_of(self, baseline) if lesson["terms"] == names]
-        healthy = [_sums_of(lesson) for lesson in lessons]
+        names = [name for name in balance.columns[0].names if name != TURNING]
+        healthy = [_sums_of(lesson, balance.shut) for lesson in lessons if lesson["terms"] == names]
         leak, rows = BalanceLeak(self.name, balance, healthy), balance.blocks.rows
         if leak.step is None and leak.rise is None:
             why = "p_A and p_B hardly differ, or too few samples are whole: no leak would show"
@@ -142,7 +164,8 @@ class VolumeBalance:
         share = float(rows.mean() / max(rows.max(), 1.0)) if is_whole else 1.0
         observables = balance.observables
         if healthy and len(balance.columns) == 1 and is_whole:
-            observables += (*_motion_observable(balance, healthy), *rival_rises(balance.recording_sums, healthy, balance.columns))
+            observables += tuple(_motion_observable(balance, healthy))
+            observables += rival_rises(balance.recording_sums, healthy, balance.columns)
         return Observed(self.name, observables, leak, share=share)
 
 
@@ -163,6 +186,13 @@ def _later(recorded: RecordingSums, times: int) -> float | None:
     return None if recorded.start_s is None else recorded.start_s + times * _AGES
 
 
-def _sums_of(lesson: Lesson) -> RecordingSums:
+def _odds_of(lessons: Sequence[Lesson]) -> float:
+    """Add up the log odds of healthy recordings that the pump is cut off at rest."""
+    return float(sum(lesson.get("shut_odds", 0.0) for lesson in lessons))
+
+
+def _sums_of(lesson: Lesson, shut: bool = False) -> RecordingSums:
     sums = np.asarray(lesson["sums"], dtype=float)
+    if shut:
+        sums = np.asarray(lesson["shut_sums"]) if "shut_sums" in lesson else shut_without_rests(sums, lesson["terms"])
     return RecordingSums(sums, lesson["flow"], lesson["pressure"], lesson.get("start_s"), lesson.get("oil_degC"))

@@ -48,7 +48,8 @@ class RecordedBalance:
     """A recording's blocks with all that is asked of them.
 
     `lost`: tests of a step of what leaves the circuit by the accumulator's own balance, by the term's name; `plain`:
-    the blocks with the zero of p_A - p_B as recorded, where they are others.
+    the blocks with the zero of p_A - p_B as recorded, where they are others; `shut`: a valve cuts the pump off at rest,
+    so that the leak's coefficient is the piston's alone (`regimes`).
     """
 
     blocks: Blocks
@@ -58,6 +59,7 @@ class RecordedBalance:
     recording: Recording
     lost: Mapping[str, StepTest] = field(default_factory=dict)
     plain: Blocks | None = None
+    shut: bool = False
 
     @property
     def units(self) -> frozenset[tuple[str, str]]:

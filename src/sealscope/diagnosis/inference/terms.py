@@ -21,6 +21,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.evidence import Cause
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
 LEAST_ABSOLUTE: float = priors("inference")["pressure"]["least"]
 #: Half the time over which speed and direction of motion are taken [s]: a few counts of an encoder at slow motion.
 HALF_DIFFERENCE = 0.025
+#: Time over which speeds are averaged to find rests, and the shortest rest [s].
+AVERAGED, LEAST_REST = (priors("inference")["rest"][name] for name in ("averaged", "least"))
 
 
 class Signals:
@@ -50,12 +53,21 @@ class Signals:
         What is added to a gauge pressure to make it an absolute one [Pa], by the channel's name.
     zero : float, optional
         What p_A - p_B reads too much [Pa].
+    still : tuple of two floats, optional
+        Largest mean rate of the pump's volume [m^3/s] and speed of the piston [m/s] at rest; by default nothing rests.
     """
 
     def __init__(
-        self, channels: Mapping[str, Array], rate: float, zeros: Mapping[str, float], zero: float = 0.0
+        self,
+        channels: Mapping[str, Array],
+        rate: float,
+        zeros: Mapping[str, float],
+        zero: float = 0.0,
+        still: tuple[float, float] = (-1.0, -1.0),
     ) -> None:
         self._channels, self.rate, self._zeros, self._zero = channels, rate, zeros, zero
+        self._still = still
+        self._stands: Array | None = None
         self._steps: dict[str, Array] = {}
         self._means: dict[str, Array] = {}
 
@@ -134,9 +146,42 @@ class Signals:
         """Shares of each interval in which the piston moves outward while A carries, moves outward, and A carries."""
         return _middle(self.outward * self.carried_by_A), _middle(self.outward), _middle(self.carried_by_A)
 
+    def stands(self, left: Callable[[Signals], Array]) -> Array:
+        """Return 1 for each interval in which the pump, by its volume, or the piston stands still, else 0."""
+        if self._stands is None:
+            pump = find_rests(left(self), self.rate, self._still[0])
+            self._stands = (pump | find_rests(self.step("x"), self.rate, self._still[1])).astype(float)
+        return self._stands
+
     def acceleration_step(self) -> Array:
         """Return the increments of the piston's speed [m/s], by which a delay between channels shows."""
         return _slope(self.step("x") * self.rate)
+
+
+def find_rests(increments: Array, rate: float, still: float) -> NDArray[np.bool_]:
+    """Find the intervals of rests: the mean rate over `AVERAGED` seconds stays below `still` for `LEAST_REST`.
+
+    `increments` (n,) of the pump's volume or of x; missing ones are no rest.
+    """
+    size, least = max(1, round(AVERAGED * rate)), max(2, round(LEAST_REST * rate))
+    if still < 0.0 or len(increments) < size + least:
+        return np.zeros(len(increments), dtype=bool)
+    known = np.isfinite(increments)
+    volume, missing = (np.concatenate([[0], np.cumsum(of)]) for of in (np.where(known, increments, 0.0), ~known))
+    below = np.abs(volume[size:] - volume[:-size]) <= still * size / rate
+    below &= missing[size:] == missing[:-size]
+    covered = _spread(below, size)  # every interval of a quiet stretch
+    runs = np.concatenate([[0], np.cumsum(~covered)])
+    whole = runs[least:] == runs[:-least]
+    return _spread(whole, least)
+
+
+def _spread(starts: NDArray[np.bool_], length: int) -> NDArray[np.bool_]:
+    """Mark the `length` places from each start on, shape (n + length - 1,)."""
+    counts = np.zeros(len(starts) + length, dtype=int)
+    counts[: len(starts)] += starts
+    counts[length:] -= starts
+    return np.cumsum(counts)[:-1] > 0
 
 
 def _middle(values: Array) -> Array:
@@ -546,6 +591,53 @@ def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array
     if source == "omega" or (source == "u" and rig.valve.spool != "present"):
         return lambda s: displacement * s.mean("omega") * s.dt
     return None
+
+
+#: Columns that count at rest, while the pump or the piston stands still: leakage and zero (`regimes`).
+REST_LEAK, REST_BIAS = "leak at rest", "bias at rest"
+RESTS = (REST_LEAK, REST_BIAS)
+#: What passes the pump alone, where a valve cuts it off at rest.
+TURNING = "pump leak while it turns"
+
+
+def with_rests(equation: Equation) -> Equation:
+    """Add to a pump's balance the columns that count at rest, before those of the leak."""
+    left = equation.left
+
+    def term(name: str, formula: str, unit: str, increments: Callable[[Signals], Array]) -> Term:
+        return Term(name, f"[rest] {formula}", unit, increments, "pump leak", nuisance=False, driven="pressure")
+
+    rests = (
+        term(REST_LEAK, "(p_A - p_B) dt", "m^3/(s Pa)", lambda s: s.stands(left) * s.pressure_difference * s.dt),
+        term(REST_BIAS, "dt", "m^3/s", lambda s: s.stands(left) * s.dt),
+    )
+    return equation._replace(terms=_before_leaks(equation, rests))
+
+
+def shut_at_rest(equation: Equation) -> Equation:
+    """Return a pump's balance where a valve cuts the pump off at rest: its leakage and zero count in motion."""
+    left = equation.left
+    pump = Term(
+        TURNING,
+        "[moves] (p_A - p_B) dt",
+        "m^3/(s Pa)",
+        lambda s: (1.0 - s.stands(left)) * s.pressure_difference * s.dt,
+        "pump leak",
+        "pump",
+        needs=("p_A", "p_B"),
+        driven="pressure",
+    )
+    terms = (
+        term._replace(formula="[moves] dt", increments=lambda s: (1.0 - s.stands(left)) * s.dt)
+        if term.name == BIAS
+        else term
+        for term in _before_leaks(equation, (pump,))
+    )
+    return equation._replace(terms=tuple(terms))
+
+
+def _before_leaks(equation: Equation, terms: tuple[Term, ...]) -> tuple[Term, ...]:
+    return (*equation.terms[: -len(_LEAKS)], *terms, *equation.terms[-len(_LEAKS) :])
 
 
 def _with_channels(equation: Equation, channels: frozenset[str]) -> Equation:
