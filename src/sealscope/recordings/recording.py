@@ -183,7 +183,7 @@ class Recording:
 
     @property
     def unused(self) -> tuple[str, ...]:
-        """Names of the recorded pressures, positions and speeds of its file that no channel is made of."""
+        """Names of the recorded pressures, positions, speeds and flows of its file that no channel is made of."""
         names = self.provenance.get("unused", ())
         return tuple(map(str, names)) if isinstance(names, list | tuple) else ()
 

@@ -17,6 +17,8 @@ from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.errors import printable
 from sealscope.paragraphs import WIDTH, paragraphs
 from sealscope.recordings.formats.columns import counted, listed
+from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.proposal import suggested_map
 
 ABSENT = "–"
 
@@ -309,8 +311,11 @@ def raw_counts(diagnosis: Diagnosis) -> str | None:
 
 
 def not_used(diagnosis: Diagnosis) -> str | None:
-    """Return which recorded pressures, positions and speeds no channel is made of; None where all are."""
-    return f"{listed(diagnosis.unused)}: recorded, and used for no channel" if diagnosis.unused else None
+    """Return which recorded pressures, positions, speeds and flows no channel is made of; None where all are."""
+    if not diagnosis.unused:
+        return None
+    lines = " ".join(f"--map '{suggested_map(Label.parse(name))}'" for name in diagnosis.unused[:4])
+    return f"{listed(diagnosis.unused)}: recorded, and used for no channel; if they are: {lines}"
 
 
 def short_text(diagnosis: Diagnosis, *, width: int = WIDTH) -> str:

@@ -21,6 +21,7 @@ from sealscope.diagnosis.rms_change.blocks import JUDGED, RmsBlocks, columns_of,
 from sealscope.diagnosis.rms_change.ringing import information, rises
 from sealscope.diagnosis.verdict.evidence import Evidence, Verdict
 from sealscope.recordings.chambers import chambers_of
+from sealscope.recordings.formats.columns import listed
 from sealscope.recordings.hydraulics import lack_of_chambers
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.motion import constant
@@ -94,6 +95,8 @@ class RmsChange:
         if evidence.verdict != "no leak" or recording.rate >= rates["ringing"]:
             return evidence
         why = f"at {recording.rate:g} Hz the details hold no ringing that a leak damps ({rates['ringing']:g} Hz would)"
+        if recording.unused:
+            why = f"{listed(recording.unused, 4)}: recorded, and used for no channel (--map CHANNEL=COLUMN)"
         return replace(evidence, verdict="cannot tell", reason=f"{why}; {evidence.reason}")
 
 
