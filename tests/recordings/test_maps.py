@@ -229,3 +229,23 @@ def test_prefixes_behind_numbers_are_powers_of_ten(tmp_path: Path) -> None:
     assert recording["x"] == pytest.approx((170.3 + k) * 1e-3)
     assert recording["p_A"] == pytest.approx((np.abs(k % 7 - 3) + 0.5) * np.where(k % 7 < 3, -1e3, 1e3))
     assert recording.rate == 1e3
+
+
+def test_pressures_and_oil_are_shown_in_the_units_of_the_log(tmp_path: Path) -> None:
+    from sealscope.reporting.overview import overview_text
+
+    rows = np.column_stack([COLUMNS, 40.0 + 1e-3 * COLUMNS[:, :1]])
+    recording = read(table(tmp_path, "t [s];p_A [psi];p_B [psi];x [mm];T_oil [degC]", rows))
+    text = overview_text("log.csv", recording, ())
+    low, high = rows[:, 0].min(), rows[:, 0].max()
+    assert f"{low:.4g} to {high:.4g} psi" in text
+    assert f"{rows[:, 3].min():.4g} to {rows[:, 3].max():.4g} degC" in text
+    assert " K" not in text
+    assert recording.pressure_unit == ss.diagnose(recording).pressure_unit == "psi"
+
+
+def test_no_name_is_cut_in_its_middle() -> None:
+    from sealscope.recordings.formats.columns import listed
+
+    name = "Zylinder 4 Druck Kolbenseite nach Ventil Y12 [bar]"
+    assert listed([name, "x" * 100]) == f"{name}, {'x' * 77}..."

@@ -8,17 +8,17 @@ from functools import cache
 from importlib import resources
 from math import floor, isfinite, isnan, log10
 from pathlib import PurePath
-from textwrap import shorten
 from typing import Any
 
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LEAKS, RMS_CHANGE
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.errors import printable
-from sealscope.paragraphs import WIDTH, paragraphs
+from sealscope.paragraphs import WIDTH, paragraph, paragraphs
 from sealscope.recordings.formats.columns import counted, listed
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.proposal import suggested_map
+from sealscope.units import from_si
 
 ABSENT = "–"
 
@@ -190,7 +190,8 @@ def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
     own = diagnosis.total_leakage
     if own is None:
         return None
-    pressure, findable = f"{number(own.pressure / 1e6, 2)} MPa", f"{number(own.findable_lpm, 2)} L/min"
+    pressure = f"{number(from_si(own.pressure, diagnosis.pressure_unit, 'Pa'), 2)} {diagnosis.pressure_unit}"
+    findable = f"{number(own.findable_lpm, 2)} L/min"
     if own.lpm is None or own.interval_lpm is None:
         known = own.pump_share is not None
         key = "share" if known else "not_measured"
@@ -394,11 +395,10 @@ def table_line(diagnosis: Diagnosis, start_s: float | None = None) -> str:
     `start_s`: when the recording began [s since 1970].
     """
     file = PurePath(diagnosis.file).name
-    file = file if len(file) <= 22 else f"{file[:10]}..{file[-10:]}"
     date = "" if start_s is None else datetime.fromtimestamp(start_s, UTC).date().isoformat()
     line = f"{file:<22} {date:<10} {diagnosis.verdict:<11} {flow(diagnosis)}"
     named = cause(diagnosis)
     if diagnosis.verdict == "no leak" and named is None:
         return line
     before = "" if named is None or diagnosis.verdict == "leak" else f"{named}: "
-    return f"{line}\n    {shorten(before + what_to_do(diagnosis), WIDTH - 4)}"
+    return f"{line}\n{paragraph(before + what_to_do(diagnosis), '    ')}"

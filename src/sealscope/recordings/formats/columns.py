@@ -136,9 +136,9 @@ def counted(count: int, noun: str) -> str:
 
 
 def listed(names: Iterable[str], most: int = 12) -> str:
-    """Join names for a message, at most so many of them, each cut to 40 characters."""
+    """Join names for a message, at most so many of them; one of over 80 characters ends in three points."""
     names = list(names)
-    shown = ", ".join(name[:40] for name in names[:most])
+    shown = ", ".join(name if len(name) <= 80 else f"{name[:77]}..." for name in names[:most])
     return f"{shown} and {len(names) - most} more" if len(names) > most else shown or "none"
 
 
