@@ -389,6 +389,10 @@ def what_to_do(diagnosis: Diagnosis) -> str:
     return diagnosis.reason if diagnosis.verdict == "cannot tell" else next_steps(diagnosis)[0]
 
 
+#: Columns of a file's name in a table; a longer name has a line of its own.
+_FILE = 22
+
+
 def table_line(diagnosis: Diagnosis, start_s: float | None = None) -> str:
     """Return a diagnosis as a line of a table: file, date, verdict, L/min, and what to do where anything changed.
 
@@ -396,7 +400,8 @@ def table_line(diagnosis: Diagnosis, start_s: float | None = None) -> str:
     """
     file = PurePath(diagnosis.file).name
     date = "" if start_s is None else datetime.fromtimestamp(start_s, UTC).date().isoformat()
-    line = f"{file:<22} {date:<10} {diagnosis.verdict:<11} {flow(diagnosis)}"
+    file = file if len(file) <= _FILE else f"{file}\n{'':{_FILE}}"
+    line = f"{file:<{_FILE}} {date:<10} {diagnosis.verdict:<11} {flow(diagnosis)}"
     named = cause(diagnosis)
     if diagnosis.verdict == "no leak" and named is None:
         return line
