@@ -41,6 +41,50 @@ def test_a_new_rig_loads_rests_and_can_be_resolved(call, tmp_path, areas):
     Experiment.of(rig=rig, duration=1.0)
 
 
+def test_a_valve_rig_from_a_data_sheet_loads_and_rests(call, tmp_path):
+    path = tmp_path / "crane.toml"
+    words = ("--kind", "valve", "--bore", "63", "--rod", "36", "--stroke", "400", "--valve", "40 L/min")
+    done = call("rigs", "new", "crane", *words, "--drop", "5 bar", "--supply", "160", "-o", path)
+    assert (done.status, done.err) == (0, "")
+    rig = load_rig(path)
+    assert pytest.approx((3117.25e-6, 2099.37e-6), rel=1e-5) == (rig.cylinder.A_A, rig.cylinder.A_B)
+    assert pytest.approx((40e-3 / 60, 5e5, 160e5)) == (rig.valve.Q_N, rig.valve.dp_N, rig.supply.p_set)
+    assert rig.states("cylinder.A_A", "valve.Q_N", "supply.p_set")
+    assert not rig.states("cylinder.V")
+    initial_state(rig, 0.0)
+    assert longest_step(rig_numbers(rig)) > 0.06 * LONGEST_STEP
+    Experiment.of(rig=rig, duration=1.0)
+
+
+def test_bore_and_rod_are_as_good_as_areas(call, tmp_path):
+    path = tmp_path / "press.toml"
+    words = ("--bore", "100 mm", "--rod", "70", "--double-rod", "--stroke", "300", "--displacement", "8")
+    assert call("rigs", "new", "press", *words, "-o", path).status == 0
+    ring = math.pi / 4 * (0.1**2 - 0.07**2)
+    assert pytest.approx((ring, ring), rel=1e-5) == (load_rig(path).cylinder.A_A, load_rig(path).cylinder.A_B)
+
+
+@pytest.mark.parametrize(
+    ("words", "rule"),
+    [
+        (("--bore", "50", "--rod", "50"), "rod must be 0 to below the bore, 50 mm, got 50 mm"),
+        (("--bore", "50", "--valve", "9"), "--valve must stand with --kind valve, got --kind pump"),
+        (("--kind", "valve", "--bore", "50"), "--displacement must stand with --kind pump, got --kind valve"),
+    ],
+)
+def test_what_does_not_fit_a_kind_is_one_line(call, words, rule):
+    assert call("rigs", "new", "press", *words, *SIZES).refused().startswith(rule)
+
+
+def test_areas_go_with_any_packaged_rig():
+    """`--rig servo-valve --area` ended in "cylinder.V must be > A_A L/2"."""
+    for name in rig_names():
+        own = load_rig(name).with_areas(7854e-6, 4006e-6, source="the call")
+        assert own.states("cylinder.A_A", "cylinder.A_B")
+        assert own.cylinder.volumes == "fixed" or not own.states("cylinder.V")
+        assert pytest.approx(7854e-6) == own.cylinder.A_A
+
+
 @pytest.mark.slow
 def test_a_new_single_rod_runs(call, tmp_path):
     path = tmp_path / "small.toml"

@@ -89,7 +89,7 @@ def test_units_from_attributes_and_columns_of_other_kinds() -> None:
     assert np.array_equal(recording["p_A"], [1e5, np.nan, 3e5], equal_nan=True)
     assert recording["p_B"][2] == pytest.approx(2.5 * 6894.757293168361)
     assert recording["x"] == pytest.approx([1e-3, 2e-3, 3e-3])
-    assert recording.provenance == {"format": "pandas"}
+    assert recording.provenance == {"format": "pandas", "log_units": {"p_A": "bar", "p_B": "psi", "x": "mm"}}
     assert recording.history == ("columns not used: remark",)
 
 

@@ -177,3 +177,75 @@ def test_a_twincat_export_with_names_alone_has_its_clock_and_its_start(tmp_path:
     assert recording.provenance["start"].startswith("2025-04-23T11:30:40.03")
     assert recording.unused == ("MainX",)
     assert recording["p_A"][-2] == 23e5
+
+
+@pytest.mark.parametrize(("head", "unit"), [("Joystick [%]", "%"), ("spool_pct", "pct"), ("Command [mA]", "mA")])
+def test_a_command_in_percent_or_mA_is_a_command(tmp_path: Path, head: str, unit: str) -> None:
+    recording = read(table(tmp_path, f"t [s];p_A [bar];p_B [bar];{head}"), map="auto")
+    assert recording.units["u"] == "count"
+    assert np.allclose(recording["u"], COLUMNS[:, 2])
+    assert any(f"is a command in {unit}" in line for line in recording.history)
+
+
+def test_columns_that_no_channel_is_made_of_are_named_with_the_line_to_write(tmp_path: Path) -> None:
+    from sealscope.reporting.messages import not_used
+
+    rows = np.column_stack([COLUMNS, COLUMNS])[np.arange(2000) % COUNT] + 1e3
+    path = table(tmp_path, "t [s];p_A [bar];p_B [bar];p_pump_bar;p_tank_bar;Flow [l/min];Weg [mm]", rows)
+    said = not_used(ss.diagnose(read(path)))
+    assert said is not None
+    for line in ("p_1=p_pump_bar", "p_2=p_tank_bar", "q_pump=Flow [l/min]", "x=Weg [mm]"):
+        assert f"--map '{line}'" in said
+
+
+def test_a_rate_is_not_blamed_where_a_column_is_not_mapped(tmp_path: Path) -> None:
+    random, t = np.random.default_rng(1), np.arange(6000) / 50.0
+    swing = 20 * np.tanh(8 * np.cos(2 * t))
+    noise = 0.05 * random.standard_normal((2, t.size))
+    columns = [t, 60 + swing + noise[0], 60 - swing + noise[1], 100 * np.sin(2 * t)]
+    text = "t [s];p_A [bar];p_B [bar];Weg [mm]\n" + "\n".join(
+        ";".join(f"{v:.5f}" for v in row) for row in zip(*columns, strict=True)
+    )
+    (tmp_path / "log.csv").write_text(text + "\n")
+    reason = ss.diagnose(read(tmp_path / "log.csv")).reason
+    assert "Weg [mm]: recorded, and used for no channel" in reason
+    assert "250 Hz" not in reason
+
+
+@pytest.mark.parametrize("line", ["SamplePeriod_ms;2", "Cycle time [ms];2", "Abtastzeit_ms;2", "SampleRate_Hz;500"])
+def test_the_sample_period_of_a_controller_s_heading_is_used_and_said(tmp_path: Path, line: str) -> None:
+    rows = "\n".join(f"{k};{value:g};{value:g}" for k, (value, *_) in enumerate(COLUMNS))
+    (tmp_path / "log.csv").write_text(f"Station;Press 4\n{line}\n\nNo;p_A [bar];p_B [bar]\n{rows}\n")
+    recording = read(tmp_path / "log.csv")
+    assert recording.rate == RATE
+    assert "no time column: sampled at 500 Hz, as the file says" in recording.history
+
+
+def test_prefixes_behind_numbers_are_powers_of_ten(tmp_path: Path) -> None:
+    text = "t [s],p_A [Pa],x [m]\n" + "".join(f"{k}m,{k % 7 - 3}.5k,{170 + k}.3m\n" for k in range(1, 40))
+    (tmp_path / "log.csv").write_text(text)
+    recording = read(tmp_path / "log.csv")
+    k = np.arange(1, 40)
+    assert recording["x"] == pytest.approx((170.3 + k) * 1e-3)
+    assert recording["p_A"] == pytest.approx((np.abs(k % 7 - 3) + 0.5) * np.where(k % 7 < 3, -1e3, 1e3))
+    assert recording.rate == 1e3
+
+
+def test_pressures_and_oil_are_shown_in_the_units_of_the_log(tmp_path: Path) -> None:
+    from sealscope.reporting.overview import overview_text
+
+    rows = np.column_stack([COLUMNS, 40.0 + 1e-3 * COLUMNS[:, :1]])
+    recording = read(table(tmp_path, "t [s];p_A [psi];p_B [psi];x [mm];T_oil [degC]", rows))
+    text = overview_text("log.csv", recording, ())
+    low, high = rows[:, 0].min(), rows[:, 0].max()
+    assert f"{low:.4g} to {high:.4g} psi" in text
+    assert f"{rows[:, 3].min():.4g} to {rows[:, 3].max():.4g} degC" in text
+    assert " K" not in text
+    assert recording.pressure_unit == ss.diagnose(recording).pressure_unit == "psi"
+
+
+def test_no_name_is_cut_in_its_middle() -> None:
+    from sealscope.recordings.formats.columns import listed
+
+    name = "Zylinder 4 Druck Kolbenseite nach Ventil Y12 [bar]"
+    assert listed([name, "x" * 100]) == f"{name}, {'x' * 77}..."

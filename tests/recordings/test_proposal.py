@@ -69,6 +69,39 @@ from sealscope.recordings.formats.headings.proposal import proposed_map
             "t [s];p_A [bar];p_B [bar];Kolbenweg [mm];Stellsignal [V]",
             {"x": "Kolbenweg [mm]", "t": "t [s]", "u": "Stellsignal [V]"},
         ),
+        (
+            "time_s;p_A_bar;p_B_bar;x_mm;p_pump_bar;p_tank_bar;spool_pct;flow_A_lpm",
+            {
+                "t": "time_s[s]",
+                "p_A": "p_A_bar[bar]",
+                "p_B": "p_B_bar[bar]",
+                "x": "x_mm[mm]",
+                "p_1": "p_pump_bar[bar]",
+                "p_2": "p_tank_bar[bar]",
+                "u": "spool_pct[pct]",
+                "q_pump": "flow_A_lpm[lpm]",
+            },
+        ),
+        (
+            "Zeit [s];Druck A [bar];Druck B [bar];Joystick [%];Schieber [mm];Volumenstrom A [l/min]",
+            {
+                "t": "Zeit [s]",
+                "p_A": "Druck A [bar]",
+                "p_B": "Druck B [bar]",
+                "u": "Joystick [%]",
+                "q_pump": "Volumenstrom A [l/min]",
+            },
+        ),
+        (
+            "t [s];Pressure A [bar];Pressure B [bar];Valve command [mA];Spool [%];Flow [L/min];Pump speed [rpm];p_tank",
+            {
+                "t": "t [s]",
+                "p_A": "Pressure A [bar]",
+                "p_B": "Pressure B [bar]",
+                "u": "Valve command [mA]",
+                "omega": "Pump speed [rpm]",
+            },
+        ),
     ],
 )
 def test_names_of_loggers(heads: str, expected: dict[str, str]) -> None:

@@ -24,6 +24,7 @@ from sealscope.diagnosis.inference.terms import PUMP
 from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.machine import healthy_leakage
 from sealscope.errors import InputError, SealscopeError
+from sealscope.paragraphs import paragraph
 from sealscope.parameters import Rig
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.bench.machines import centred_start
@@ -133,7 +134,7 @@ class RecordingPlan(NamedTuple):
         able = [row for row in self.compared if not row.note]
         lines += [f"  {row.duty!s:<34}{self._size(row.conductance):>14}{self._size(row.separable):>18}" for row in able]
         notes = [row for row in self.compared if row.note]
-        lines += [f"  left out: {row.duty}: {row.note}"[:120] for row in notes[:1]]
+        lines += [paragraph(f"left out: {row.duty}: {row.note}", "  ", 4) for row in notes[:1]]
         return "\n".join(lines)
 
     def _size(self, conductance: float) -> str:

@@ -293,17 +293,15 @@ def _assumed_rig(name: str | None, area: Sequence[str] | None, displacement: str
     from sealscope.units import parse_quantity
 
     rig = None if name is None else load_rig(name)
-    stated: dict[str, float] = {}
+    source, stated = "set by the call (--area, --displacement)", dict[str, float]()
     if area:
         if len(area) > 2:
             raise InputError(f"--area must be given once, or twice for sides A and B, got {len(area)} times")
         sides = [parse_quantity(text, "m^2", name="--area") for text in area]
-        stated |= {"cylinder.A_A": sides[0], "cylinder.A_B": sides[-1]}
+        rig = (rig or unstated()).with_areas(sides[0], sides[-1], source=source)
     if displacement is not None:
         stated["pump.q_b"] = parse_quantity(displacement, "m^3/rev", name="--displacement")
-    if not stated:
-        return rig
-    return (rig or unstated()).with_overrides(stated, source="set by the call (--area, --displacement)")
+    return rig if not stated else (rig or unstated()).with_overrides(stated, source=source)
 
 
 def rig_with(name: str, overrides: Sequence[str] | None) -> Rig:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
-from typer import Argument, Context, Option, Typer, echo
+from typer import Argument, Context, Option, Typer, echo, prompt
 
 from sealscope.cli.options import RigArgument, check_folder, declared, say_wrapped, write_text
 from sealscope.errors import InputError
@@ -14,11 +14,7 @@ from sealscope.errors import InputError
 rigs = Typer(
     name="rigs", help="List the packaged rigs; `rigs new` writes another machine's file, `rigs margins` rates a loop."
 )
-AreaA = Annotated[str, Option("--area-A", help="Piston area on side A.", prompt="Piston area on side A [mm^2]")]
-AreaB = Annotated[
-    str, Option("--area-B", help="Piston area on side B: with the rod, if there is one.", prompt="... on side B [mm^2]")
-]
-Displacement = Annotated[str, Option(help="Displacement of the pump.", prompt="Displacement of the pump [cm^3/rev]")]
+_MM2, _MM, _CM3 = "mm^2", "mm", "cm^3/rev"
 
 
 @rigs.callback(invoke_without_command=True)
@@ -36,32 +32,47 @@ def list_rigs(context: Context) -> None:
 @rigs.command()
 def new(
     name: Annotated[str, Argument(help="Name of the rig; the file is NAME.toml unless `-o` says otherwise.")],
-    area_A: AreaA,
-    area_B: AreaB,
-    stroke: Annotated[str, Option(help="Stroke.", prompt="Stroke [mm]")],
-    displacement: Displacement,
+    kind: Annotated[Literal["pump", "valve"], Option(help="What moves the cylinder.")] = "pump",
+    bore: Annotated[str | None, Option(help="Bore of the cylinder.")] = None,
+    rod: Annotated[str | None, Option(help="Diameter of the rod, with --bore.")] = None,
+    double_rod: Annotated[bool, Option("--double-rod", help="The rod leaves both sides.")] = False,
+    area_A: Annotated[str | None, Option("--area-A", help="Piston area on side A, in place of the bore.")] = None,
+    area_B: Annotated[str | None, Option("--area-B", help="Piston area on side B: with the rod, if any.")] = None,
+    stroke: Annotated[str | None, Option(help="Stroke.")] = None,
+    displacement: Annotated[str | None, Option(help="Displacement of the pump.")] = None,
+    valve: Annotated[str | None, Option(metavar="FLOW", help="Rated flow of the valve, '40 L/min'.")] = None,
+    drop: Annotated[str | None, Option(help="Pressure drop of one edge at that flow, '5 bar'.")] = None,
+    supply: Annotated[str | None, Option(help="Pressure of the valve's supply, '160 bar'.")] = None,
     output: Annotated[Path | None, Option("--output", "-o", help="File to write (.toml).")] = None,
 ) -> None:
-    """Write a commented rig file from areas, stroke and displacement.
+    """Write a commented rig file from a data sheet: bore and rod (or areas), stroke, and pump or valve.
 
-    A number without a unit is in mm^2, mm or cm^3/rev.
+    A number without a unit is in mm, mm^2, cm^3/rev, L/min or bar. What is needed and not given is asked for.
     """
     from sealscope.parameters import load_rig
-    from sealscope.parameters.new_rig import rig_text
-    from sealscope.units import parse_quantity
+    from sealscope.parameters.new_rig import piston_areas, rig_text, valve_rig_text
 
-    def si(text: str, si_unit: str, usual: str, option: str) -> float:
-        with suppress(ValueError):
-            text = f"{float(text)}[{usual}]"
-        return parse_quantity(text, si_unit, name=option)
-
-    text = rig_text(
-        name,
-        si(area_A, "m^2", "mm^2", "--area-A"),
-        si(area_B, "m^2", "mm^2", "--area-B"),
-        si(stroke, "m", "mm", "--stroke"),
-        si(displacement, "m^3/rev", "cm^3/rev", "--displacement"),
-    )
+    for option, value, needed in (
+        ("--displacement", displacement, "pump"), ("--valve", valve, "valve"), ("--drop", drop, "valve"),
+        ("--supply", supply, "valve"),
+    ):  # fmt: skip
+        if value is not None and kind != needed:
+            raise InputError(f"{option} must stand with --kind {needed}, got --kind {kind}")
+    if bore is not None:
+        diameters = _si(bore, "m", _MM, "--bore"), _si(rod or "0", "m", _MM, "--rod")
+        areas = piston_areas(*diameters, both=double_rod)
+    else:
+        sides = (area_A, "Piston area on side A", "--area-A"), (area_B, "... on side B", "--area-B")
+        areas = tuple(_si(text or _asked(what, _MM2), "m^2", _MM2, option) for text, what, option in sides)  # type: ignore[assignment]
+    length = _si(stroke or _asked("Stroke", _MM), "m", _MM, "--stroke")
+    if kind == "pump":
+        volume = displacement or _asked("Displacement of the pump", _CM3)
+        text = rig_text(name, *areas, length, _si(volume, "m^3/rev", _CM3, "--displacement"))
+    else:
+        flow = _si(valve or _asked("Rated flow of the valve", "L/min"), "m^3/s", "L/min", "--valve")
+        pressures = (None if own is None else _si(own, "Pa", "bar", option) for own, option in (
+            (drop, "--drop"), (supply, "--supply")))  # fmt: skip
+        text = valve_rig_text(name, *areas, length, flow, *pressures)
     path = output or Path(f"{name}.toml")
     if path.suffix != ".toml":
         raise InputError(f"a rig's file must end in .toml, got {path}")
@@ -71,6 +82,20 @@ def new(
     write_text(path, text)
     echo(f"{path}: {load_rig(path).title}")
     echo(f"replace what is assumed (grep 'assumed:' {path}), then:\nsealscope simulate --rig {path} -o run.nc")
+
+
+def _asked(what: str, unit: str) -> str:
+    """Ask for a size at the terminal."""
+    return str(prompt(f"{what} [{unit}]"))
+
+
+def _si(text: str, si_unit: str, usual: str, option: str) -> float:
+    """Parse an option's quantity, without a unit in the `usual` one."""
+    from sealscope.units import parse_quantity
+
+    with suppress(ValueError):
+        text = f"{float(text)}[{usual}]"
+    return parse_quantity(text, si_unit, name=option)
 
 
 @rigs.command("margins")

@@ -1,4 +1,4 @@
-"""A new rig's file from four numbers of its machine: what they do not tell is assumed, and says so."""
+"""A new rig's file from the numbers of a data sheet: what they do not tell is assumed, and says so."""
 
 from __future__ import annotations
 
@@ -8,15 +8,32 @@ from string import Template
 
 from sealscope.errors import InputError
 from sealscope.parameters.load import load_rig
+from sealscope.parameters.rig import Rig
+from sealscope.units import BAR, LITRE_PER_MINUTE
 
 #: Dead volume of each side, over the larger swept volume.
 _DEAD = 0.25
 #: Gas in the accumulator over the oil that the rod displaces.
 _GAS = 5.0
+#: Speed of a supply's pump [rev/s], pressure above its setting at which the relief valve takes all of its flow [Pa],
+#: and pressure of the accumulator's gas over the setting.
+_SUPPLY_SPEED, _ABOVE_SETTING, _CHARGE = 25.0, 2.5e5, 0.7
+_STATED = "stated when this file was written: replace by drawing or data sheet"
+
+
+def piston_areas(bore: float, rod: float, *, both: bool = False) -> tuple[float, float]:
+    """Compute the piston areas [m^2] of sides A and B from bore and rod [m]; `both`: the rod leaves both sides.
+
+    Raises InputError where the rod is not thinner than the bore.
+    """
+    if not (math.isfinite(bore) and 0.0 <= rod < bore):
+        raise InputError(f"rod must be 0 to below the bore, {1e3 * bore:g} mm, got {1e3 * rod:g} mm")
+    ring = 0.25 * math.pi * (bore**2 - rod**2)
+    return (ring if both else 0.25 * math.pi * bore**2), ring
 
 
 def rig_text(name: str, area_A: float, area_B: float, stroke: float, displacement: float) -> str:
-    """Return the text of a rig's file, with comments.
+    """Return the text of the file of a pump-controlled rig, with comments.
 
     What the four numbers do not tell is taken from `thesis` (equal areas) or `single-rod-eha`, scaled where the size of
     the machine says how: friction with the bore, moving mass with the oil displaced, valves with the volumes.
@@ -37,41 +54,118 @@ def rig_text(name: str, area_A: float, area_B: float, stroke: float, displacemen
     InputError
         A number is not > 0, or the name has more than letters, digits, `-`, `_` and blanks.
     """
-    for what, value in (("area-A", area_A), ("area-B", area_B), ("stroke", stroke), ("displacement", displacement)):
+    _check_sizes(name, {"area-A": area_A, "area-B": area_B, "stroke": stroke, "displacement": displacement})
+    single = area_A != area_B
+    base = load_rig("single-rod-eha" if single else "thesis")
+    sizes = _cylinder_sizes(base, area_A, area_B, stroke)
+    text = _template("new_rig.toml.txt").substitute(
+        sizes,
+        name=name,
+        q_b=f"{1e6 * displacement:g}",
+        displacement=f"{1e6 * displacement:.6g}",
+        V_gas=f"{1e3 * _GAS * abs(area_A - area_B) * stroke:.4g}",
+        G_check=f"{base.makeup.G_check * _size(base, area_A, area_B, stroke):.4g}",
+    )
+    return text if single else text[: text.index("\n[makeup]")]
+
+
+def valve_rig_text(
+    name: str,
+    area_A: float,
+    area_B: float,
+    stroke: float,
+    rated_flow: float,
+    rated_drop: float | None = None,
+    pressure: float | None = None,
+) -> str:
+    """Return the text of the file of a valve-controlled rig, with comments.
+
+    What the numbers do not tell is taken from `servo-valve`, scaled where the size of the machine says how.
+
+    Parameters
+    ----------
+    name : str
+        Name of the rig.
+    area_A, area_B : float
+        Piston areas [m^2].
+    stroke : float
+        Stroke [m].
+    rated_flow : float
+        Rated flow of the valve [m^3/s].
+    rated_drop : float, optional
+        Pressure drop of one edge at the rated flow [Pa]; by default that of a servo valve, 35 bar.
+    pressure : float, optional
+        Pressure of the supply above the return [Pa].
+
+    Raises
+    ------
+    InputError
+        A number is not > 0, or the name has more than letters, digits, `-`, `_` and blanks.
+    """
+    base = load_rig("servo-valve")
+    drop = base.valve.dp_N if rated_drop is None else rated_drop
+    setting = base.supply.p_set if pressure is None else pressure
+    given = {"area-A": area_A, "area-B": area_B, "stroke": stroke, "valve": rated_flow, "drop": drop, "supply": setting}
+    _check_sizes(name, given)
+    assumed = f"assumed: that of {base.name}"
+    torques = rated_flow / _SUPPLY_SPEED * setting / (base.pump.q_b * base.supply.p_set)  # so many motors on one shaft
+    motor = {name: f"{base[f'motor.{name}'] * torques:.4g}" for name in ("i_max", "J_M", "B_M")}  # type: ignore[operator]
+    motor |= {name: f"{base[f'motor.{name}'] / torques:.4g}" for name in ("R_c", "L_c")}  # type: ignore[operator]
+    return _template("new_valve_rig.toml.txt").substitute(
+        _cylinder_sizes(base, area_A, area_B, stroke),
+        name=name,
+        flow=f"{rated_flow / LITRE_PER_MINUTE:.6g}",
+        drop=f"{drop / BAR:.6g}",
+        drop_source="assumed: usual of servo valves; proportional valves are rated at 5 bar"
+        if rated_drop is None
+        else _STATED,
+        pressure=f"{setting / BAR:.6g}",
+        pressure_source=assumed if pressure is None else _STATED,
+        charge=f"{_CHARGE * setting / BAR:.4g}",
+        G_set=f"{rated_flow / _ABOVE_SETTING:.4g}",
+        V_acc=f"{1e3 * base.supply.V_acc * rated_flow / base.valve.Q_N:.4g}",
+        q_b=f"{1e6 * rated_flow / _SUPPLY_SPEED:.4g}",
+        **motor,
+    )
+
+
+def _check_sizes(name: str, sizes: dict[str, float]) -> None:
+    for what, value in sizes.items():
         if not (math.isfinite(value) and value > 0):
             raise InputError(f"{what} must be > 0, got {value:g}")
     if not name.strip() or not all(letter.isalnum() or letter in "-_ " for letter in name):
         raise InputError(f"name of a rig must be of letters, digits, '-', '_' and blanks, got {name!r}")
-    single = area_A != area_B
-    base = load_rig("single-rod-eha" if single else "thesis")
-    larger = max(area_A, area_B)
+
+
+def _template(file: str) -> Template:
+    return Template(Path(__file__).with_name(file).read_text(encoding="utf-8"))
+
+
+def _size(base: Rig, area_A: float, area_B: float, stroke: float) -> float:
+    """Compute the volume of a side at mid-stroke over that of the rig `base`."""
+    return (0.5 + _DEAD) * max(area_A, area_B) * stroke / base.cylinder.V
+
+
+def _cylinder_sizes(base: Rig, area_A: float, area_B: float, stroke: float) -> dict[str, str]:
+    """Return what cylinder and friction are in the files of rigs, by the templates' names."""
+    larger, size = max(area_A, area_B), _size(base, area_A, area_B, stroke)
     bore = math.sqrt(larger / max(base.cylinder.A_A, base.cylinder.A_B))
-    V = (0.5 + _DEAD) * larger * stroke
-    size = V / base.cylinder.V
-    mass = base.cylinder.M_eq * size
-    scaled = f"assumed: that of {base.name}, scaled with the"
+    mass, friction = base.cylinder.M_eq * size, base.friction
     # side B is the smaller one in V_rod; a rod on side A leaves V to B
     V_rod = max(0.5 * (area_A - area_B) * stroke, 0.0)
-    friction = base.friction
-    text = Template(Path(__file__).with_name("new_rig.toml.txt").read_text(encoding="utf-8")).substitute(
-        name=name,
-        kind="Single" if single else "Double",
-        base=base.name,
-        stated="stated when this file was written: replace by drawing or data sheet",
-        scaled=scaled,
-        q_b=f"{1e6 * displacement:g}",
-        displacement=f"{1e6 * displacement:.6g}",
-        area_A=f"{1e6 * area_A:.6g}",
-        area_B=f"{1e6 * area_B:.6g}",
-        stroke=f"{1e3 * stroke:.6g}",
-        V=f"{1e6 * V:.6g}",
-        V_rod=f"{1e6 * V_rod:.6g}",
-        M_eq=f"{mass:.4g}",
-        d_stop=f"{math.sqrt(base.cylinder.k_stop * mass):.4g}",
-        F_pr=f"{friction.F_pr * bore:.4g}",
-        F_cfr=f"{friction.F_cfr * bore**2:.4g}",
-        F_v=f"{friction.F_v * bore:.4g}",
-        V_gas=f"{1e3 * _GAS * abs(area_A - area_B) * stroke:.4g}",
-        G_check=f"{base.makeup.G_check * size:.4g}",
-    )
-    return text if single else text[: text.index("\n[makeup]")]
+    return {
+        "kind": "Double" if area_A == area_B else "Single",
+        "base": base.name,
+        "stated": _STATED,
+        "scaled": f"assumed: that of {base.name}, scaled with the",
+        "area_A": f"{1e6 * area_A:.6g}",
+        "area_B": f"{1e6 * area_B:.6g}",
+        "stroke": f"{1e3 * stroke:.6g}",
+        "V": f"{1e6 * size * base.cylinder.V:.6g}",
+        "V_rod": f"{1e6 * V_rod:.6g}",
+        "M_eq": f"{mass:.4g}",
+        "d_stop": f"{math.sqrt(base.cylinder.k_stop * mass):.4g}",
+        "F_pr": f"{friction.F_pr * bore:.4g}",
+        "F_cfr": f"{friction.F_cfr * bore**2:.4g}",
+        "F_v": f"{friction.F_v * bore:.4g}",
+    }

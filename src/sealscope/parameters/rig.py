@@ -25,6 +25,8 @@ Value = float | int | str
 P = TypeVar("P", bound=Part)
 #: Begins the source of a value that nobody has stated of this machine.
 ASSUMED = "assumed:"
+#: Gas of an accumulator over the oil that the rod displaces over the stroke.
+_GAS_OVER_ROD = 5.0
 
 
 class ParameterEntry(NamedTuple):
@@ -270,6 +272,29 @@ class Rig(Part):
                 raise InputError(f"{full} must be set once, got {replaced[full]} and {name}")
             replaced[full] = name
             entries[full] = ParameterEntry(*_as_given(full, value, source), source, source)
+        rig = Rig.from_entries(entries, name=self._name, title=self._title, place=source)
+        return rig.with_channel_map(self.channel_map)
+
+    def with_areas(self, A_A: float, A_B: float, *, source: str) -> Rig:
+        """Return the same machine with other piston areas [m^2]; volumes that move with the piston fit them.
+
+        The dead volume beside the stroke and the accumulator's gas are scaled with the larger area, an assumption.
+        """
+        entries, old = self._given(), self.cylinder
+        scale = max(A_A, A_B) / max(old.A_A, old.A_B)
+        fitted: dict[str, float] = {}
+        if old.volumes == "position":
+            dead = max(old.V - 0.5 * max(old.A_A, old.A_B) * old.L, 0.0)
+            fitted["cylinder.V"] = 0.5 * max(A_A, A_B) * old.L + scale * dead
+            fitted["cylinder.V_rod"] = max(0.5 * (A_A - A_B) * old.L, 0.0)
+        if self.makeup.check_valves != "absent":
+            gas = _GAS_OVER_ROD * abs(A_A - A_B) * old.L
+            fitted["makeup.V_gas"] = max(scale * self.makeup.V_gas, gas)
+        assumed = f"{ASSUMED} that of {self._name}, scaled with the area"
+        stated = {"cylinder.A_A": A_A, "cylinder.A_B": A_B}
+        for values, why in ((fitted, assumed), (stated, source)):
+            for full, value in values.items():
+                entries[full] = ParameterEntry(*_as_given(full, value, source), why, source)
         rig = Rig.from_entries(entries, name=self._name, title=self._title, place=source)
         return rig.with_channel_map(self.channel_map)
 

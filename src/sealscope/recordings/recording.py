@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from sealscope.calls import checked_call
 from sealscope.errors import InputError, UnreadableFile
+from sealscope.recordings.chambers import SHOWN_UNITS
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, LONG_NAMES, Array
 from sealscope.recordings.formats.columns import ChannelMap, Wanted, counted
 from sealscope.storage.opening import whole
@@ -183,9 +184,20 @@ class Recording:
 
     @property
     def unused(self) -> tuple[str, ...]:
-        """Names of the recorded pressures, positions and speeds of its file that no channel is made of."""
+        """Names of the recorded pressures, positions, speeds and flows of its file that no channel is made of."""
         names = self.provenance.get("unused", ())
         return tuple(map(str, names)) if isinstance(names, list | tuple) else ()
+
+    def unit_in_log(self, name: str) -> str | None:
+        """Return the unit that a channel has in the log it was read from; None for SI, counts or no log."""
+        units = self.provenance.get("log_units")
+        return str(units[name]) if isinstance(units, Mapping) and name in units else None
+
+    @property
+    def pressure_unit(self) -> str:
+        """Unit in which pressures are shown: that of the log, else bar."""
+        units = (self.unit_in_log(name) for name in self.channels if name.startswith("p_"))
+        return next((unit for unit in units if unit in SHOWN_UNITS), "bar")
 
     def between(self, start: float, stop: float) -> Recording:
         """Return the samples with start <= t < stop [s]."""

@@ -16,7 +16,7 @@ from sealscope.reporting.features import ChamberDetails
 from sealscope.reporting.picture import Picture, ticks
 from sealscope.reporting.series import DrawnTimes, coded, coded_times, ordered_time, time_base
 from sealscope.signals.details import QUANTITIES
-from sealscope.units import to_si
+from sealscope.units import from_si, to_si
 
 PRODUCT = QUANTITIES[-1]
 SAMPLES = "samples"
@@ -90,6 +90,15 @@ class Chart(NamedTuple):
         return any(bool(np.any((line.values < low) | (line.values > high))) for line in self.lines)
 
 
+def shown_values(recording: Recording, name: str, pressure_unit: str) -> tuple[str, Array]:
+    """Return the unit in which a channel is shown and its values (n,) in it; a temperature is in that of its log."""
+    if recording.units[name] == "K":
+        unit = recording.unit_in_log(name) or "degC"
+        return unit, from_si(recording[name], unit, "K")
+    unit, size = shown_unit(recording.units[name], pressure_unit)
+    return unit, recording[name] / size
+
+
 def shown_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tuple[str, float]:
     """Return the unit in which a channel is shown, and how many of the channel's own units it holds.
 
@@ -122,8 +131,8 @@ def channel_charts(recording: Recording, pressure_unit: str) -> list[Chart]:
         units: dict[str, list[ChartLine]] = {}
         for name, style in zip(members, "ab", strict=False):
             if name in recording and np.isfinite(recording[name]).any():
-                unit, size = shown_unit(recording.units[name], pressure_unit)
-                units.setdefault(unit, []).append(ChartLine(name, style, recording[name] / size))
+                unit, values = shown_values(recording, name, pressure_unit)
+                units.setdefault(unit, []).append(ChartLine(name, style, values))
         for i, (unit, lines) in enumerate(units.items()):
             charts.append(Chart(f"{key}-{i}", "channels", title, unit, tuple(lines), height=height))
     return charts

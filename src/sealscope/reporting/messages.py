@@ -8,15 +8,17 @@ from functools import cache
 from importlib import resources
 from math import floor, isfinite, isnan, log10
 from pathlib import PurePath
-from textwrap import shorten
 from typing import Any
 
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LEAKS, RMS_CHANGE
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.errors import printable
-from sealscope.paragraphs import WIDTH, paragraphs
+from sealscope.paragraphs import WIDTH, paragraph, paragraphs
 from sealscope.recordings.formats.columns import counted, listed
+from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.proposal import suggested_map
+from sealscope.units import from_si
 
 ABSENT = "–"
 
@@ -188,7 +190,8 @@ def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
     own = diagnosis.total_leakage
     if own is None:
         return None
-    pressure, findable = f"{number(own.pressure / 1e6, 2)} MPa", f"{number(own.findable_lpm, 2)} L/min"
+    pressure = f"{number(from_si(own.pressure, diagnosis.pressure_unit, 'Pa'), 2)} {diagnosis.pressure_unit}"
+    findable = f"{number(own.findable_lpm, 2)} L/min"
     if own.lpm is None or own.interval_lpm is None:
         known = own.pump_share is not None
         key = "share" if known else "not_measured"
@@ -309,8 +312,11 @@ def raw_counts(diagnosis: Diagnosis) -> str | None:
 
 
 def not_used(diagnosis: Diagnosis) -> str | None:
-    """Return which recorded pressures, positions and speeds no channel is made of; None where all are."""
-    return f"{listed(diagnosis.unused)}: recorded, and used for no channel" if diagnosis.unused else None
+    """Return which recorded pressures, positions, speeds and flows no channel is made of; None where all are."""
+    if not diagnosis.unused:
+        return None
+    lines = " ".join(f"--map '{suggested_map(Label.parse(name))}'" for name in diagnosis.unused[:4])
+    return f"{listed(diagnosis.unused)}: recorded, and used for no channel; if they are: {lines}"
 
 
 def short_text(diagnosis: Diagnosis, *, width: int = WIDTH) -> str:
@@ -383,17 +389,21 @@ def what_to_do(diagnosis: Diagnosis) -> str:
     return diagnosis.reason if diagnosis.verdict == "cannot tell" else next_steps(diagnosis)[0]
 
 
+#: Columns of a file's name in a table; a longer name has a line of its own.
+_FILE = 22
+
+
 def table_line(diagnosis: Diagnosis, start_s: float | None = None) -> str:
     """Return a diagnosis as a line of a table: file, date, verdict, L/min, and what to do where anything changed.
 
     `start_s`: when the recording began [s since 1970].
     """
     file = PurePath(diagnosis.file).name
-    file = file if len(file) <= 22 else f"{file[:10]}..{file[-10:]}"
     date = "" if start_s is None else datetime.fromtimestamp(start_s, UTC).date().isoformat()
-    line = f"{file:<22} {date:<10} {diagnosis.verdict:<11} {flow(diagnosis)}"
+    file = file if len(file) <= _FILE else f"{file}\n{'':{_FILE}}"
+    line = f"{file:<{_FILE}} {date:<10} {diagnosis.verdict:<11} {flow(diagnosis)}"
     named = cause(diagnosis)
     if diagnosis.verdict == "no leak" and named is None:
         return line
     before = "" if named is None or diagnosis.verdict == "leak" else f"{named}: "
-    return f"{line}\n    {shorten(before + what_to_do(diagnosis), WIDTH - 4)}"
+    return f"{line}\n{paragraph(before + what_to_do(diagnosis), '    ')}"

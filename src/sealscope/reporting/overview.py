@@ -12,7 +12,7 @@ from sealscope.recordings.channels import LONG_NAMES, Array
 from sealscope.recordings.formats.headings.preamble import remarks_of
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
-from sealscope.reporting.charts import shown_unit
+from sealscope.reporting.charts import shown_values
 
 _BARS = "▁▂▃▄▅▆▇█"
 #: Width of a curve in characters.
@@ -49,8 +49,8 @@ def overview_text(name: str, recording: Recording, findings: Sequence[Finding]) 
         paragraph(f"{name}: {kind}{len(recording)} samples at {recording.rate:g} Hz, {seconds:g} s{start}", indent=2)
     ]
     for channel, values in recording.channels.items():
-        unit, size = shown_unit(recording.units[channel], "bar")
-        known = values[np.isfinite(values)] / size
+        unit, values_shown = shown_values(recording, channel, recording.pressure_unit)
+        known = values_shown[np.isfinite(values_shown)]
         ends = f"{known.min():.4g} to {known.max():.4g} {unit}" if known.size else "no values"
         line = f"  {channel:<7}{LONG_NAMES[channel]:<24}{ends:<28}"
         lines.append(line + curve(values, max(CURVE // 2, WIDTH - len(line))))

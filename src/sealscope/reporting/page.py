@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,7 +42,7 @@ def write_page(
     truth_onset_s: float | None = None,
     truth_leak_lpm: float | None = None,
     title: str | None = None,
-    pressure_unit: str = "bar",
+    pressure_unit: str | None = None,
 ) -> Path:
     """Write the page of a diagnosis: one HTML file with charts, figures and findings, and nothing outside it.
 
@@ -64,7 +65,7 @@ def write_page(
     title : str, optional
         Title of the page; by default the name of the recording.
     pressure_unit : {"bar", "MPa", "kPa", "psi"}, optional
-        Unit in which pressures are shown.
+        Unit in which pressures are shown, by default that of the log, else bar.
 
     Returns
     -------
@@ -153,11 +154,13 @@ def render_page(
     truth_onset_s: float | None = None,
     truth_leak_lpm: float | None = None,
     title: str | None = None,
-    pressure_unit: str = "bar",
+    pressure_unit: str | None = None,
 ) -> str:
     """Return the page as a string of HTML; arguments and errors as for `write_page`."""
     from markupsafe import Markup
 
+    pressure_unit = pressure_unit or recording.pressure_unit
+    diagnosis = replace(diagnosis, pressure_unit=pressure_unit)
     known_rig, all_marks = _rig_of(diagnosis, rig), _all_marks(recording, marks, truth_onset_s)
     details = [features.chamber_details(recording, name) for name in CHAMBERS]
     chambers = [chamber for chamber, _ in details if chamber is not None]
@@ -212,10 +215,9 @@ def _changes(
 
 
 def _summary(recording: Recording, name: str, pressure_unit: str) -> dict[str, Any]:
-    values = recording[name]
+    unit, values = charts.shown_values(recording, name, pressure_unit)
     finite = values[np.isfinite(values)]
-    unit, size = charts.shown_unit(recording.units[name], pressure_unit)
-    low, mean, high = (float(f(finite)) / size if finite.size else None for f in (np.min, np.mean, np.max))
+    low, mean, high = (float(f(finite)) if finite.size else None for f in (np.min, np.mean, np.max))
     return {"name": name, "unit": unit, "low": low, "mean": mean, "high": high, "missing": values.size - finite.size}
 
 

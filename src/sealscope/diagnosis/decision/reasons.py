@@ -10,6 +10,7 @@ from sealscope.diagnosis.decision.texts import has_text, text_of
 from sealscope.diagnosis.inference.observable import Observable, Ringing
 from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, LEAK, NO_LEAK, Evidence
+from sealscope.recordings.formats.columns import listed
 
 
 def reason_of(case: Case, evidence: Evidence, alarm: Question | None, bound: float, other: OtherEvent | None) -> str:
@@ -74,7 +75,9 @@ def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) ->
     key = "ringing_hidden" if evidence.verdict == CANNOT_TELL else "ringing"
     text = text_of("bound", key, percent=percent, where=_against_text(ringing))
     if ringing.rate < fast:
-        text = f"{text_of('bound', 'slow', rate=ringing.rate, fast=fast)}; {text}"
+        # a column that nobody mapped hides more than a slow clock does
+        key, values = ("unused", {"names": listed(ringing.unused, 4)}) if ringing.unused else ("slow", {"fast": fast})
+        text = f"{text_of('bound', key, rate=ringing.rate, **values)}; {text}"
     return text if ringing.healthy else text + text_of("bound", "start")
 
 

@@ -161,13 +161,14 @@ class Ringing(NamedTuple):
     """How far the ringing of the pressures is known, where nothing measures the leak itself.
 
     `bound`: 95 % bound of the size of a change of its log RMS; `rate` [Hz]; `healthy`: recordings it was compared with,
-    0 for none; `is_dated`: whether their dates are known.
+    0 for none; `is_dated`: whether their dates are known; `unused`: recorded columns that no channel is made of.
     """
 
     bound: float
     rate: float
     healthy: int
     is_dated: bool
+    unused: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,6 +19,7 @@ from sealscope.diagnosis.inference.terms import LAG, PUMP, Equation
 from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.evidence import RAREST
 from sealscope.diagnosis.verdict.machine import measures_flow
+from sealscope.recordings.channels import flow_source
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.oil import oil_temperature
 from sealscope.recordings.recording import Array, Recording
@@ -166,7 +167,7 @@ def _size(balance: RecordedBalance) -> Size:
     """
     column, rig, meter = balance.columns[0], balance.rig, measures_flow(balance.recording.units)
     believed = priors("inference")["size"]
-    with_unit = not {("theta", "count"), ("omega", "count"), ("u", "count")} & balance.units
+    with_unit = (flow_source(balance.recording.channels), "count") not in balance.units
     pressures = not {("p_A", "count"), ("p_B", "count")} & balance.units
     states_displacement = rig.states("pump.q_b") and with_unit
     if len(balance.columns) > 1:  # behind a valve the area sizes the flow

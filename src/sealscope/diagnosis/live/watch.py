@@ -23,6 +23,7 @@ from sealscope.diagnosis.live.sequential import RECENT, StepDetector, StepEstima
 from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.evidence import NO_LEAK, Evidence
 from sealscope.errors import InputError
+from sealscope.recordings.formats.timebase import clock_text
 from sealscope.recordings.recording import Recording
 from sealscope.storage.plain_state import part_of, recall, restored, saved
 from sealscope.units import LITRE_PER_MINUTE
@@ -272,8 +273,8 @@ class Watch:
             self._forget()
             return
         reason = (
-            f"the leakage conductance rises at {rise.onset[0]:.0f} s beyond its random walk (score {rise.score:.1f}, "
-            f"threshold {2.0 * threshold:.1f})"
+            f"the leakage conductance rises at {clock_text(rise.onset[0])} beyond its random walk "
+            f"(score {rise.score:.1f}, threshold {2.0 * threshold:.1f})"
         )
         self._raise(own, rise._replace(threshold=2.0 * threshold, reason=reason), block)
 

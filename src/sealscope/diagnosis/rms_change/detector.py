@@ -71,7 +71,9 @@ class RmsChange:
         if len(blocks.log_rms) < (fewest := priors("rms_change")["blocks"]["fewest"]):
             short = f"too short to be its own baseline: {len(blocks.log_rms)} blocks, {fewest} are needed"
             return Observed(self.name, lack=f"{short}; give leak-free recordings as --baseline")
-        return observe_within(blocks.settled(), recording.rate)
+        report = observe_within(blocks.settled(), recording.rate)
+        ringing = report.ringing and report.ringing._replace(unused=recording.unused)
+        return replace(report, ringing=ringing)
 
 
 def observe_within(blocks: RmsBlocks, rate: float) -> Observed:
@@ -124,7 +126,7 @@ def observe_against(recording: Recording, baseline: Sequence[Healthy]) -> Observ
     judged = RmsChange().learn(recording)
     observables, bound = compare_lessons(judged, lessons, chambers)
     is_dated = None not in [lesson.get("start_s") for lesson in (judged, *lessons)]
-    return Observed(RmsChange.name, observables, ringing=Ringing(bound, recording.rate, len(lessons), is_dated))
+    return Observed(RmsChange.name, observables, ringing=Ringing(bound, recording.rate, len(lessons), is_dated, recording.unused))
 
 
 def compare_lessons(

@@ -89,6 +89,7 @@ class Diagnosis(Evidence):
     about: Mapping[str, str] = field(default_factory=dict)
     start: str | None = None
     unused: tuple[str, ...] = ()
+    pressure_unit: str = "bar"
 
     @classmethod
     def of(
@@ -108,6 +109,7 @@ class Diagnosis(Evidence):
             about=remarks_of(recording.provenance),
             start=None if start is None else str(start),
             unused=recording.unused,
+            pressure_unit=recording.pressure_unit,
             **stated,
         )
 

@@ -22,10 +22,27 @@ function flow(value, interval) {
   return `${litres(Math.max(value, 0))}${range} L/min`;
 }
 
+// the local time as ISO 8601 writes it, whatever the browser's language
+function isoTime(t) {
+  const local = new Date(t * 1000 - new Date(t * 1000).getTimezoneOffset() * 60000);
+  return local.toISOString().slice(0, 19).replace("T", " ");
+}
+
+// uPlot's templates of dates, the American ones as ISO 8601 writes them
+function isoTemplate(template) {
+  const iso = template
+    .replace("{M}/{D}/{YY}", "{YYYY}-{MM}-{DD}")
+    .replace("{M}/{D}", "{MM}-{DD}")
+    .replace("{h}{aa}", "{HH}:00")
+    .replace("{h}", "{HH}")
+    .replace("{aa}", "");
+  return uPlot.fmtDate(iso);
+}
+
 // clocks beyond 1973 are dates, others seconds since the beginning
 function clock(t) {
   if (t === null || t === undefined) return "";
-  if (t > 1e8) return new Date(t * 1000).toLocaleString();
+  if (t > 1e8) return isoTime(t);
   const whole = Math.floor(t);
   const parts = [Math.floor(whole / 3600), Math.floor(whole / 60) % 60, whole % 60];
   return parts.map((part) => String(part).padStart(2, "0")).join(":");
@@ -168,6 +185,7 @@ function draw(course, events) {
       width: Math.max(280, place.clientWidth),
       height: 240,
       scales: { x: { time: dated } },
+      fmtDate: isoTemplate,
       bands: [{ series: [2, 1], fill: colour("--band") }],
       axes: [
         { stroke: colour("--quiet"), grid, space: 80, ...(dated ? {} : { values: (plot, at) => at.map(clock) }) },

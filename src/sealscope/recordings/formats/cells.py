@@ -37,6 +37,9 @@ _QUANTITY = re.compile(
     r"(?P<number>[+\-\u2212]?\d(?:[\d.,'\u00a0\u202f]{0,40}\d)?(?:[eE][+-]?\d{1,3})?)[ \u00a0\u202f]{0,2}"
     r"(?P<unit>[^\W\d_][^\s;,|\d\"]{0,15}[23\u00b2\u00b3]?|%|\u00b0C?)"
 )
+#: A number with the prefix of a power of ten behind it, `170.3m` or `-3k`, at the end of a cell.
+_PREFIXED = re.compile(r"(?<=\d)(?P<prefix>[pnu\u00b5\u03bcmkKMG])(?=[ ]{0,8}\"?[ ]{0,8}(?:[;,|\t]|$))")
+_POWERS = {"p": -12, "n": -9, "u": -6, "\u00b5": -6, "\u03bc": -6, "m": -3, "k": 3, "K": 3, "M": 6, "G": 9}
 #: Most spellings of units that the beginning of a file is tried for.
 _MOST_UNITS = 64
 
@@ -88,6 +91,25 @@ def _number(cell: str, pointed: str, decimal: str) -> float:
     if not is_number(text, decimal):
         return np.nan
     return float(text.replace(",", ".").lower().replace("d", "e"))  # a Fortran exponent, 1.5D+03
+
+
+def has_prefixes(rows: Sequence[Sequence[str]]) -> bool:
+    """Return whether numbers end in prefixes of powers of ten, and not in a unit: a column has several, or a `k`."""
+    found: dict[int, set[str]] = {}
+    for row in rows:
+        for column, cell in enumerate(row):
+            match = _PREFIXED.search(cell)
+            bare = match is None and is_number(cell, ".") and float(cell.replace(",", "")) != 0.0
+            if match is not None and is_number(cell[: match.start()], "."):
+                found.setdefault(column, set()).add(match["prefix"])
+            elif bare:
+                found.setdefault(column, set()).add("")
+    return any(len(prefixes) > 1 or prefixes & {"k", "u", "\u00b5", "\u03bc"} for prefixes in found.values())
+
+
+def with_exponents(line: str) -> str:
+    """Return a line of a log with exponents for the prefixes behind its numbers: `170.3e-3` for `170.3m`."""
+    return _PREFIXED.sub(lambda match: f"e{_POWERS[match['prefix']]}", line)
 
 
 def _unit_behind(cell: str) -> str | None:

@@ -17,6 +17,7 @@ from sealscope.recordings.formats.headings.labels import Label, square_brackets
 from sealscope.recordings.formats.headings.proposal import (
     ends_in,
     is_recorded,
+    is_scaled,
     is_time,
     map_options,
     proposed_map,
@@ -59,7 +60,7 @@ class ColumnMap:
     `parts`: part of the time -> its column, where several columns hold the time; `date`: the column of the date, where
     the time column may hold the time of a day, or the time column itself where a date is taken for it; `rate`: of the
     samples [Hz], as the caller or the file says, or None; `names`: channel -> what the file calls it, where this is
-    another name; `unused`: recorded pressures, positions and speeds that no channel is made of; `notes`: lines for the
+    another name; `unused`: recorded pressures, positions, speeds and flows without a channel; `notes`: lines for the
     history.
     """
 
@@ -135,9 +136,9 @@ def counted(count: int, noun: str) -> str:
 
 
 def listed(names: Iterable[str], most: int = 12) -> str:
-    """Join names for a message, at most so many of them, each cut to 40 characters."""
+    """Join names for a message, at most so many of them; one of over 80 characters ends in three points."""
     names = list(names)
-    shown = ", ".join(name[:40] for name in names[:most])
+    shown = ", ".join(name if len(name) <= 80 else f"{name[:77]}..." for name in names[:most])
     return f"{shown} and {len(names) - most} more" if len(names) > most else shown or "none"
 
 
@@ -216,6 +217,8 @@ def _checked_unit(channel: str, unit: str | None, what: str) -> tuple[str, str |
         return COUNTS, None
     if channel == "omega" and unit in WORDS["turns"]:
         return "rpm", None
+    if channel == "u" and is_scaled(unit):
+        return COUNTS, f"{what} is a command in {unit}: what it is in V is not known, its changes count"
     to_si(0.0, unit, CHANNEL_UNITS[channel], name=channel)
     return unit, None
 

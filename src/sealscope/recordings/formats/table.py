@@ -30,7 +30,7 @@ from sealscope.recordings.formats.headings.preamble import exported_from
 from sealscope.recordings.formats.headings.proposal import is_time, unit_of_time
 from sealscope.recordings.formats.headings.split_time import joined_time
 from sealscope.recordings.formats.headings.words import WORDS
-from sealscope.recordings.formats.timebase import LogTime, falling, nominal_rate, stamps, time_base
+from sealscope.recordings.formats.timebase import LogTime, falling, iso_moment, nominal_rate, stamps, time_base
 from sealscope.units import to_si
 
 #: Most values that one file may hold in the columns used: 2 GiB of doubles, 16 hours of 9 channels at 500 Hz.
@@ -182,9 +182,10 @@ def converted(
         if own is None and falling(time):
             time, columns = time[::-1], {column: cells[::-1] for column, cells in columns.items()}
             notes.append("rows begin with the last sample: taken in the order of time")
-    channels, units = {}, {}
+    channels, units, in_log = {}, {}, {}
     for name, made in choice.channels.items():
         unit = made.unit or COUNTS
+        in_log[name] = "" if unit in (COUNTS, CHANNEL_UNITS[name]) else unit
         units[name] = COUNTS if unit == COUNTS else CHANNEL_UNITS[name]
         channels[name] = to_si(made.values(columns), unit, units[name], name=name)
         if not any(channels[name] is cells for cells in columns.values()):
@@ -198,13 +199,13 @@ def converted(
         t, rate, start, more = time_base(time, label.unit, label.whole, choice.rate, log)
         notes += more
         if not start and (begin := exported_from(about)) is not None:
-            start = {"start": str(begin)}
+            start = {"start": iso_moment(begin)}
         if own is not None and abs(rate / own["rate"] - 1.0) <= _SAME_RATE:
             rate = own["rate"]
     if own is not None:
         return RecordingFields(t, channels, units, rate, own["provenance"], (*own["history"], *notes), kind)
     said = {"file": wanted.file, "format": kind, **start, "about": dict(about), "columns": choice.names}
-    said |= {"unused": list(choice.unused)}
+    said |= {"unused": list(choice.unused), "log_units": {name: unit for name, unit in in_log.items() if unit}}
     provenance = {key: value for key, value in said.items() if value or key in start}
     return RecordingFields(t, channels, units, rate, provenance, tuple(notes), kind)
 

@@ -34,6 +34,7 @@ from sealscope.recordings.formats.cells import (
     is_value,
     numbers,
     plain_cells,
+    with_exponents,
 )
 from sealscope.recordings.formats.columns import Wanted, choose_columns, counted
 from sealscope.recordings.formats.headings.labels import Label
@@ -221,7 +222,7 @@ class _Log:
         self.total = self.repeated = self.remarks = 0
         self.remark = ""
         plain = layout.encoding in ("utf-8", "utf-8-sig", "cp1252") and layout.delimiter != " "
-        numeric = not layout.cell_units and "texts" not in kinds.values()
+        numeric = not layout.cell_units and not layout.prefixed and "texts" not in kinds.values()
         self.fast = plain and numeric and path.stat().st_size >= _LARGE and find_spec("pyarrow") is not None
         self.stamped: bool | None = None
         self.day_first: bool | None = None
@@ -254,6 +255,8 @@ class _Log:
         """Return the cells of the samples in a block from line `number` on, and the numbers of their lines."""
         lines = _lines(block, self.layout)
         kept = self._samples(lines, max(0, self.layout.first_row + 1 - number))
+        if self.layout.prefixed:
+            lines = [with_exponents(line) for line in lines]
         if not kept:
             return [], []
         where = [number + i for i in kept]

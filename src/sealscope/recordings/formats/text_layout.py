@@ -11,9 +11,18 @@ from itertools import accumulate, chain, islice, repeat
 
 from sealscope.errors import InputError
 from sealscope.recordings.channels import CHANNEL_UNITS
-from sealscope.recordings.formats.cells import is_grouped, is_missing, is_value, units_behind, with_units, without_units
+from sealscope.recordings.formats.cells import (
+    has_prefixes,
+    is_grouped,
+    is_missing,
+    is_value,
+    units_behind,
+    with_exponents,
+    with_units,
+    without_units,
+)
 from sealscope.recordings.formats.columns import counted
-from sealscope.recordings.formats.headings.described import described, scope_heading
+from sealscope.recordings.formats.headings.described import described, scope_heading, x_y_pairs
 from sealscope.recordings.formats.headings.labels import Label, is_unit
 from sealscope.recordings.formats.headings.preamble import of_lines, stated_rate
 from sealscope.recordings.formats.headings.proposal import knows, measures
@@ -41,7 +50,8 @@ class Layout:
     """`delimiter`: a blank is any white space; `first_row`: index of the first data line; `own`: our JSON line.
 
     `above`: the lines above the first row, which some loggers repeat further down; `rate`: what they say of it [Hz];
-    `cell_units`: column -> the unit that stands behind each of its numbers.
+    `cell_units`: column -> the unit that stands behind each of its numbers; `prefixed`: numbers end in prefixes of
+    powers of ten.
     """
 
     encoding: str
@@ -55,6 +65,7 @@ class Layout:
     above: frozenset[str] = frozenset()
     rate: float | None = None
     cell_units: Mapping[int, str] = field(default_factory=dict)
+    prefixed: bool = False
 
     @property
     def kind(self) -> str:
@@ -216,7 +227,8 @@ def _stacked(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int]:
         groups = accumulate(chain(over[0], repeat("")), lambda before, cell: cell.strip() or before, initial="")
         texts = [f"{group} {text}".strip() for text, group in zip(texts, islice(groups, 1, None), strict=False)]
         taken += 1
-    return [Label.parse(name, unit) for name, unit in zip(texts, chain(units, repeat(None)), strict=False)], taken
+    labels = [Label.parse(name, unit) for name, unit in zip(texts, chain(units, repeat(None)), strict=False)]
+    return x_y_pairs(labels), taken
 
 
 def _numbered_units(row: Sequence[str]) -> list[str | None] | None:
@@ -249,7 +261,11 @@ def layout_of(head: bytes, encoding: str, whole: bool, place: str) -> Layout:
     if not content:
         raise InputError("a recording must have samples, got an empty file")
     body = content[max(1, min(len(content) // 2, len(content) - 20)) :][-_SAMPLE_ROWS:] or content
-    written, cell_units = lines, _units_in_cells(body)
+    written = lines
+    if prefixed := _has_prefixes(body):
+        body = [with_exponents(line) for line in body]
+        lines = [_exponents_of_samples(line) for line in lines]
+    cell_units = {} if prefixed else _units_in_cells(body)
     if cell_units:
         lines, body = ([without_units(line, cell_units.values()) for line in part] for part in (lines, body))
     delimiter, decimal, width = _look(body)
@@ -274,6 +290,7 @@ def layout_of(head: bytes, encoding: str, whole: bool, place: str) -> Layout:
     unused = len(plain) - len(of_lines(plain, delimiter))
     if unused > 0:
         notes.append(f"{counted(unused, 'line')} before the header not used")
+    notes += ["numbers such as 170.3m read with their prefix, as 0.1703"] if prefixed else []
     return Layout(
         encoding,
         delimiter,
@@ -285,6 +302,7 @@ def layout_of(head: bytes, encoding: str, whole: bool, place: str) -> Layout:
         above=frozenset(line.strip() for line in above),
         rate=stated_rate(of_lines(above, delimiter)),
         cell_units=cell_units,
+        prefixed=prefixed,
     )
 
 
@@ -313,6 +331,20 @@ def _first_row(lines: Sequence[str], body: Sequence[str], delimiter: str, decima
         if good and 2 * (good + empty) > len(numeric):
             return index
     return None
+
+
+def _has_prefixes(body: Sequence[str]) -> bool:
+    """Return whether the numbers of a log end in prefixes of powers of ten, by any delimiter."""
+    return any(map(_QUANTITY.search, body)) and any(
+        has_prefixes([cells_of(line, sign) for line in body]) for sign in "\t;|,"
+    )
+
+
+def _exponents_of_samples(line: str) -> str:
+    """Return a line with exponents for the prefixes behind its numbers, where most of its cells are numbers."""
+    changed = with_exponents(line)
+    cells = re.split(r"[;,|\t]", changed)
+    return changed if 2 * sum(is_value(cell, ".") for cell in cells) > len(cells) else line
 
 
 def _units_in_cells(body: Sequence[str]) -> dict[int, str]:

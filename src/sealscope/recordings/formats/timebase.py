@@ -187,6 +187,19 @@ def counts_from_1970(clock: float) -> bool:
     return _EARLIEST_EPOCH < clock < _LATEST_EPOCH
 
 
+def iso_moment(moment: np.datetime64) -> str:
+    """Format a moment as an ISO stamp with as many decimals as it has: `2024-05-31T12:00:00.25`."""
+    text = str(moment)
+    return text.rstrip("0").rstrip(".") if "." in text else text
+
+
+def clock_text(clock: float) -> str:
+    """Format a clock [s] as a date and time of the day in UTC where it counts from 1970, else as seconds."""
+    if not counts_from_1970(clock):
+        return f"{clock:.0f} s"
+    return str(np.datetime64(round(clock), "s")).replace("T", " ") + " UTC"
+
+
 def seconds_of(stamp: str) -> float | None:
     """Return an ISO stamp as seconds since 1970, to a millisecond; None where it is none."""
     try:
@@ -271,7 +284,7 @@ def _from_stamps(values: NDArray[np.datetime64], name: str, log: LogTime) -> _Se
         if (wrapped := _unwrapped(t, step, once=not undated)) is not None:
             t = wrapped
             notes.append(f"column {name} {what}")
-    return t[1:] + log.end if goes_on else t, {} if undated else {"start": str(start)}, notes
+    return t[1:] + log.end if goes_on else t, {} if undated else {"start": iso_moment(start)}, notes
 
 
 def _unwrapped(t: Array, step: float, once: bool) -> Array | None:
@@ -300,7 +313,7 @@ def _from_numbers(values: Array, unit: str | None, name: str, log: LogTime) -> _
         seconds = to_si(values - first, word, "s", name="time")
         try:
             elapsed = np.timedelta64(round(to_si(first, word, "s") * 1e9), "ns")
-            return seconds, {"start": str(stamps([since["start"]])[0] + elapsed)}, []
+            return seconds, {"start": iso_moment(stamps([since["start"]])[0] + elapsed)}, []
         except (ValueError, OverflowError):
             return seconds, {"start": f"{first:g} {unit}"}, []
     seconds = to_si(values, unit, "s", name="time")
@@ -317,7 +330,7 @@ def _without_unit(values: Array, finite: Array, name: str, log: LogTime) -> _Sec
         origin, note = days[0], f"column {name} read as {days[1]}"
         if origin is None:  # it has no start, and goes on
             return (values - (first if log.last is None else log.last)) * _DAY + log.end, {}, [note]
-        begin = {"start": str(origin + np.timedelta64(round(first * _DAY * 1e6), "us"))}
+        begin = {"start": iso_moment(origin + np.timedelta64(round(first * _DAY * 1e6), "us"))}
         return (values - first) * _DAY, begin, [note]
     counted = begins and finite.size == values.size and np.all(np.diff(finite) == 1)
     if counted and abs(first) < _EARLIEST_EPOCH:

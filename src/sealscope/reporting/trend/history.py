@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -142,8 +143,10 @@ def _overlay(ordered: Sequence[Judged]) -> tuple[list[charts.Chart], charts.Draw
     for name in own.channels:
         if name not in other or own.units[name] != other.units[name]:
             continue
-        unit, size = charts.shown_unit(own.units[name], "bar")
-        over = np.interp(own.t, t, other[name], left=np.nan, right=np.nan)
-        lines = (charts.ChartLine(files[0], "a", own[name] / size), charts.ChartLine(files[1], "b", over / size))
+        pressure_unit = own.pressure_unit
+        unit, values = charts.shown_values(own, name, pressure_unit)
+        over = replace(own, channels={name: np.interp(own.t, t, other[name], left=np.nan, right=np.nan)})
+        values_over = charts.shown_values(over, name, pressure_unit)[1]
+        lines = (charts.ChartLine(files[0], "a", values), charts.ChartLine(files[1], "b", values_over))
         shown.append(charts.Chart(f"over-{name}", "channels", name, unit, lines))
     return (shown, charts.draw(own, [], shown, newest.diagnosis, []), files) if shown else ([], None, [])

@@ -14,7 +14,7 @@ from sealscope.diagnosis.trend.trend import Trend
 from sealscope.paragraphs import paragraph, paragraphs
 from sealscope.recordings.formats.columns import counted
 from sealscope.reporting.messages import machine_text, number, say
-from sealscope.units import DAY, DAYS_PER_YEAR
+from sealscope.units import BAR, DAY, DAYS_PER_YEAR
 
 
 def moment(trend: Trend, day: float) -> str:
@@ -67,7 +67,7 @@ def figures(trend: Trend) -> dict[str, str]:
     wear = trend.wear
     if wear is None:
         return dict.fromkeys(("now", "healthy", "since", "growth", "limit"), "")
-    at = "" if trend.pressure is None else f" at {number(trend.pressure / 1e6, 2)} MPa"
+    at = "" if trend.pressure is None else f" at {number(trend.pressure / BAR, 2)} bar"
     of_first = " of the first; no rig was stated" if trend.unit == "%" and trend.basis != "ringing" else ""
     healthy = f"{number(wear.healthy.low, 2)} to {number(wear.healthy.high, 2)} {trend.unit}{of_first}"
     since, growth = "", "not stated: the recordings are too few, or span less than a day"

@@ -1,4 +1,4 @@
-"""Headings with names or properties apart from the columns: a table of channels, a row of labels, TwinCAT Scope."""
+"""Headings whose names stand apart or belong together: tables of channels, rows of labels, TwinCAT Scope, X and Y."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ from dataclasses import replace
 
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.words import WORDS
+from sealscope.units import same_dimension
 
 _ROW = WORDS["row"]
+#: Names of columns of pairs: `X`, `p_A X` or `p_A.x`, with `Y` for x beside it.
+_PAIRED = {sign: re.compile(rf"(?P<name>.*?)[\s_.:-]{{0,3}}\b{sign}\d{{0,3}}", re.IGNORECASE) for sign in "xy"}
 _LONGEST = 80
 #: Rows by which a TwinCAT Scope export is known; `V (Voltage)`, `(None)`: a unit and what it measures.
 _SCOPE, _MEASURED = ("SampleTime[ms]", "Starttime of export"), re.compile(r"([^()]{0,20})\([^()]{0,40}\)")
@@ -73,3 +76,29 @@ def scope_heading(lines: Sequence[str], delimiter: str) -> tuple[list[Label], in
         unit = (measured[1] if measured else given).strip()
         labels.append(Label("t [ms]", "t", "ms") if name == "Name" else Label.parse(name, unit or None))
     return labels, sum(1 for line in lines[begin:] if line.strip())
+
+
+def x_y_pairs(labels: Sequence[Label]) -> list[Label]:
+    """Return the labels of columns in pairs of times X and values Y as times and channels; all others as they are.
+
+    `X [s], p_A [bar], X [s], p_B [bar]` and `p_A X, p_A Y [bar], p_B X, p_B Y [bar]`; an X without a unit is in
+    seconds.
+    """
+    times, values = labels[::2], labels[1::2]
+    timed = all(label.unit is None or same_dimension(label.unit, "s") for label in times)
+    if len(labels) < 4 or len(labels) % 2 or not timed:
+        return list(labels)
+    heads = [_PAIRED["x"].fullmatch(label.name.replace("_", " ")) for label in times]
+    tails = [_PAIRED["y"].fullmatch(label.name.replace("_", " ")) for label in values]
+    bare = all(head is not None and not head["name"] for head in heads)
+    alike = all(
+        head is not None and tail is not None and head["name"].casefold() == tail["name"].casefold()
+        for head, tail in zip(heads, tails, strict=True)
+    )
+    if not (bare or alike):
+        return list(labels)
+    result = []
+    for time, value, tail in zip(times, values, tails, strict=True):
+        name = value.name if bare or tail is None else value.name[: len(tail["name"])]
+        result += [replace(time, name="t", unit=time.unit or "s"), replace(value, name=name)]
+    return result

@@ -17,6 +17,7 @@ _MOST, _LONGEST_NAME, _LONGEST_TEXT = 40, 60, 200
 _PAIR = re.compile(r"([^:=]{1,60}?)[ \t]{0,8}[:=](?!\\|//)[ \t]{0,8}(.{1,400})")
 #: What loggers call the sampling rate, and the time from one sample to the next.
 _STATED = [re.compile(WORDS["stated"][kind], re.IGNORECASE) for kind in ("rate", "interval")]
+_ENDING = re.compile(r"(?P<name>.{1,60}?)[_ ](?P<unit>[kM]?Hz|[mun\u00b5\u03bc]?s)")
 #: TwinCAT's start of an export: 100 ns since 1601.
 _FILETIME = re.compile(r"(1[23]\d{16})\b")
 _FROM_1601_TO_1970 = 11_644_473_600 * 10**9  # [ns]
@@ -32,6 +33,8 @@ def stated_rate(about: Mapping[str, str]) -> float | None:
     """Return the sampling rate [Hz] that a file's entries state, as a rate or as an interval; None without."""
     for name, text in about.items():
         label = Label.parse(name)
+        if label.unit is None and (ending := _ENDING.fullmatch(label.name)):  # SamplePeriod_ms
+            label = Label(name, ending["name"], ending["unit"])
         matches = [pattern.fullmatch(label.name) for pattern in _STATED]
         cells = re.split(r"[;,\t]\s*", text.strip())  # one a channel, all the same
         quantity = _QUANTITY.fullmatch(cells[0] if len(set(cells)) == 1 else text.strip())

@@ -22,8 +22,10 @@ _UNSPACED = frozenset(
 #: What a column measures -> the unit, and the channel, that it has; a pressure's channel follows from its side.
 _UNITS = {"oil": "K", "position": "m", "command": "V", "speed": "rad/s", "angle": "rad", "leak": "m^3/s", "time": "s"}
 _CHANNELS = {
-    "oil": "T_oil", "position": "x", "command": "u", "speed": "omega", "angle": "theta", "leak": "q_leak", "time": "t"
+    "oil": "T_oil", "position": "x", "command": "u", "spool": "u", "speed": "omega", "angle": "theta", "leak": "q_leak",
+    "time": "t"
 }  # fmt: skip
+_SHARES = frozenset(("%", "percent", "pct", "Prozent", "prozent"))
 _PRESSURES = {"A": "p_A", "B": "p_B", "1": "p_1", "2": "p_2", "pump 1": "p_1", "pump 2": "p_2"}
 _TOKEN = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_a-zA-Z]+")
 #: The last word of `MainPaBar`; in `MainPa` it is the pressure A, and no pascal.
@@ -40,6 +42,8 @@ class _Guess(NamedTuple):
 
     @property
     def channel(self) -> str | None:
+        if self.kind == "flow":
+            return "q_pump" if self.side == "A" else None
         return _PRESSURES.get(self.side) if self.kind == "pressure" else _CHANNELS[self.kind]
 
 
@@ -60,9 +64,15 @@ def proposed_map(labels: Sequence[Label]) -> dict[str, str]:
         for channel, pumped in (("p_A", "p_1"), ("p_B", "p_2")):  # pressures 1 and 2 alone are those of the chambers
             if pumped in candidates:
                 candidates[channel] = candidates.pop(pumped)
+    driven = ({*candidates} | own) & {"omega", "theta"}
+    if ("u" in candidates or "u" in own) and not driven and not {"p_1", "p_2"} & ({*candidates} | own):
+        for channel, kind in (("p_1", "before"), ("p_2", "behind")):  # of a valve, whose command is recorded
+            candidates[channel] = [(label, guess) for label in labels if (guess := _guess_at_valve(label, kind))]
     result = {}
     for channel in (*CHANNEL_UNITS, "t"):
         columns = candidates.get(channel, [])
+        if channel == "u" and any(guess.kind == "command" for _, guess in columns):  # the spool follows it
+            columns = [column for column in columns if column[1].kind == "command"]
         if len(columns) > 1:  # what is made of another column gives way to it
             columns = [column for column in columns if not _words_of(column[0].name) & _KIND["made"]]
         if len(columns) == 1 and channel.casefold() not in own:
@@ -111,7 +121,8 @@ def split_unit(name: str) -> tuple[str, str | None]:
         kind = {"s": "time", "m": "position"}.get(unit)
         if kind is not None and not _words_of(before) & _MEASURED[kind]:  # x_s may as well be a set point
             continue
-        if is_familiar(unit) and any(same_dimension(unit, known) for known in (*CHANNEL_UNITS.values(), "s", "m/s")):
+        known = (*CHANNEL_UNITS.values(), "s", "m/s")
+        if is_familiar(unit) and (is_scaled(unit) or any(same_dimension(unit, own) for own in known)):
             return before, unit
     return name, None
 
@@ -133,7 +144,8 @@ def is_recorded(label: Label) -> bool:
     if words & (_KIND["wanted"] | _KIND["made"]):
         return False
     if unit is not None:
-        return unit in WORDS["turns"] or any(same_dimension(unit, own) for own in ("Pa", "m", "rad/s", "m/s"))
+        recorded = ("Pa", "m", "rad/s", "m/s", "m^3/s")
+        return unit in WORDS["turns"] or any(same_dimension(unit, own) for own in recorded)
     kinds = (*(_MEASURED[kind] for kind in ("pressure", "position", "speed")), _KIND["supply"], _KIND["velocity"])
     return len(name) > 1 and any(words & known for known in kinds)
 
@@ -174,6 +186,11 @@ def _guess(label: Label, head: str = "") -> _Guess | None:
         return None if words & (_KIND["other"] | _KIND["wanted"]) else _Guess("pressure", side, unit)
     if unit is not None and words & _KIND["oil"] and same_dimension(unit, "K"):
         return _Guess("oil", "", unit)
+    if words & _MEASURED["spool"]:
+        return _Guess("spool", "", unit) if unit is None or _commands(unit) else None
+    if unit is not None and same_dimension(unit, "m^3/s"):
+        kind = "leak" if words & _MEASURED["leak"] else "flow"
+        return _Guess(kind, side, unit) if words & _MEASURED[kind] else None
     measured = any(words & _MEASURED[kind] for kind in ("pressure", "position", "speed", "angle"))
     if words & _KIND["other"] or (words & _KIND["wanted"] and measured):
         return None
@@ -182,10 +199,42 @@ def _guess(label: Label, head: str = "") -> _Guess | None:
         return _Guess("speed", side, "rpm" if unit in WORDS["turns"] else unit)
     if unit is not None and "s" in words and same_dimension(unit, "m"):  # the path in German books
         return _Guess("position", side, unit)
+    if unit is not None and words & _MEASURED["command"] and _commands(unit):
+        return _Guess("command", side, unit)
     for kind, known in _MEASURED.items():
-        if words & known and (unit is None or (kind in _UNITS and same_dimension(unit, _UNITS[kind]))):
+        fits = unit is None or (kind in _UNITS and same_dimension(unit, _UNITS[kind]))
+        if words & known and fits and kind != "flow":
             return _Guess(kind, side, unit)
     return None
+
+
+def _commands(unit: str) -> bool:
+    """Return whether a command may have a unit."""
+    return is_scaled(unit) or same_dimension(unit, "V")
+
+
+def is_scaled(unit: str) -> bool:
+    """Return whether a unit is a share of full scale, or the current of a valve or of a controller's output."""
+    return unit in _SHARES or same_dimension(unit, "A")
+
+
+def _guess_at_valve(label: Label, kind: str) -> _Guess | None:
+    """Return what a name tells of a pressure `before` or `behind` a valve; None for any other column."""
+    name, ending = split_unit(label.name)
+    unit = ending if label.unit is None else label.unit
+    words = _words_of(name if label.unit is None else label.name)
+    if unit is None or not same_dimension(unit, "Pa") or not words & _KIND[kind] or words & _KIND["wanted"]:
+        return None
+    return _Guess("pressure", "", unit)
+
+
+def suggested_map(label: Label) -> str:
+    """Return the channel that a column may be, as a map writes it: `q_pump=Flow [l/min]`."""
+    guess = _guess(label)
+    channel = "q_pump" if guess is not None and guess.kind == "flow" else None if guess is None else guess.channel
+    for valved, kind in (("p_1", "before"), ("p_2", "behind")):
+        channel = valved if channel is None and _guess_at_valve(label, kind) else channel
+    return f"{channel or 'CHANNEL'}={label.whole}"
 
 
 def _side(words: set[str]) -> str:
