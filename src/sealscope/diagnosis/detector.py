@@ -69,6 +69,8 @@ def checked(evidence: Any) -> Evidence:
         raise ValueError("a reason must be one line")
     if evidence.verdict != "cannot tell" and (evidence.score is None or evidence.threshold is None):
         raise ValueError("a verdict must come with its score and threshold")
+    if any(figure is not None and np.isnan(figure) for figure in (evidence.score, evidence.threshold)):
+        raise ArithmeticError("a score and a threshold must be numbers, got none")
     return evidence
 
 

@@ -57,6 +57,7 @@ class Examination:
     share: float = 1.0
     _detectors: dict[str, Detector] = field(default_factory=dict)
     _evidence: dict[tuple[str, frozenset[str]], Evidence] = field(default_factory=dict)
+    _failures: dict[str, str] = field(default_factory=dict)
 
     def through(self, channels: Iterable[str]) -> Examination:
         """Return the same recording with these channels alone."""
@@ -89,6 +90,7 @@ class Examination:
             return self._evidence[key]
         except Exception as error:
             why = failure(name, getattr(factory, "distribution", None), error)
+            self._failures[name] = why
             return Evidence("cannot tell", why, detector=name, usable=False)
 
     def _run(self, name: str, detector: Detector) -> Evidence:
@@ -108,13 +110,17 @@ class Examination:
         return replace(evidence, detector=name, share=self.share * evidence.share)
 
     def fused(self) -> Evidence:
-        """Return one verdict from all registered detectors but those that only stand in for one which judges."""
+        """Return one verdict from all registered detectors but those that only stand in for one which judges.
+
+        Where a main detector fails, nobody else may say that there is no leak.
+        """
         evidences: list[Evidence] = []
         for name in sorted(detectors(), key=rank):
             if name not in ORDER or deciding(evidences) is None:
                 evidences.append(self.evidence(name))
         other = None if self.distrust else other_step(self.recording, RAREST)
-        return combined(evidences, other, self.refusal)
+        failed = next((self._failures[name] for name in ORDER if name in self._failures), None)
+        return combined(evidences, other, self.refusal or failed)
 
 
 def _unusable(detector: Detector, healthy: Healthy) -> str | None:

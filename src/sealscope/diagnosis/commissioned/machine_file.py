@@ -27,9 +27,11 @@ from sealscope.calls import checked_call
 from sealscope.diagnosis.commissioned.lessons_file import (
     SUFFIX,
     format_lesson,
+    list_of,
     make_table,
     read_lessons,
     read_lines,
+    table_of,
     write_lines,
 )
 from sealscope.diagnosis.commissioned.machine import CommissionedMachine, JudgedAlarm, Judgement, Origin
@@ -58,9 +60,11 @@ _HEAD = """\
 
 def _moment(text: Any) -> float:
     try:
-        return datetime.fromisoformat(text).timestamp()
-    except (TypeError, OverflowError):
+        moment = datetime.fromisoformat(text).timestamp()
+        datetime.fromtimestamp(moment, UTC)
+    except (TypeError, ValueError, OverflowError, OSError):
         raise ValueError("must be a time as ISO 8601 writes it") from None
+    return moment
 
 
 #: A file's name, which leads to no other folder.
@@ -89,11 +93,11 @@ _FILE = make_table(
         name=str,
         rate=(float, None),
         limit=(str, None),
-        left_out=(list[str], None),
+        left_out=(list_of(str), None),
     ),
-    map=(dict[str, str], None),
-    healthy=Annotated[list[_HEALTHY], Field(min_length=1)],  # type: ignore[valid-type]
-    alarms=(list[_ALARM], None),  # type: ignore[valid-type]
+    map=(table_of(str), None),
+    healthy=list_of(_HEALTHY, fewest=1),
+    alarms=(list_of(_ALARM), None),
 )
 
 

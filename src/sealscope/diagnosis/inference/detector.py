@@ -161,7 +161,7 @@ def _sums_of(lesson: Lesson) -> RecordingSums:
 def _of_another_machine(own: RecordedBalance, healthy: Sequence[RecordingSums], probability: float) -> str:
     """Return in words that motion takes another flow than in the healthy recordings, empty where it does not."""
     change = motion_change(own.recording_sums.sums[0], [of.sums[0] for of in healthy], own.columns[0])
-    if abs(change.score) <= change.threshold(0.5 * probability):
+    if not abs(change.score) > change.threshold(0.5 * probability):
         return ""
     return (
         f"; motion takes {np.exp(change.value):.3g} times the flow that it does in the healthy recordings: another "
