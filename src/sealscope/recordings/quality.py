@@ -222,8 +222,8 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
 
 def flag_impossible(values: Array, unit: str) -> NDArray[np.bool_]:
     """Flag the samples (n,), in an SI unit, of a size that no sensor reads; missing and infinite ones are not."""
-    largest = _POSSIBLE.get(unit, _POSSIBLE["any"])
-    return np.isfinite(values) & (np.abs(values) > largest)
+    largest: float = _POSSIBLE.get(unit, _POSSIBLE["any"])
+    return np.asarray(np.isfinite(values) & (np.abs(values) > largest))
 
 
 def _every(present: NDArray[np.intp]) -> int:
