@@ -23,7 +23,7 @@ _MOST_DOTS = 30
 _KEYS = re.compile(r"[\w.\"' \t\r-]+")
 #: Bytes that tomllib and the checks take for a table, for an element of an array of tables, for a key's value, and for
 #: a value in an array; how many may be taken in all, and how many times those of the text.
-_TABLE, _ROW, _ENTRY, _VALUE, _MEMORY, _SHARE = 900, 200, 130, 70, 2_000_000, 6
+_TABLE, _ROW, _ENTRY, _VALUE, _MEMORY, _SHARE = 900, 60, 110, 70, 2_000_000, 6
 _HEADER, _INNER_KEY = re.compile(r"\s*\[[^\[\],]*\]\s*(?:#.*)?\n?"), re.compile(r"[{,]([^{},=]*)=")
 
 
@@ -41,6 +41,11 @@ def read_toml(path: Path, what: str, place: str, largest: int = LARGEST) -> dict
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{what} must be readable, got: {reason} ({place})") from None
+    return parse_toml(data, what, place, largest)
+
+
+def parse_toml(data: bytes, what: str, place: str, largest: int = LARGEST) -> dict[str, Any]:
+    """Return the tables of the bytes of a TOML file; errors and limits as `read_toml` has them."""
     if len(data) > largest:
         raise InputError(f"{what} must be at most {largest} bytes, got more ({place})")
     try:

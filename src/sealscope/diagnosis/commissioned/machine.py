@@ -67,10 +67,10 @@ class JudgedAlarm(NamedTuple):
 
 
 class Origin(NamedTuple):
-    """The file that a machine was loaded from, and its parts then, by which changes of others are known."""
+    """The file that a machine was loaded from, and hashes of its parts, by which changes of others are known."""
 
     path: Path
-    parts: frozenset[str]
+    parts: frozenset[bytes]
 
 
 def _is_taken_back(word: JudgedAlarm, later: Iterable[JudgedAlarm]) -> bool:
