@@ -113,3 +113,35 @@ def test_a_machine_s_file_states_rig_and_limit(call, days: Path, tmp_path: Path)
         "--set must not stand beside --machine"
         in call("plan", "--machine", file, "--set", "pump.G_pump=1e-13").refused()
     )
+
+
+def test_cells_of_strangers_are_no_formulas_and_command_no_terminal(call, days: Path, tmp_path: Path) -> None:
+    for k, name in enumerate(("=cmd|' !A0", "a\x1b[31m", "plain"), 1):
+        (tmp_path / f"{name}.nc").write_bytes((days / f"day_{k}.nc").read_bytes())
+    call("trend", tmp_path, "-o", tmp_path / "trend.csv")
+    text = (tmp_path / "trend.csv").read_text()
+    names = {row["file"] for row in csv.DictReader(io.StringIO(text))}
+    assert names == {"'=cmd|' !A0.nc", "a\\x1b[31m.nc", "plain.nc"}
+    assert "\x1b" not in text
+
+
+def test_a_link_out_of_a_folder_is_left_out(call, days: Path, tmp_path: Path, caplog) -> None:
+    """What lies elsewhere on the machine is read where it is named, and shows in no text otherwise."""
+    folder, secret = tmp_path / "logs", tmp_path / "secret"
+    folder.mkdir()
+    secret.write_text("hidden:x:0:0\n")
+    for k in (1, 2):
+        (folder / f"day_{k}.nc").write_bytes((days / f"day_{k}.nc").read_bytes())
+    (folder / "passwd.csv").symlink_to(secret)
+    (folder / "again.nc").symlink_to(folder / "gone.nc")
+    machine, link = tmp_path / "m.toml", tmp_path / "link"
+    link.symlink_to(folder)
+    for words in (("commission", folder, "-o", machine), ("diagnose", link, "--machine", machine), ("trend", folder)):
+        caplog.clear()
+        done = call(*words)
+        assert done.status == 0
+        assert "hidden" not in done.out + done.err
+        assert "passwd" not in done.out + done.err
+        assert [
+            text.endswith("got a link out of it, left out (%s)" % (words[1] / "passwd.csv")) for text in caplog.messages
+        ] == [True]

@@ -9,10 +9,12 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -38,13 +40,14 @@ from sealscope.simulation.commands import parse_command
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults import parse_fault
 from sealscope.simulation.leaks import parse_leak
+from sealscope.storage.plain_state import array_of, plain_array
 from sealscope.storage.plain_values import as_type
 from sealscope.storage.rows import LOCK, ROWS, read_rows, stored
 from sealscope.thesis.engine.build import ItemRow
 from sealscope.thesis.engine.products import Claim, Figure, Number, ThesisTable
 from sealscope.units import parse_quantity, parse_unit
 
-from .mutations import change_tree, changed_bytes, changed_option, changed_toml
+from .mutations import change_tree, changed_bytes, changed_option, changed_toml, nodes
 
 #: Draws a hostile input and uses it; whether it was taken.
 Use = Callable[[random.Random], bool]
@@ -188,9 +191,42 @@ def rigs(folder: Path) -> Use:
     return _toml([*whole, small, small], read, folder)
 
 
+_NAN = re.compile(r"\b(nan|inf)\b", re.IGNORECASE)
+
+
+def altered(taught: bytes, draw: random.Random) -> tuple[bytes, dict[str, str]]:
+    """A file of lessons with one of them changed, and the checksums that changed: those before and after."""
+    head, *rows = taught.splitlines(keepends=True)
+    at = draw.randrange(len(rows))
+    before, _, data = rows[at].strip().partition(b" ")
+    tree = json.loads(data)
+    if draw.random() < 0.5:
+        change_tree(tree, draw)
+    else:
+        arrays = [
+            value for value, _ in nodes({"": tree}) if isinstance(value, dict) and value.keys() == {"shape", "f8"}
+        ]
+        place = draw.choice(arrays)
+        values = array_of(place, "drawn").ravel().copy()
+        chosen = slice(None) if draw.random() < 0.5 else draw.randrange(len(values))
+        values[chosen] = (
+            draw.choice((0.0, -1.0, 1e300, 1e99, np.nan, np.inf, 1e-300))
+            if draw.random() < 0.5
+            else (values[chosen] * draw.choice((0.0, -1.0, 1e-12, 1e3, 1e30, 1e-200)))
+        )
+        place["f8"] = plain_array(values)["f8"]
+    data = json.dumps(tree).encode()
+    after = sha256(data).hexdigest()
+    rows[at] = b"%b %b\n" % (after.encode(), data)
+    return head + b"".join(rows), {before.decode(): after}
+
+
 def machines(folder: Path) -> Use:
-    """Files of a commissioned machine, changed, or links to folders and pipes; one that is taken judges a recording."""
-    healthy, path = folder / "healthy", folder / "given.toml"
+    """Files of a commissioned machine, changed, or links to folders and pipes; one that is taken judges a recording.
+
+    Its lessons are changed in their bytes, or in their values with the right checksums.
+    """
+    healthy, path, lessons = folder / "healthy", folder / "given.toml", folder / "given.lessons"
     healthy.mkdir()
     for seed in (1, 2, 3):
         sealscope.write(sealscope.simulate(duration="6 s", seed=seed), healthy / f"run{seed}.nc")
@@ -198,24 +234,33 @@ def machines(folder: Path) -> Use:
     alarms = (JudgedAlarm("press 1-1", "valid", 1.7e9, 1.69e9, 0.002), JudgedAlarm("press 1-2", "invalid", 1e9, 1e9))
     bare = replace(whole, rig=None, channel_map={"p_A": "PG_1[bar]"}, alarms=alarms)
     texts = [sealscope.write_machine(own, folder / "whole.toml").read_text() for own in (whole, bare)]
-    judged = sealscope.simulate(duration="6 s", seed=4)
+    judged, taught = sealscope.simulate(duration="6 s", seed=4), (folder / "whole.lessons").read_bytes()
 
     def read() -> None:
         machine = sealscope.load_machine(path)
-        machine.diagnose(judged)
-        str(machine)
+        texts = [machine.diagnose(judged).reason, str(machine)]
+        assert not any(_NAN.search(text) for text in texts), texts
         again = sealscope.load_machine(sealscope.write_machine(machine, folder / "again.toml"))
         assert [own.digest for own in again.healthy] == [own.digest for own in machine.healthy]
 
     def use(draw: random.Random) -> bool:
         path.unlink(missing_ok=True)
+        lessons.write_bytes(taught)
         match draw.randrange(20):
             case 0:
                 path.symlink_to(draw.choice((healthy, path)))
             case 1:
                 os.mkfifo(path)
             case _:
-                path.write_bytes(changed_toml(draw.choice(texts), draw))
+                text = draw.choice(texts)
+                if draw.random() < 0.6:
+                    data, checksums = (
+                        (changed_bytes(taught, draw), {}) if draw.random() < 0.2 else altered(taught, draw)
+                    )
+                    lessons.write_bytes(data)
+                    for before, after in checksums.items():
+                        text = text.replace(before, after)
+                path.write_bytes(changed_toml(text, draw) if draw.random() < 0.6 else text.encode())
         with np.errstate(all="ignore"):
             return taken(read)
 

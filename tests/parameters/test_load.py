@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import pytest
 
+import sealscope as ss
 import sealscope.parameters
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig
@@ -167,3 +169,38 @@ def test_a_rig_is_its_own_rig_and_another_type_is_refused():
         load_rig(5)
     with pytest.raises(InputError, match="load_rig has no argument 'rg'; did you mean 'rig'"):
         load_rig(rg="thesis")
+
+
+HEAVY = {
+    "tables": "".join(f"[a{k}]\n" for k in range(100_000)),
+    "rows": "[[healthy]]\n" * 80_000,
+    "empty lists": "a = [" + "[]," * 300_000 + "]\n",
+    "keys": "".join(f"k{k}=1\n" for k in range(90_000)),
+    "dots": "".join(f"a.b{k}.c.d.e=1\n" for k in range(50_000)),
+    "inline tables": "".join(f"k{k}={{a.b.c=1}}\n" for k in range(50_000)),
+    "a long text": f'a = "{"x" * 990_000}"\n',
+    "blanks in brackets": "[" + " " * 900_000 + "\n",
+}
+
+
+@pytest.mark.parametrize("kind", HEAVY)
+@pytest.mark.parametrize("load", [ss.load_rig, ss.load_machine])
+def test_a_hostile_file_takes_less_than_ten_times_its_size_in_memory(tmp_path: Path, kind: str, load) -> None:
+    """The first error ends it, and what would become many objects is refused before it is parsed."""
+    path = write(tmp_path, HEAVY[kind])
+    with pytest.raises(InputError):  # what is imported once is not counted
+        load(path)
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError) as caught:
+            load(path)
+        assert tracemalloc.get_traced_memory()[1] < 10 * len(HEAVY[kind])
+    finally:
+        tracemalloc.stop()
+    assert len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize("load", [ss.load_rig, ss.load_machine])
+def test_rigs_and_machines_have_one_limit(tmp_path: Path, load) -> None:
+    with pytest.raises(InputError, match="must be at most 1000000 bytes, got more"):
+        load(write(tmp_path, "#" * 1_000_001))

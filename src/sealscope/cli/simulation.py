@@ -78,6 +78,8 @@ def parameters(
     form: Annotated[Literal["table", "csv", "json"], Option("--format", help="Table, CSV or JSON.")] = "table",
 ) -> None:
     """List a rig's parameters: symbol, name, value, unit and source."""
+    from sealscope.storage.csv_file import guard_cell
+
     loaded = opt.rig_with(rig, overrides)
     columns = ("symbol", "name", "meaning", "value", "unit", "source")
     rows = [{column: getattr(row, column) for column in columns} for row in loaded.table()]
@@ -86,7 +88,7 @@ def parameters(
     elif form == "csv":
         writer = csv.DictWriter(sys.stdout, columns, lineterminator="\n")
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows({name: guard_cell(value) for name, value in row.items()} for row in rows)
     else:
         width = min(get_terminal_size((80, 24)).columns, 120)
         wide = max(len(row["name"]) for row in rows) + 2

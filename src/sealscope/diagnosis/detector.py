@@ -70,7 +70,7 @@ def checked(report: Any, name: str) -> Observed:
         if not 0.0 <= observable.chance <= 1.0:
             raise ValueError(f"a chance must be 0 to 1, got {observable.chance!r} ({observable.name})")
         if not np.isfinite(observable.score):
-            raise ValueError(f"a score must be finite, got {observable.score!r} ({observable.name})")
+            raise ArithmeticError(f"a score must be finite, got {observable.score!r} ({observable.name})")
     if "\n" in report.lack:
         raise ValueError("what a detector lacks must be one line")
     return replace(report, provider=name)

@@ -100,7 +100,10 @@ class Examination:
         return self._decide(name, [self.signals], context)
 
     def fused(self) -> Evidence:
-        """Decide by all registered detectors: the first that measures the leak and can tell judges."""
+        """Decide by all registered detectors: the first that measures the leak and can tell judges.
+
+        Where one that measures the leak fails, nobody else may say that there is none.
+        """
         context = Context(false_alarm_probability=self.false_alarm_probability, refusal=self.refusal)
         names = sorted(detectors(), key=rank)
         judged = dict[str, Evidence]()
@@ -108,7 +111,8 @@ class Examination:
         for name in names:
             if name not in ORDER or not any(is_decided(own) for own in judged.values()):
                 judged[name] = self._decide(name, reports, context)
-        return combine(list(judged.values()), context)
+        failed = next((self.report(name).lack for name in ORDER if name in judged and self.report(name).has_failed), None)
+        return combine(list(judged.values()), replace(context, refusal=self.refusal or failed))
 
     def _decide(self, name: str, reports: Sequence[Observed], context: Context) -> Evidence:
         report = self.report(name)

@@ -51,7 +51,8 @@ def run_detector(
                 raise ValueError(f"its name must be that of its entry point, {name!r}, got {detector.name!r}")
             return _observe(detector, recording, baseline, distrust)
     except Exception as error:
-        return Observed(name, lack=failure(name, getattr(factory, "distribution", None), error))
+        lack = failure(name, getattr(factory, "distribution", None), error)
+        return Observed(name, lack=lack, has_failed=True)
 
 
 def _observe(detector: Detector, recording: Recording, baseline: Sequence[Healthy], distrust: str | None) -> Observed:

@@ -32,6 +32,7 @@ _FEWEST_AT_RAIL = 5
 _LONG_RUN = 20
 _PRIORS = priors_of("sealscope.recordings")
 _CLOCK, _HUM, _CREEP = (_PRIORS[table] for table in ("clock", "hum", "creep"))
+_POSSIBLE = _PRIORS["possible"]
 
 
 @dataclass(frozen=True)
@@ -186,7 +187,12 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
     extreme = np.flatnonzero(np.isinf(values))
     if extreme.size:
         add("infinite", extreme.size, int(extreme[0]), f"{counted(extreme.size, 'infinite sample')}")
-    present = np.flatnonzero(np.isfinite(values))
+    impossible = flag_impossible(values, unit)
+    wild = np.flatnonzero(impossible)
+    if wild.size:
+        text = f"{counted(wild.size, 'sample')} beyond what any sensor reads, first {values[wild[0]]:g} {unit}"
+        add("impossible", wild.size, int(wild[0]), text)
+    present = np.flatnonzero(np.isfinite(values) & ~impossible)
     kept = values[present]
     if kept.size < 2:
         return findings
@@ -211,6 +217,12 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
         text += ": is the sensor connected?" if share > _HUM["alone"] else ""
         add("mains_hum", kept.size, int(present[0]), text, "warning" if share > _HUM["loud"] else "note")
     return findings
+
+
+def flag_impossible(values: Array, unit: str) -> NDArray[np.bool_]:
+    """Flag the samples (n,), in an SI unit, of a size that no sensor reads; missing and infinite ones are not."""
+    largest: float = _POSSIBLE.get(unit, _POSSIBLE["any"])
+    return np.asarray(np.isfinite(values) & (np.abs(values) > largest))
 
 
 def _every(present: NDArray[np.intp]) -> int:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from sealscope.errors import InputError
+from sealscope.errors import InputError, printable
 from sealscope.storage.opening import open_inner
+
+_log = logging.getLogger(__name__)
 
 
 def make_folder(folder: Path) -> None:
@@ -31,6 +34,23 @@ def inner_folder(folder: Path, *names: str) -> Path:
             raise InputError(f"a folder of results must not be a link, got one ({folder})")
         make_folder(folder)
     return folder
+
+
+def inner_files(folder: Path, paths: Iterable[Path]) -> Iterator[Path]:
+    """Yield the files among the paths in a folder, which may come from outside; a link out of it is logged, not read.
+
+    Links within the folder are followed; the folder itself may be a link.
+    """
+    root = folder.resolve()
+    for path in paths:
+        try:
+            is_file, within = path.is_file(), path.resolve().is_relative_to(root)
+        except (OSError, RuntimeError):  # gone meanwhile, or links in a circle
+            continue
+        if is_file and not within:
+            _log.warning("%s", printable(f"a file of a folder must lie in it, got a link out of it, left out ({path})"))
+        elif is_file:
+            yield path
 
 
 def by_numbers(name: str) -> list[str | int]:

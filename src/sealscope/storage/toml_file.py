@@ -7,6 +7,7 @@ import tomllib
 from collections.abc import Callable, Mapping
 from functools import cache
 from importlib.resources import files
+from io import StringIO
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,9 +18,13 @@ from sealscope.storage.plain_values import LARGEST_WHOLE, as_type
 _T = TypeVar("_T")
 #: Largest file read [bytes]; what is larger is no file of settings.
 LARGEST = 1_000_000
-#: Most dots in a key: tomllib takes a time that goes with their square. What stands between keys.
+#: Most dots in a key: tomllib takes a time that goes with their square. What keys consist of.
 _MOST_DOTS = 30
-_NO_KEY = re.compile(r"[^\w.\"'\s-]+|\n")
+_KEYS = re.compile(r"[\w.\"' \t\r-]+")
+#: Bytes that tomllib and the checks take for a table, for an element of an array of tables, for a key's value, and for
+#: a value in an array; how many may be taken in all, and how many times those of the text.
+_TABLE, _ROW, _ENTRY, _VALUE, _MEMORY, _SHARE = 900, 60, 110, 70, 2_000_000, 6
+_HEADER, _INNER_KEY = re.compile(r"\s*\[[^\[\],]*\]\s*(?:#.*)?\n?"), re.compile(r"[{,]([^{},=]*)=")
 
 
 def read_toml(path: Path, what: str, place: str, largest: int = LARGEST) -> dict[str, Any]:
@@ -36,12 +41,19 @@ def read_toml(path: Path, what: str, place: str, largest: int = LARGEST) -> dict
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{what} must be readable, got: {reason} ({place})") from None
+    return parse_toml(data, what, place, largest)
+
+
+def parse_toml(data: bytes, what: str, place: str, largest: int = LARGEST) -> dict[str, Any]:
+    """Return the tables of the bytes of a TOML file; errors and limits as `read_toml` has them."""
     if len(data) > largest:
         raise InputError(f"{what} must be at most {largest} bytes, got more ({place})")
     try:
         text = data.decode("utf-8-sig")
-        if any(part.count(".") > _MOST_DOTS for part in _NO_KEY.split(text)):
+        if any(part[0].count(".") > _MOST_DOTS for part in _KEYS.finditer(text)):
             raise ValueError(f"a dotted key must have at most {_MOST_DOTS} dots")
+        if (memory := _count_memory(text)) > max(_MEMORY, _SHARE * len(data)):
+            raise ValueError(f"{len(data)} bytes of text must hold fewer tables and values, got some {memory} bytes")
         tree = tomllib.loads(text)
         _check_whole_numbers(tree)
     except UnicodeDecodeError as error:
@@ -75,6 +87,20 @@ def priors_of(package: str) -> Mapping[str, Mapping[str, Any]]:
         table: {name: (row["value"], row["unit"], row["source"])[0] for name, row in rows.items()}
         for table, rows in tables.items()
     }
+
+
+def _count_memory(text: str) -> int:
+    """Return about how many bytes the tables and values of a text take, at most, without parsing it."""
+    tables = rows = 0
+    for line in StringIO(text):
+        if line.lstrip().startswith("[["):
+            rows, tables = rows + 1, tables + line.count(".")
+        elif _HEADER.fullmatch(line):
+            tables += 1 + line.count(".")
+        else:
+            tables += line.partition("=")[0].count(".") + line.count("{")
+            tables += sum(key[1].count(".") for key in _INNER_KEY.finditer(line))
+    return _TABLE * tables + _ROW * rows + _ENTRY * text.count("=") + _VALUE * (text.count(",") + text.count("["))
 
 
 def _check_whole_numbers(value: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 import sealscope as ss
 from sealscope.diagnosis.commissioned.lessons_file import SUFFIX, Line, format_lesson, parse_lesson, read_lines
 from sealscope.errors import InputError
+from sealscope.storage.plain_state import plain_array
 
 
 @pytest.fixture
@@ -34,7 +36,7 @@ def refused(path: Path) -> str:
 
 def test_a_lesson_is_read_as_it_was_learnt(machine):
     """To the last bit, with names that this version does not know."""
-    numbers = np.array([[1.0, 1e-300], [-0.1, 3e200]])
+    numbers = np.array([[1.0, 1e-300], [-0.1, 3e90]])
     statistics = {"rise": 0.25, "later kind": numbers, "empty": np.zeros((0, 3))}
     lessons = {**machine.healthy[0].lessons, "a plug-in's": {"names": ["a", "b"], "n": 3, "curve": [0.1, 0.2]}}
     learnt = replace(machine.healthy[0], statistics=statistics, lessons=lessons)
@@ -186,9 +188,17 @@ def altered(line: Line, change: str, value: object) -> Line:
     place = tree
     for part in path:
         place = place[part]
-    place[name] = value
+    place[name.strip()] = value
     data = json.dumps(tree).encode()
     return Line(sha256(data).hexdigest(), data)
+
+
+def packed(values: object) -> dict[str, object]:
+    return plain_array(np.asarray(values, dtype=float))
+
+
+def sums_of(scale: float) -> dict[str, object]:
+    return packed(np.full((1, 25, 25), scale))
 
 
 HOSTILE = {
@@ -198,11 +208,19 @@ HOSTILE = {
     "units": ([], "units"),
     "start_s": ("now", "start_s"),
     "lessons/volume balance/sums": ([[1.0]], "must be an array of numbers"),
+    "lessons/volume balance/sums ": (sums_of(0.0), "sums must be those of squares and products"),
+    "lessons/volume balance/sums  ": (sums_of(1e200), "finite numbers of a size below 1e+100"),
+    "lessons/volume balance/sums   ": (sums_of(np.nan), "finite numbers"),
+    "lessons/volume balance/scale": (1e300, "scale"),
+    "lessons/volume balance/flow": (-1.0, "flow"),
+    "lessons/volume balance/start_s": (1e18, "start_s"),
+    "lessons/rms change/duty": (packed([1.0, 2.0]), "levels and duty must be of the shapes (10,) and (4,)"),
+    "about/noise": ({"p_A": "x"}, "noise: p_A"),
     "lessons/volume balance/terms": (["a"], "sums must be of the shape"),
     "lessons/volume balance/pressure": (None, "pressure"),
     "lessons/rms change/levels": ({"shape": [3], "f8": "AAAA"}, "levels"),
     "lessons/other": ([[], []] * 4000, "must hold its numbers in arrays"),
-    "statistics/rise": ("high", "statistics.rise"),
+    "statistics/rise": ("high", "statistics: rise: must be an array"),
 }
 
 
@@ -217,3 +235,39 @@ def test_an_altered_lesson_with_the_right_checksum_is_refused_in_one_line(pair, 
     assert rule in message
     assert "hostile.lessons" in message
     assert "\n" not in message
+
+
+def test_a_file_of_lessons_takes_less_than_ten_times_its_size_in_memory(pair):
+    """The worst that may be written: many short lessons of empty lists."""
+    text, lessons = pair
+    line = read_lines(lessons)[0]
+    bare = {"digest": "a", "units": {}, "rate": 1.0, "seconds": 1.0, "lessons": {"other": {"x": [[]] * 25}}}
+    rows = []
+    for number in range(2000):
+        data = json.dumps({**bare, "digest": f"{number:064}"}).replace(" ", "").encode()
+        rows.append((sha256(data).hexdigest(), data))
+    lessons.write_bytes(b"sealscope lessons 1\n" + b"".join(b"%b %b\n" % (own.encode(), data) for own, data in rows))
+    head = text.read_text().partition("\n[[healthy]]\n")[0]
+    text.write_text(head + "".join(f'\n[[healthy]]\nfile = "r"\nlesson = "{own}"\n' for own, _ in rows))
+    assert parse_lesson(line, "run1.nc", "place").digest
+    tracemalloc.start()
+    try:
+        assert len(ss.load_machine(text).healthy) == 2000
+        assert tracemalloc.get_traced_memory()[1] < 10 * (text.stat().st_size + lessons.stat().st_size)
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_main_method_that_cannot_run_is_never_no_leak(machine, monkeypatch):
+    """What the others say is stated beside it."""
+    judged = ss.simulate(command="3 sin(4t)", duration="20 s", seed=41)
+    assert machine.diagnose(judged).verdict == "no leak"
+
+    def fail(*_: object) -> None:
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr("sealscope.diagnosis.inference.detector.judge", fail)
+    diagnosis = machine.diagnose(judged)
+    assert diagnosis.verdict == "cannot tell"
+    assert "volume balance cannot be computed on this recording: singular matrix" in diagnosis.reason
+    assert ss.diagnose(judged).verdict == "cannot tell"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import signal
+import tracemalloc
 from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import cycle
@@ -243,3 +244,20 @@ def test_another_actuator_is_named_and_is_no_leak(machine):
     assert {run.verdict for run in runs.values()} == {"no leak"}
     assert "another machine" not in runs[633].reason
     assert "motion takes 1.15 times the flow" in runs[728].reason
+
+
+def test_what_would_not_be_read_again_is_not_written(machine, tmp_path):
+    """Marks grow a text up to the limit that all its readers have, within ten times its size in memory."""
+    path = ss.write_machine(machine, tmp_path / "press.toml")
+    marks = tuple(JudgedAlarm(f"press-{k}", "repaired", 1.7e9 + k, 1.7e9 + k) for k in range(9000))
+    with pytest.raises(InputError, match="must be at most 1000000 bytes, got more"):
+        ss.write_machine(replace(machine, alarms=marks), path)
+    assert ss.load_machine(path).alarms == ()
+    ss.write_machine(replace(machine, alarms=marks[:7000]), path)
+    tracemalloc.start()
+    try:
+        assert len(ss.load_machine(path).alarms) == 7000
+        assert ss.load_rig(path) == machine.rig
+        assert tracemalloc.get_traced_memory()[1] < 10 * path.stat().st_size
+    finally:
+        tracemalloc.stop()

@@ -21,7 +21,7 @@ from sealscope.errors import InputError, SealscopeError
 from sealscope.recordings import read
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Recording
-from sealscope.storage.folders import by_numbers
+from sealscope.storage.folders import by_numbers, inner_files
 
 #: Share of the rms of p_A - p_B that its mean exceeds in a stroke of one direction.
 _ONE_WAY = 0.5
@@ -32,7 +32,7 @@ ProgressCallback = Callable[[int, int, int], None]
 
 def _files(plan: RecordedPlan, folder: Path) -> Iterator[tuple[RecordingSet, Path]]:
     for recordings in plan.sets:
-        files = (path for path in folder.glob(recordings.files) if path.is_file())
+        files = inner_files(folder, folder.glob(recordings.files))
         paths = sorted(files, key=lambda path: by_numbers(path.name))
         chosen = paths[recordings.first - 1 : recordings.end - 1]
         if not chosen:

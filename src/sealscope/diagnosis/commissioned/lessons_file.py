@@ -18,10 +18,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PositiveFloat, create_model
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, FailFast, Field, create_model
 
+from sealscope.diagnosis.inference.terms import LEAK
 from sealscope.diagnosis.learnt import Learnt
+from sealscope.diagnosis.rms_change.blocks import DUTY
 from sealscope.errors import InputError
+from sealscope.signals.details import QUANTITIES
 from sealscope.storage.atomic import atomic_write
 from sealscope.storage.opening import open_regular
 from sealscope.storage.plain_state import array_of, plain_array
@@ -32,7 +35,9 @@ SUFFIX, _HEAD = ".lessons", b"sealscope lessons 1\n"
 #: Largest file and longest line [bytes]; most lessons in a file.
 LARGEST, _LONGEST, _MOST = 50_000_000, 5_000_000, 5000
 #: Most commas, brackets and braces in a line: a number, and a share of its bytes. Each becomes an object in memory.
-_MARKS, _SHARE = 200, 0.1
+_MARKS, _SHARE = 40, 0.1
+#: Largest size of a number: products of two do not overflow. Times are within the years that calendars have [s].
+_SIZE, _FIRST, _LAST = 1e100, -6.2e10, 2.5e11
 #: Length of a checksum in hexadecimal digits.
 _DIGITS = 64
 
@@ -51,55 +56,102 @@ def make_table(extra: Literal["allow", "ignore"] = "ignore", **kinds: Any) -> An
     return create_model("Table", __config__=config, **fields)  # type: ignore[call-overload]
 
 
-def _check_array(value: Any) -> np.ndarray:
+def table_of(kind: Any) -> Any:
+    """Return the type of a table whose values are of one kind; the first that is not is the error."""
+
+    def check(table: Any) -> Any:
+        if not isinstance(table, dict):
+            raise ValueError(f"must be a table, got {table!r:.60}")
+        for name, value in table.items():
+            try:
+                as_type(kind, value)
+            except ValueError as error:
+                raise ValueError(f"{name}: {error}") from None
+        return table
+
+    return Annotated[Any, AfterValidator(check)]
+
+
+def list_of(kind: Any, fewest: int = 0) -> Any:
+    """Return the type of a list of one kind; the first value that is not is the error."""
+    return Annotated[list[kind], FailFast(), Field(min_length=fewest)]
+
+
+def _check_array(value: Any) -> Any:
     if not isinstance(value, np.ndarray):
         raise ValueError("must be an array of numbers")
-    if not np.isfinite(value).all():
-        raise ValueError("must hold finite numbers")
+    if not (np.abs(value) < _SIZE).all():
+        raise ValueError(f"must hold finite numbers of a size below {_SIZE:g}")
     return value
 
 
 def _check_statistic(value: Any) -> Any:
-    return value if isinstance(value, float) else _check_array(value)
+    _check_array(np.array(value) if isinstance(value, float) else value)
+    return value
 
 
 def _check_sums(lesson: Any) -> Any:
+    """Check sums of products: their shape, and that flow and leak, which all estimates rest on, can be of one duty."""
     size = len(lesson.terms) + 1
-    if lesson.sums.ndim != 3 or lesson.sums.shape[1:] != (size, size):
+    if lesson.sums.ndim != 3 or not len(lesson.sums) or lesson.sums.shape[1:] != (size, size):
         raise ValueError(f"sums must be of the shape (E, {size}, {size}), got {lesson.sums.shape}")
+    if LEAK not in lesson.terms:
+        raise ValueError(f"terms must have {LEAK!r}, got {', '.join(lesson.terms)}")
+    leak = lesson.terms.index(LEAK)
+    squares, product = lesson.sums[:, [leak, -1], [leak, -1]], lesson.sums[:, leak, -1]
+    if not (squares > 0.0).all() or not (product**2 <= _ROUNDED * squares.prod(axis=1)).all():
+        raise ValueError("sums must be those of squares and products of a leak and a flow, got none such")
     return lesson
 
 
+def _check_levels(lesson: Any) -> Any:
+    chambers, expected = len(lesson.chambers), (len(QUANTITIES) * len(lesson.chambers),)
+    if not chambers or lesson.levels.shape != expected or lesson.duty.shape != (len(DUTY),):
+        shapes = f"{lesson.levels.shape} and {lesson.duty.shape}"
+        raise ValueError(f"levels and duty must be of the shapes {expected} and ({len(DUTY)},), got {shapes}")
+    return lesson
+
+
+#: By how much rounding lets a product exceed its squares.
+_ROUNDED = 1.0 + 1e-6
 _Array = Annotated[Any, AfterValidator(_check_array)]
 _Statistic = Annotated[Any, AfterValidator(_check_statistic)]
+_Number = Annotated[float, Field(gt=-_SIZE, lt=_SIZE)]
+_Size = Annotated[float, Field(ge=0.0, lt=_SIZE)]
+_Positive = Annotated[float, Field(gt=0.0, lt=_LAST)]
+_Time = Annotated[float, Field(gt=_FIRST, lt=_LAST)]
 _BALANCE = make_table(
     "allow",
-    terms=list[str],
-    scale=float,
+    terms=list_of(str),
+    scale=_Size,
     sums=_Array,
-    flow=float,
-    pressure=float,
-    start_s=(float, None),
-    oil_degC=(float, None),
+    flow=_Size,
+    pressure=_Size,
+    start_s=(_Time, None),
+    oil_degC=(_Number, None),
+)
+_RMS = make_table(
+    "allow",
+    chambers=list_of(str),
+    recorded=(list_of(str), None),
+    rate=_Positive,
+    start_s=(_Time, None),
+    levels=_Array,
+    duty=_Array,
 )
 #: What Sealscope's own methods learn; the lessons of others are plain tables.
 _LESSONS = {
     "volume balance": (Annotated[_BALANCE, AfterValidator(_check_sums)], None),
-    "pressure response": (make_table("allow", level=float), None),
-    "rms change": (
-        make_table(
-            "allow",
-            chambers=list[str],
-            recorded=(list[str], None),
-            rate=float,
-            start_s=(float, None),
-            levels=_Array,
-            duty=_Array,
-        ),
-        None,
-    ),
+    "pressure response": (make_table("allow", level=_Number), None),
+    "rms change": (Annotated[_RMS, AfterValidator(_check_levels)], None),
 }
-_ABOUT = {"sha256": str, "pressure_bar": float, "oil_degC": float, "noise": dict[str, float], "wrong": list[str]}
+_ABOUT = {
+    "sha256": str,
+    "pressure_bar": _Number,
+    "oil_degC": _Number,
+    "noise": table_of(_Size),
+    "wrong": list_of(str),
+}
 
 
 def _unpack(value: Any, name: str) -> Any:
@@ -116,13 +168,13 @@ def _unpack(value: Any, name: str) -> Any:
 
 _LESSON = make_table(
     digest=Annotated[str, Field(min_length=1, max_length=200)],
-    units=dict[str, str],
-    rate=PositiveFloat,
-    seconds=PositiveFloat,
-    start_s=(float, None),
+    units=table_of(str),
+    rate=_Positive,
+    seconds=_Positive,
+    start_s=(_Time, None),
     about=(make_table("allow", **{name: (kind, None) for name, kind in _ABOUT.items()}), None),
     lessons=Annotated[make_table("allow", **_LESSONS), BeforeValidator(lambda value: _unpack(value, ""))],
-    statistics=(Annotated[dict[str, _Statistic], BeforeValidator(lambda value: _unpack(value, ""))], None),
+    statistics=(Annotated[table_of(_Statistic), BeforeValidator(lambda value: _unpack(value, ""))], None),
 )
 
 

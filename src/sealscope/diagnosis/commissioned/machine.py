@@ -31,6 +31,7 @@ from sealscope.recordings import read
 from sealscope.recordings.formats.columns import ChannelMap, counted
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.recording import Recording
+from sealscope.storage.folders import inner_files
 
 if TYPE_CHECKING:
     from sealscope.diagnosis.commissioned.summary import Summary
@@ -72,10 +73,10 @@ class JudgedAlarm(NamedTuple):
 
 
 class Origin(NamedTuple):
-    """The file that a machine was loaded from, and its parts then, by which changes of others are known."""
+    """The file that a machine was loaded from, and hashes of its parts, by which changes of others are known."""
 
     path: Path
-    parts: frozenset[str]
+    parts: frozenset[bytes]
 
 
 def _is_taken_back(word: JudgedAlarm, later: Iterable[JudgedAlarm]) -> bool:
@@ -227,7 +228,10 @@ def read_of_machine(path: str | os.PathLike[str], channel_map: ChannelMap, rate:
 
 
 def recordings_in(paths: Iterable[str | os.PathLike[str]] | str | os.PathLike[str]) -> list[Path]:
-    """Return the files of recordings that a path, several, or a folder name; InputError where there is none."""
+    """Return the files of recordings that a path, several, or a folder name; InputError where there is none.
+
+    A link in a folder that leads out of it is left out, and a warning says so: name it to have it read.
+    """
     try:
         named = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
         given = [Path(path) for path in named]
@@ -236,7 +240,7 @@ def recordings_in(paths: Iterable[str | os.PathLike[str]] | str | os.PathLike[st
     files: list[Path] = []
     for path in given:
         if path.is_dir():
-            inside = sorted(own for own in path.iterdir() if own.is_file() and not own.name.startswith("."))
+            inside = inner_files(path, sorted(each for each in path.iterdir() if not each.name.startswith(".")))
             files += [own for own in inside if own.suffix.lower() not in NO_RECORDINGS and not _is_written(own)]
         else:
             files.append(path)

@@ -14,9 +14,9 @@ from __future__ import annotations
 import json
 import os
 import re
-import tomllib
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
+from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,9 +27,11 @@ from sealscope.calls import checked_call
 from sealscope.diagnosis.commissioned.lessons_file import (
     SUFFIX,
     format_lesson,
+    list_of,
     make_table,
     read_lessons,
     read_lines,
+    table_of,
     write_lines,
 )
 from sealscope.diagnosis.commissioned.machine import CommissionedMachine, JudgedAlarm, Judgement, Origin
@@ -41,7 +43,7 @@ from sealscope.recordings.formats.columns import REST, check_call
 from sealscope.storage.atomic import atomic_write, check_folder
 from sealscope.storage.folders import locked
 from sealscope.storage.plain_values import as_type
-from sealscope.storage.toml_file import LARGEST, read_toml
+from sealscope.storage.toml_file import parse_toml, read_toml
 
 #: What this version writes and reads; names in [machine] that are written anew with each change.
 _FORMAT, _REWRITTEN = 2, ("sealscope", "written", "lessons")
@@ -58,9 +60,11 @@ _HEAD = """\
 
 def _moment(text: Any) -> float:
     try:
-        return datetime.fromisoformat(text).timestamp()
-    except (TypeError, OverflowError):
+        moment = datetime.fromisoformat(text).timestamp()
+        datetime.fromtimestamp(moment, UTC)
+    except (TypeError, ValueError, OverflowError, OSError):
         raise ValueError("must be a time as ISO 8601 writes it") from None
+    return moment
 
 
 #: A file's name, which leads to no other folder.
@@ -89,11 +93,10 @@ _FILE = make_table(
         name=str,
         rate=(float, None),
         limit=(str, None),
-        left_out=(list[str], None),
+        left_out=(list_of(str), None),
     ),
-    map=(dict[str, str], None),
-    healthy=Annotated[list[_HEALTHY], Field(min_length=1)],  # type: ignore[valid-type]
-    alarms=(list[_ALARM], None),  # type: ignore[valid-type]
+    map=(table_of(str), None),
+    healthy=list_of(_HEALTHY, fewest=1),
 )
 
 
@@ -183,10 +186,12 @@ def _lock_of(target: Path) -> Path:
 
 
 def _write(machine: CommissionedMachine, target: Path) -> None:
-    """Write lessons, kept text and text, in this order: each text finds its lessons after any of them."""
+    """Write lessons, kept text and text, in this order: each text finds its lessons after any of them.
+
+    Raises InputError where the text would not be read again.
+    """
     taught, data = [format_lesson(learnt) for learnt in machine.healthy], _format_text(machine, target)
-    if len(data) > LARGEST:
-        raise InputError(f"a machine's file must be at most {LARGEST} bytes, got {len(data)} ({target})")
+    _stated_in(parse_toml(data, "a machine's file", str(target)), str(target))
     backup, lines = target.with_suffix(".toml.bak"), {line.checksum: line for line in taught}
     texts = [(path, _read_if_there(path)) for path in (target, backup)]
     present = {line.checksum: line for path, tree in texts for line in read_lines(_lessons_path(path, tree))}
@@ -210,20 +215,36 @@ def _format_text(machine: CommissionedMachine, target: Path) -> bytes:
 
 def _tree_of(machine: CommissionedMachine, target: Path) -> dict[str, Any]:
     """Return the tables of a machine's text as they are read again."""
-    return tomllib.loads(_format_text(machine, target).decode())
+    return parse_toml(_format_text(machine, target), "a machine's file", str(target))
 
 
-def _parts(tree: Mapping[str, Any]) -> dict[str, str]:
-    """Return what a machine's text holds that another process may add or take away: each in JSON, and its name."""
+def _read_alarms(rows: Any) -> tuple[JudgedAlarm, ...]:
+    """Read the rows of [[alarms]], one after the other; ValueError for the first that breaks a rule."""
+    if not isinstance(rows, list):
+        raise ValueError(f"alarms must be tables, got {rows!r:.60}")
+    alarms = []
+    for number, row in enumerate(rows, 1):
+        try:
+            alarms.append(JudgedAlarm(**as_type(_ALARM, row).model_dump(exclude_unset=True)))
+        except ValueError as error:
+            raise ValueError(f"alarms[{number}].{error}") from None
+    return tuple(alarms)
+
+
+def _parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
+    """Return what a machine's text holds that another process may add or take away: hash and name of each."""
+
+    def hash_of(value: Any) -> bytes:
+        return sha256(json.dumps(value, sort_keys=True, default=str).encode()).digest()[:16]
+
     head = {name: value for name, value in tree["machine"].items() if name not in _REWRITTEN}
     stated = {name: table for name, table in tree.items() if name not in OF_MACHINES}
-    parts = {json.dumps([head, stated], sort_keys=True, default=str): "another statement of the machine"}
-    parts |= {json.dumps(row["lesson"]): f"another recording, {row['file']}" for row in tree["healthy"]}
-    alarms = tree.get("alarms", ())
-    return parts | {json.dumps(row, sort_keys=True): f"another mark of {row['alarm']}" for row in alarms}
+    parts = {hash_of([head, stated]): "another statement of the machine"}
+    parts |= {hash_of(row["lesson"]): f"another recording, {row['file']}" for row in tree["healthy"]}
+    return parts | {hash_of(row): f"another mark of {row['alarm']}" for row in tree.get("alarms", ())}
 
 
-def _change_since(origin: Origin, present: Mapping[str, str], own: Mapping[str, str]) -> str | None:
+def _change_since(origin: Origin, present: Mapping[bytes, str], own: Mapping[bytes, str]) -> str | None:
     """Name something that was added to, or taken from, a machine's file and that writing would undo; None for nothing.
 
     `present`: parts of the file; `own`: parts of the machine to be written, which was read with those of `origin`.
@@ -379,7 +400,7 @@ def load_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
         rate=head.get("rate"),
         limit=head.get("limit"),
         left_out=tuple(head.get("left_out", ())),
-        alarms=tuple(JudgedAlarm(**row) for row in stated.get("alarms", ())),
+        alarms=stated["alarms"],
         origin=Origin(target, frozenset(_parts(tree))),
     )
 
@@ -390,6 +411,7 @@ def _stated_in(tree: dict[str, Any], place: str) -> dict[str, Any]:
         stated: dict[str, Any] = as_type(_FILE, tree).model_dump(exclude_unset=True)
         check_call(stated.get("map", {}), stated["machine"].get("rate"))
         RepairLimit.of(stated["machine"].get("limit"))
+        stated["alarms"] = _read_alarms(tree.get("alarms", []))
         if len({row["lesson"] for row in stated["healthy"]}) < len(stated["healthy"]):
             raise ValueError("healthy must name each lesson once")
     except ValueError as error:

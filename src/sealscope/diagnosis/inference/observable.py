@@ -188,6 +188,8 @@ class Observed:
         Why it reports nothing, empty where it reports something.
     share : float
         Share of the recording, 0 to 1, that the report rests on.
+    has_failed : bool
+        Whether it raised an error where it should have reported.
     """
 
     provider: str
@@ -196,3 +198,4 @@ class Observed:
     ringing: Ringing | None = None
     lack: str = ""
     share: float = 1.0
+    has_failed: bool = False

@@ -63,6 +63,4 @@ def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
 
 
 def _cells(row: dict[str, Any], columns: Sequence[str]) -> dict[str, Any]:
-    """Return the cells of a row, which a spreadsheet takes for no formula: names and comments come from outside."""
-    cells, signs = {name: row.get(name) for name in columns}, ("=", "+", "-", "@", "\t", "\r")
-    return {name: f"'{own}" if isinstance(own, str) and own.startswith(signs) else own for name, own in cells.items()}
+    return {name: row.get(name) for name in columns}

@@ -21,7 +21,7 @@ from sealscope.recordings.channels import Array
 from sealscope.recordings.corrections.clock import NEAR
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.motion import runs_of
-from sealscope.recordings.quality import uniform_segments
+from sealscope.recordings.quality import flag_impossible, uniform_segments
 from sealscope.recordings.recording import Recording
 from sealscope.storage.toml_file import priors_of
 
@@ -38,6 +38,18 @@ _END = 8
 _UNLIKE = 0.4
 #: Samples by which the cycle's length may be off.
 _SLACK = 2
+
+
+def remove_impossible(recording: Recording) -> Recording:
+    """Mark samples as missing that are beyond what any sensor reads (`quality.flag_impossible`).
+
+    Returns the recording itself where there are none.
+    """
+    wrong = {name: flag_impossible(values, recording.units[name]) for name, values in recording.channels.items()}
+    if not any(flags.any() for flags in wrong.values()):
+        return recording
+    channels = {name: np.where(wrong[name], np.nan, values) for name, values in recording.channels.items()}
+    return replace(recording, channels=channels)
 
 
 def bridge(recording: Recording, needed: Sequence[str]) -> Recording:

@@ -14,6 +14,7 @@ from sealscope.diagnosis.trend.trend import Trend
 from sealscope.paragraphs import paragraph, paragraphs
 from sealscope.recordings.formats.columns import counted
 from sealscope.reporting.messages import machine_text, number, say
+from sealscope.storage.csv_file import guard_cell
 from sealscope.units import BAR, DAY, DAYS_PER_YEAR
 
 
@@ -168,5 +169,5 @@ def trend_csv(trend: Trend) -> str:
     with io.StringIO(newline="") as text:
         table = csv.writer(text, lineterminator="\n")
         table.writerow(("file", time, "day [d]", *levels, "group", "temperature [degC]", "note"))
-        table.writerows(row.values() for row in trend.as_dict()["points"])
+        table.writerows(map(guard_cell, row.values()) for row in trend.as_dict()["points"])
         return text.getvalue()
