@@ -28,13 +28,13 @@ OFF = {
     "single-rod-eha": ({"F_pr": 120.0, "F_cfr": 6e-5, "F_v": 2400.0, "K_oil": 800e6},),
 }
 
-PI = PositionPI.of(load_rig("thesis"))
+PI = PositionPI.from_rig(load_rig("thesis"))
 
 
 def followed(rig: str, target: str, duration: float, **options):
     """Run under the controller that assumes the rig as it is shipped; return the run and its error [m]."""
     experiment = Experiment.of(
-        rig=rig, command=target, duration=duration, controller=PositionPI.of(load_rig(rig)), **options
+        rig=rig, command=target, duration=duration, controller=PositionPI.from_rig(load_rig(rig)), **options
     )
     run = trajectory(experiment, ())
     return run, np.broadcast_to(experiment.target.at(run.t), run.t.shape) - run["x"]
@@ -215,7 +215,7 @@ def test_a_recorded_position_is_a_target(tmp_path):
         ({"command": "position 400 mm sin(2t)"}, r"position must stay within the stroke, \+-300 mm, got .* mm at t = "),
         ({"load": "500"}, r"load must have its unit \(N, kN\), such as 'step 100 N', got '500'"),
         ({"load": 500.0}, r"load must be a text or a Force, got 500.0"),
-        ({"controller": PositionPI.of(load_rig("thesis"))}, r"a controller must have a target to follow"),
+        ({"controller": PositionPI.from_rig(load_rig("thesis"))}, r"a controller must have a target to follow"),
     ],
 )
 def test_a_wrong_target_or_load_is_one_line(options, rule):
@@ -231,7 +231,7 @@ def test_rates_and_voltages_that_cannot_be():
     with pytest.raises(InputError, match="rate of the controller must be a whole multiple"):
         outputs_per_sample(500.0, 333.3, 4)
     with pytest.raises(InputError, match="k_v of the controller must be >= 0, got -1"):
-        PositionPI.of(load_rig("thesis"), k_v=-1.0)
+        PositionPI.from_rig(load_rig("thesis"), k_v=-1.0)
     target = Experiment.of(rig="thesis-closed-loop", command="position 10 mm sin(t)", duration=1.0)
     with pytest.raises(InputError, match="a run of a batch must have a command, got a target"):
         simulate_batch([target])

@@ -248,7 +248,7 @@ class Experiment:
             return None
         from sealscope.control import PositionPI
 
-        return self.controller or PositionPI.of(self.rig)
+        return self.controller or PositionPI.from_rig(self.rig)
 
     def effects(self) -> tuple[Effect, ...]:
         """Return what changes in the machine within the run."""

@@ -114,9 +114,10 @@ def advance(
     begin: int,
     account: np.ndarray,
 ) -> None:
-    """Advance groups of runs in place by n steps of h [s], the first of them step `start` of the run.
+    """Advance groups of runs in place by n steps of h [s], the first of them step `start` of a run.
 
-    Groups `groups[0]` to before `groups[1]` are advanced, by the implicit-explicit method where `implicit`, else by RK4.
+    Groups `groups[0]` to before `groups[1]` are advanced, by the implicit-explicit method where `implicit`, else by
+    RK4.
 
     `y`: (groups, 14, WIDTH); `shape`: (n, nodes) the command's shape at `nodes` [s] of each step, or (n, 2 nodes) with
     the load [N] of all runs behind; `drive`: (groups, 2, WIDTH) gain and offset [V]; `leaks`: (groups, LEAK_ROWS,
