@@ -38,7 +38,7 @@ def followed(controller, command: str, duration: float, lpm: float = 0.0, **opti
         rig=RIG, command=command, duration=duration, controller=controller, leak=leak, set=OFF, **options
     )
     run = trajectory(experiment, experiment.leaks)
-    return run, np.broadcast_to(experiment.target.at(run.t), run.t.shape) - run["x"]
+    return run, np.broadcast_to(experiment.target.value_at(run.t), run.t.shape) - run["x"]
 
 
 def rms(values) -> float:
@@ -180,7 +180,7 @@ def test_a_single_rod_is_served_as_well(lpm, load):
             set={"F_pr": 120.0, "F_cfr": 6e-5, "F_v": 2400.0, "K_oil": 800e6, "F_l": load},
         )  # fmt: skip
         run = trajectory(experiment, experiment.leaks)
-        runs[name] = run, rms((experiment.target.at(run.t) - run["x"])[run.t > 8.0])
+        runs[name] = run, rms((experiment.target.value_at(run.t) - run["x"])[run.t > 8.0])
     (fixed, missed), (tolerant, left) = runs.values()
     if lpm == 0.0:
         np.testing.assert_array_equal(fixed.rows, tolerant.rows)

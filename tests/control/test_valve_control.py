@@ -33,7 +33,7 @@ def followed(command, duration, **options):
     """True position, target [m] and time [s] of a run."""
     experiment = Experiment.of(rig=RIG, command=command, duration=duration, **options)
     run = simulate_experiment(experiment)
-    return run, run.truth.outputs["x"], experiment.target.at(run.truth.t)
+    return run, run.truth.outputs["x"], experiment.target.value_at(run.truth.t)
 
 
 @given(flow=st.floats(-1.6e-4, 1.6e-4), dp=st.floats(-5e6, 5e6), p_s=st.floats(6e6, 2e7))
@@ -90,7 +90,7 @@ def test_an_overlap_is_crossed():
         experiment = Experiment.of(rig=rig, command="position 20 mm sin(1.57t)", duration=8.0, controller=controller)
         run = simulate_experiment(experiment)
         late = run.truth.t >= 2.0
-        errors.append(np.sqrt(np.mean((run.truth.outputs["x"] - experiment.target.at(run.truth.t))[late] ** 2)))
+        errors.append(np.sqrt(np.mean((run.truth.outputs["x"] - experiment.target.value_at(run.truth.t))[late] ** 2)))
     assert errors[0] < 0.5 * errors[1]
 
 
