@@ -27,7 +27,7 @@ class Proportional:
     delay: int = 1  # samples
 
     @classmethod
-    def of(cls, rig):
+    def from_rig(cls, rig):
         return cls(rig.cylinder.A_A / (rig.pump.q_b / (2 * np.pi)) / rig.motor.omega_per_volt)
 
     def compiled(self):

@@ -61,7 +61,7 @@ def test_a_machine_follows_its_target_under_its_load(tmp_path):
 def test_the_controller_assumes_the_rig_as_designed_and_not_the_machine(tmp_path):
     plan = plan_of(tmp_path, PLAN)
     experiment = experiment_of(plan, cases_of(plan)[1])
-    assert experiment.controlled == Flatness.of(plan.rig) != Flatness.of(experiment.rig)
+    assert experiment.controlled == Flatness.from_rig(plan.rig) != Flatness.from_rig(experiment.rig)
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,7 @@ def followed(controller, command: str, duration: float, lpm: float = 0.0, **opti
         rig=RIG, command=command, duration=duration, controller=controller, leak=leak, set=OFF, **options
     )
     run = trajectory(experiment, experiment.leaks)
-    return run, np.broadcast_to(experiment.target.at(run.t), run.t.shape) - run["x"]
+    return run, np.broadcast_to(experiment.target.value_at(run.t), run.t.shape) - run["x"]
 
 
 def rms(values) -> float:
@@ -47,7 +47,7 @@ def rms(values) -> float:
 
 def test_the_inverse_of_a_drive_gives_the_flow_against_the_pressure():
     """Closed form: k_p (omega_d - omega) + K_i I = C_e omega + R i at constant speed and current."""
-    drive, m = Drive.of(RIG), RIG.motor
+    drive, m = Drive.from_rig(RIG), RIG.motor
     omega, dp, rate = 30.0, 2e6, 500.0
     inverse = drive.inverse(rate)
     volts = np.array([inverse(omega * drive.displacement, dp) for _ in range(5000)])
@@ -59,7 +59,7 @@ def test_the_inverse_of_a_drive_gives_the_flow_against_the_pressure():
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_the_observer_returns_the_conductance_of_a_balance_that_holds(sign):
-    balance = FaultTolerant.of(RIG).balance
+    balance = FaultTolerant.from_rig(RIG).balance
     (observer,), rate, G = observer_of(balance, 500.0), 500.0, 3e-13
     t = np.arange(10_000) / rate
     x, p = 0.05 * np.sin(1.5 * t), 1e6 + sign * 0.3e6 * np.sin(0.7 * t)
@@ -76,7 +76,7 @@ def test_the_observer_returns_the_conductance_of_a_balance_that_holds(sign):
 
 
 def test_a_leak_that_opens_at_once_is_followed_within_three_blocks_and_an_outlier_is_not():
-    balance = FaultTolerant.of(RIG).balance
+    balance = FaultTolerant.from_rig(RIG).balance
     (observer,), rate = observer_of(balance, 500.0), 500.0
     G = np.repeat([0.0, 2.6e-12], 5000)
     theta = np.cumsum(G * 3e6) / rate / balance.D
@@ -123,12 +123,12 @@ class Written:
 def test_laws_in_machine_code_are_those_in_python():
     """PI against one written out; the laws through Python, and tolerance around a controller in Python."""
     words = {"command": "position step 30 mm at 0.3 s", "duration": 6.0, "lpm": 0.5, "seed": 3}
-    pi, tolerant = PositionPI.of(RIG), FaultTolerant.of(RIG)
+    pi, tolerant = PositionPI.from_rig(RIG), FaultTolerant.from_rig(RIG)
     run, _ = followed(pi, **words)
     written, _ = followed(Written(pi), **words)
     np.testing.assert_allclose(written.volts, run.volts, rtol=0, atol=1e-12)
     np.testing.assert_allclose(written.rows, run.rows, rtol=1e-12, atol=1e-9)
-    for controller in (tolerant, Flatness.of(RIG)):
+    for controller in (tolerant, Flatness.from_rig(RIG)):
         run, _ = followed(controller, **words)
         called, _ = followed(Written(pi, controller), **words)
         np.testing.assert_array_equal(called.rows, run.rows)
@@ -141,22 +141,22 @@ def test_laws_in_machine_code_are_those_in_python():
 
 @pytest.mark.slow
 def test_without_a_leak_tolerance_costs_nothing_to_the_last_bit():
-    plain, _ = followed(PositionPI.of(RIG), SINE, 12.0, seed=4)
-    tolerant, _ = followed(FaultTolerant.of(RIG), SINE, 12.0, seed=4)
+    plain, _ = followed(PositionPI.from_rig(RIG), SINE, 12.0, seed=4)
+    tolerant, _ = followed(FaultTolerant.from_rig(RIG), SINE, 12.0, seed=4)
     np.testing.assert_array_equal(plain.rows, tolerant.rows)
     assert not tolerant.compensated.any()
 
 
 @pytest.mark.parametrize("lpm", [0.5, *(pytest.param(lpm, marks=pytest.mark.slow) for lpm in (0.0042, 0.05))])
 def test_a_leak_under_2_kN_is_tracked_held_and_reported(lpm):
-    _, healthy = followed(PositionPI.of(RIG), SINE, 16.0)
-    run, error = followed(FaultTolerant.of(RIG), SINE, 16.0, lpm)
+    _, healthy = followed(PositionPI.from_rig(RIG), SINE, 16.0)
+    run, error = followed(FaultTolerant.from_rig(RIG), SINE, 16.0, lpm)
     late = run.t > 8.0
     assert rms(error[late]) < 1.1 * rms(healthy[late])
     assert rms(error[late]) < 0.01 * 40e-3
     flow = conductance(lpm) * (run["p_A"] - run["p_B"])
     assert np.mean(run.compensated[late]) == pytest.approx(np.mean(flow[late]), rel=0.1)
-    held, error = followed(FaultTolerant.of(RIG), "position 0 mm sin(t)", 20.0, lpm)
+    held, error = followed(FaultTolerant.from_rig(RIG), "position 0 mm sin(t)", 20.0, lpm)
     still = held.t > 10.0
     drift = np.polyfit(held.t[still], held["x"][still], 1)[0]
     assert abs(drift) * 60e3 < 0.1  # mm/min
@@ -180,7 +180,7 @@ def test_a_single_rod_is_served_as_well(lpm, load):
             set={"F_pr": 120.0, "F_cfr": 6e-5, "F_v": 2400.0, "K_oil": 800e6, "F_l": load},
         )  # fmt: skip
         run = trajectory(experiment, experiment.leaks)
-        runs[name] = run, rms((experiment.target.at(run.t) - run["x"])[run.t > 8.0])
+        runs[name] = run, rms((experiment.target.value_at(run.t) - run["x"])[run.t > 8.0])
     (fixed, missed), (tolerant, left) = runs.values()
     if lpm == 0.0:
         np.testing.assert_array_equal(fixed.rows, tolerant.rows)
@@ -194,7 +194,7 @@ def test_a_single_rod_is_served_as_well(lpm, load):
 @pytest.mark.slow
 @pytest.mark.parametrize("lpm", [0.0042, 0.5])
 def test_a_step_of_100_mm_under_2_kN_is_held_with_a_leak(lpm):
-    run, error = followed(FaultTolerant.of(RIG), "position step 100 mm at 1 s", 24.0, lpm)
+    run, error = followed(FaultTolerant.from_rig(RIG), "position step 100 mm at 1 s", 24.0, lpm)
     assert np.abs(error[run.t > 12.0]).max() < 60e-6
     assert abs(np.polyfit(run.t[run.t > 16.0], run["x"][run.t > 16.0], 1)[0]) * 60e3 < 0.1
     assert run["x"].max() < 0.104
@@ -205,10 +205,10 @@ def test_stiffness_comes_back_to_that_of_a_machine_without_a_leak():
     """A load that ends, 0.5 L/min: the fixed controller needs its integral for the leak, and deviates twice as much."""
     deviation = {}
     for name, controller, lpm in (
-        ("healthy", PositionPI.of(RIG), 0.0),
-        ("fixed", PositionPI.of(RIG), 0.5),
-        ("tolerant", FaultTolerant.of(RIG), 0.5),
-        ("ideal", FaultTolerant.of(RIG, known=conductance(0.5)), 0.5),
+        ("healthy", PositionPI.from_rig(RIG), 0.0),
+        ("fixed", PositionPI.from_rig(RIG), 0.5),
+        ("tolerant", FaultTolerant.from_rig(RIG), 0.5),
+        ("ideal", FaultTolerant.from_rig(RIG, known=conductance(0.5)), 0.5),
     ):
         run, error = followed(controller, "position 0 mm sin(t)", 16.0, lpm, load="step -2 kN at 10 s")
         after = run.t > 10.0
@@ -233,9 +233,11 @@ def test_what_is_made_good_is_a_channel_of_the_recording(tmp_path):
 
 @pytest.mark.parametrize("force", [0.0, pytest.param(2000.0, marks=pytest.mark.slow)])
 def test_flatness_follows_within_1_percent(force):
-    run, error = followed(Flatness.of(RIG), f"position 50 mm sin({0.5 * math.pi}t)", 10.0, load=f"{force - 2000} N")
+    run, error = followed(
+        Flatness.from_rig(RIG), f"position 50 mm sin({0.5 * math.pi}t)", 10.0, load=f"{force - 2000} N"
+    )
     assert rms(error[run.t > 4.0]) < 0.01 * 50e-3
-    run, error = followed(Flatness.of(RIG), "position step 100 mm at 1 s", 12.0, load=f"{force - 2000} N")
+    run, error = followed(Flatness.from_rig(RIG), "position step 100 mm at 1 s", 12.0, load=f"{force - 2000} N")
     assert np.abs(error[run.t > 9.0]).max() < 100e-6
     assert run["x"].max() < 0.103
 
@@ -268,8 +270,8 @@ def test_a_wrong_name_is_one_line(name, rule):
 
 def test_numbers_that_cannot_be():
     with pytest.raises(InputError, match="displacement of the drive must be > 0, got 0"):
-        replace(Drive.of(RIG), displacement=0.0)
+        replace(Drive.from_rig(RIG), displacement=0.0)
     with pytest.raises(InputError, match="v_max of the controller must be > 0, got 0"):
-        replace(Flatness.of(RIG), v_max=0.0)
+        replace(Flatness.from_rig(RIG), v_max=0.0)
     with pytest.raises(InputError, match="known of the controller must be >= 0, got -1"):
-        FaultTolerant.of(RIG, known=-1.0)
+        FaultTolerant.from_rig(RIG, known=-1.0)

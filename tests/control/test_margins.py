@@ -16,7 +16,7 @@ from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.integrate import trajectory
 
 RIG = load_rig("thesis-closed-loop")
-PI = PositionPI.of(RIG)
+PI = PositionPI.from_rig(RIG)
 
 
 @pytest.mark.parametrize(("share", "grows"), [(0.9, False), (1.1, True)])
@@ -98,8 +98,8 @@ def test_a_loop_turned_or_late_by_its_margin_passes_through_minus_one_and_by_les
 def test_tolerance_costs_no_margin_without_a_leak_and_little_with_one_where_the_rig_is_damped(speed):
     without = margins(RIG, PI, speed)
     assert without.damped
-    assert margins(RIG, FaultTolerant.of(RIG), speed) == without
-    with_one = margins(RIG, FaultTolerant.of(RIG, known=2.6e-12), speed)
+    assert margins(RIG, FaultTolerant.from_rig(RIG), speed) == without
+    with_one = margins(RIG, FaultTolerant.from_rig(RIG, known=2.6e-12), speed)
     assert with_one.phase > 0.95 * without.phase
     assert with_one.gain > 0.8 * without.gain
 

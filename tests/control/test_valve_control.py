@@ -33,13 +33,13 @@ def followed(command, duration, **options):
     """True position, target [m] and time [s] of a run."""
     experiment = Experiment.of(rig=RIG, command=command, duration=duration, **options)
     run = simulate_experiment(experiment)
-    return run, run.truth.outputs["x"], experiment.target.at(run.truth.t)
+    return run, run.truth.outputs["x"], experiment.target.value_at(run.truth.t)
 
 
 @given(flow=st.floats(-1.6e-4, 1.6e-4), dp=st.floats(-5e6, 5e6), p_s=st.floats(6e6, 2e7))
 def test_the_inverse_of_a_valve_makes_its_two_open_edges_pass_the_flow(flow, dp, p_s):
     assume(abs(flow) > 1e-7)
-    drive = replace(ValveDrive.of(RIG), p_s=p_s)
+    drive = replace(ValveDrive.from_rig(RIG), p_s=p_s)
     v, u = RIG.valve, drive.inverse(500.0)(flow, dp)
     p_A, p_B = 0.5 * (p_s + dp), 0.5 * (p_s - dp)  # over the return, Merritt's p_A + p_B = p_s
     way = v.x_max * abs(u) / v.u_N
@@ -51,7 +51,7 @@ def test_the_inverse_of_a_valve_makes_its_two_open_edges_pass_the_flow(flow, dp,
 
 
 def test_the_largest_flow_is_that_of_the_largest_voltage():
-    drive = ValveDrive.of(RIG)
+    drive = ValveDrive.from_rig(RIG)
     assert drive.steady(drive.largest(7.0)) == pytest.approx(7.0)
     assert drive.p_s == pytest.approx(7e6 + 4.9e-6 * 25 / 5e-10)  # 1500 rpm over the relief valve
     stronger = replace(drive, p_s=4 * drive.p_s)
@@ -83,20 +83,20 @@ def test_after_a_step_the_piston_stands():
 def test_an_overlap_is_crossed():
     """1 V of dead band: known to the controller, the error is a small part of what it is otherwise."""
     rig = RIG.with_overrides(dict.fromkeys(("o_PA", "o_AT", "o_PB", "o_BT"), "50[um]"))
-    knows = PositionPI.of(rig)
+    knows = PositionPI.from_rig(rig)
     assert knows.dead_volts == pytest.approx(1.0)
     errors = []
     for controller in (knows, replace(knows, dead_volts=0.0)):
         experiment = Experiment.of(rig=rig, command="position 20 mm sin(1.57t)", duration=8.0, controller=controller)
         run = simulate_experiment(experiment)
         late = run.truth.t >= 2.0
-        errors.append(np.sqrt(np.mean((run.truth.outputs["x"] - experiment.target.at(run.truth.t))[late] ** 2)))
+        errors.append(np.sqrt(np.mean((run.truth.outputs["x"] - experiment.target.value_at(run.truth.t))[late] ** 2)))
     assert errors[0] < 0.5 * errors[1]
 
 
 def test_the_loop_has_margins():
     """A stiff supply: more phase than at a pump, whose drive lags; 50 degrees and a factor of two at all speeds."""
-    controller = PositionPI.of(RIG)
+    controller = PositionPI.from_rig(RIG)
     for speed in (0.0, 0.05):
         margin = margins(RIG, controller, speed)
         assert margin.damped
@@ -105,16 +105,16 @@ def test_the_loop_has_margins():
 
 
 def test_a_valve_is_not_a_pump():
-    assert isinstance(PositionPI.of(RIG).drive, ValveDrive)
-    assert isinstance(PositionPI.of(load_rig("thesis")).drive, Drive)
-    assert Flatness.of(RIG).G == 0.0
+    assert isinstance(PositionPI.from_rig(RIG).drive, ValveDrive)
+    assert isinstance(PositionPI.from_rig(load_rig("thesis")).drive, Drive)
+    assert Flatness.from_rig(RIG).G == 0.0
     with pytest.raises(InputError, match=r"fault-tolerant controller must have a pump .* got rig servo-valve"):
-        FaultTolerant.of(RIG)
+        FaultTolerant.from_rig(RIG)
     with pytest.raises(InputError, match=r"fault-tolerant controller must have a pump"):
         controller_named("fault-tolerant-flatness", RIG)
     with pytest.raises(InputError, match=r"must have a pump-controlled rig .* ValveDrive"):
-        Drive.of(RIG)
+        Drive.from_rig(RIG)
     with pytest.raises(InputError, match=r"must have a servo valve .* got rig thesis"):
-        ValveDrive.of(load_rig("thesis"))
+        ValveDrive.from_rig(load_rig("thesis"))
     with pytest.raises(InputError, match=r"p_s of the valve must be > 0, got 0.0"):
-        replace(ValveDrive.of(RIG), p_s=0.0)
+        replace(ValveDrive.from_rig(RIG), p_s=0.0)

@@ -109,7 +109,7 @@ def _command(text: str) -> None:
 def _leak(text: str) -> None:
     leak = parse_leak(text)
     if leak is not None:
-        leak.opening.at(T)
+        leak.opening.value_at(T)
         str(leak)
 
 

@@ -87,7 +87,7 @@ def test_friction_differs_and_drifts_as_one(machines):
 )
 def test_what_drifts_within_a_record_stays_within_its_size(machines, name, low, high):
     t = np.linspace(0.0, 180.0, 1001)
-    spans = [np.ptp(d.shape.at(t)) for m in machines for d in m.drifts if d.parameter == name]
+    spans = [np.ptp(d.shape.value_at(t)) for m in machines for d in m.drifts if d.parameter == name]
     assert len(spans) == len(machines)
     assert min(spans) >= low * (1 - 1e-9)
     assert max(spans) <= high * (1 + 1e-9)
@@ -97,7 +97,7 @@ def test_what_drifts_within_a_record_stays_within_its_size(machines, name, low, 
 def test_warmer_oil_moves_friction_and_modulus_down_and_pump_leakage_up(machines):
     t = np.linspace(0.0, 180.0, 200)
     names = ("friction.F_v", "fluid.K_oil", "pump.G_pump", "sensors.p_A.noise")
-    paths = np.array([[d.shape.at(t) for n in names for d in m.drifts if d.parameter == n] for m in machines])
+    paths = np.array([[d.shape.value_at(t) for n in names for d in m.drifts if d.parameter == n] for m in machines])
     ends = paths[:, :, -1] / np.ptp(paths, axis=2)
     together = ends.T @ ends / len(machines)  # warming is the rule, so the mean belongs to it
     assert together[0, 1] > 0.2

@@ -28,16 +28,16 @@ OFF = {
     "single-rod-eha": ({"F_pr": 120.0, "F_cfr": 6e-5, "F_v": 2400.0, "K_oil": 800e6},),
 }
 
-PI = PositionPI.of(load_rig("thesis"))
+PI = PositionPI.from_rig(load_rig("thesis"))
 
 
 def followed(rig: str, target: str, duration: float, **options):
     """Run under the controller that assumes the rig as it is shipped; return the run and its error [m]."""
     experiment = Experiment.of(
-        rig=rig, command=target, duration=duration, controller=PositionPI.of(load_rig(rig)), **options
+        rig=rig, command=target, duration=duration, controller=PositionPI.from_rig(load_rig(rig)), **options
     )
     run = trajectory(experiment, ())
-    return run, np.broadcast_to(experiment.target.at(run.t), run.t.shape) - run["x"]
+    return run, np.broadcast_to(experiment.target.value_at(run.t), run.t.shape) - run["x"]
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def test_without_feed_forward_and_integral_it_lags():
         controller=replace(PI, k_i=0.0, drive=replace(PI.drive, shortfall=0.0)),
     )  # fmt: skip
     run = trajectory(experiment, ())
-    error = experiment.target.at(run.t) - run["x"]
+    error = experiment.target.value_at(run.t) - run["x"]
     assert np.sqrt(np.mean(error[run.t > 2.0] ** 2)) > 0.01 * 50e-3
 
 
@@ -168,7 +168,9 @@ def test_a_recorded_force_is_taken_as_it_was(tmp_path):
     path = tmp_path / "force  of a press.csv"
     path.write_text("t [min],F [kN],note\n1,0.5,a\n1.01,1.5,b\n1.03,-0.5,c\n")
     force = Experiment.of(load=f"file {path}", duration=1.0).load
-    np.testing.assert_allclose(force.at(np.array([0.0, 0.3, 0.6, 1.2, 9.0])), [500.0, 1000.0, 1500.0, 500.0, -500.0])
+    np.testing.assert_allclose(
+        force.value_at(np.array([0.0, 0.3, 0.6, 1.2, 9.0])), [500.0, 1000.0, 1500.0, 500.0, -500.0]
+    )
     for words, rule in (
         ("t [s],p [Pa]\n0,1\n", "columns t [s] and F [N], or F [N] with one of x [m] and v [m/s]"),
         ("t [s],F [bar]\n0,1\n1,1\n", "bar"),
@@ -182,11 +184,11 @@ def test_a_recorded_force_is_taken_as_it_was(tmp_path):
 
 def test_words_of_targets_and_loads():
     t = np.array([0.0, 0.5, 2.0])
-    np.testing.assert_allclose(parse_position("position 50 mm sin(2t) + 1 cm").at(t), 0.05 * np.sin(2 * t) + 0.01)
-    np.testing.assert_allclose(parse_position("position step 0.1 m at 1 s").at(t), [0.0, 0.0, 0.1])
-    np.testing.assert_allclose(parse_force("2 kN").at(t), 2000.0)
-    np.testing.assert_allclose(parse_force("step 500[N] at 0.01 min").at(t), [0.0, 0.0, 500.0])
-    two = parse_position("position 50 mm sin(2t) + 5 mm sin(9t)").at(t)
+    np.testing.assert_allclose(parse_position("position 50 mm sin(2t) + 1 cm").value_at(t), 0.05 * np.sin(2 * t) + 0.01)
+    np.testing.assert_allclose(parse_position("position step 0.1 m at 1 s").value_at(t), [0.0, 0.0, 0.1])
+    np.testing.assert_allclose(parse_force("2 kN").value_at(t), 2000.0)
+    np.testing.assert_allclose(parse_force("step 500[N] at 0.01 min").value_at(t), [0.0, 0.0, 500.0])
+    two = parse_position("position 50 mm sin(2t) + 5 mm sin(9t)").value_at(t)
     np.testing.assert_allclose(two, 0.05 * np.sin(2 * t) + 0.005 * np.sin(9 * t))
     trapezoid = parse_position("position trapezoid 40 mm within 1 s every 8 s")
     np.testing.assert_allclose(trapezoid.at(np.array([0.0, 0.5, 3.0, 4.25, 6.0, 8.5])), [0, 0.02, 0.04, 0.03, 0, 0.02])
@@ -200,7 +202,7 @@ def test_a_recorded_position_is_a_target(tmp_path):
     path = tmp_path / "moved  twice.csv"
     np.savetxt(path, np.c_[t, 10.0 * np.sin(t)], delimiter=",", header="t [s],x [mm]", comments="")
     target = parse_position(f"position  file {path}")
-    np.testing.assert_allclose(target.at(t), 0.01 * np.sin(t), atol=1e-9)
+    np.testing.assert_allclose(target.value_at(t), 0.01 * np.sin(t), atol=1e-9)
     assert str(target) == f"position file {path}"
     path.write_text("t [s],p_A [Pa]\n0,1\n0.1,2\n0.2,3\n")
     with pytest.raises(InputError, match="a recorded position must have the channel x"):
@@ -215,7 +217,7 @@ def test_a_recorded_position_is_a_target(tmp_path):
         ({"command": "position 400 mm sin(2t)"}, r"position must stay within the stroke, \+-300 mm, got .* mm at t = "),
         ({"load": "500"}, r"load must have its unit \(N, kN\), such as 'step 100 N', got '500'"),
         ({"load": 500.0}, r"load must be a text or a Force, got 500.0"),
-        ({"controller": PositionPI.of(load_rig("thesis"))}, r"a controller must have a target to follow"),
+        ({"controller": PositionPI.from_rig(load_rig("thesis"))}, r"a controller must have a target to follow"),
     ],
 )
 def test_a_wrong_target_or_load_is_one_line(options, rule):
@@ -231,7 +233,7 @@ def test_rates_and_voltages_that_cannot_be():
     with pytest.raises(InputError, match="rate of the controller must be a whole multiple"):
         outputs_per_sample(500.0, 333.3, 4)
     with pytest.raises(InputError, match="k_v of the controller must be >= 0, got -1"):
-        PositionPI.of(load_rig("thesis"), k_v=-1.0)
+        PositionPI.from_rig(load_rig("thesis"), k_v=-1.0)
     target = Experiment.of(rig="thesis-closed-loop", command="position 10 mm sin(t)", duration=1.0)
     with pytest.raises(InputError, match="a run of a batch must have a command, got a target"):
         simulate_batch([target])

@@ -57,7 +57,7 @@ def test_values_are_drawn_from_a_list_and_replace_the_profiles(unmodelled):
 def test_warming_oil_warms(unmodelled):
     for seed in range(10):
         machine = draw(unmodelled, seed, family="warming oil")
-        at_end = {drift.parameter: float(drift.shape.at(np.array(180.0))) for drift in machine.drifts}
+        at_end = {drift.parameter: float(drift.shape.value_at(np.array(180.0))) for drift in machine.drifts}
         assert at_end["friction.F_v"] < -0.3
         assert at_end["pump.G_pump"] > 0.9
         machine.experiment()  # every drift stays within what its parameter may be

@@ -120,10 +120,12 @@ def test_a_wander_is_the_sum_it_says_and_starts_at_nothing():
     t = np.linspace(0.0, 12.0, 700)
     wander = Wander((0.3, -0.2, 0.1), 10.0, 0.05)
     expected = 0.05 * t / 10 + sum(w * np.sin((k + 0.5) * np.pi * t / 10) for k, w in enumerate(wander.weights))
-    np.testing.assert_allclose(wander.at(t), expected, atol=1e-14)
-    assert wander.at(np.zeros(1))[0] == 0.0
-    assert np.ptp(wander.scaled(0.08).at(np.linspace(0, 10, 1001))) == pytest.approx(0.08)
-    assert tabulated(np.array([0.0, 4.0]), np.array([0.0, 0.2])).at(np.array([2.0, 9.0])) == pytest.approx([0.1, 0.2])
+    np.testing.assert_allclose(wander.value_at(t), expected, atol=1e-14)
+    assert wander.value_at(np.zeros(1))[0] == 0.0
+    assert np.ptp(wander.scaled(0.08).value_at(np.linspace(0, 10, 1001))) == pytest.approx(0.08)
+    assert tabulated(np.array([0.0, 4.0]), np.array([0.0, 0.2])).value_at(np.array([2.0, 9.0])) == pytest.approx(
+        [0.1, 0.2]
+    )
 
 
 # -- instruments ----------------------------------------------------------------------------------------------------

@@ -69,8 +69,8 @@ def test_a_drift_moves_the_noise_as_drawn(tables: dict[str, tuple[ThesisTable, .
 def moved(number: int, draw: int = 0) -> dict[str, float]:
     """By what share each parameter of a test that drifts at 9 s has moved after it; before, none has."""
     drifts = drawn_drifts(number, 9.0, draw)
-    assert [drift.shape.at(np.array(8.999)) for drift in drifts] == [0.0] * len(drifts)
-    return {drift.parameter: float(drift.shape.at(np.array(9.0))) for drift in drifts}
+    assert [drift.shape.value_at(np.array(8.999)) for drift in drifts] == [0.0] * len(drifts)
+    return {drift.parameter: float(drift.shape.value_at(np.array(9.0))) for drift in drifts}
 
 
 def test_drifts_keep_within_their_bounds_and_go_both_ways() -> None:

@@ -1,4 +1,4 @@
-"""Controllers around a rig, with parameters of their own: what they assume of the machine, not what it is."""
+"""Controllers around a rig; their parameters are assumptions of the machine, not its own values."""
 
 from sealscope.control.controller import CompiledLaw as CompiledLaw
 from sealscope.control.controller import Controller as Controller

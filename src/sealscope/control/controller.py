@@ -1,4 +1,4 @@
-"""What a controller is: started with a run, it turns each sample of its measurements into a voltage."""
+"""The interface of a controller: started with a run, it turns each sample of its measurements into a voltage."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sealscope.recordings.recording import Array
 
 
 class Measured(NamedTuple):
-    """What a controller knows at a sample.
+    """A sample of a controller's target and measurements.
 
     Time [s]; target [m]; mean speed of the target [m/s] while the voltage will act; measured position [m] from
     mid-stroke; measured pressures of the chambers [Pa]; measured angle of the motor [rad].
@@ -48,7 +48,7 @@ class CompiledLaw(NamedTuple):
 
 
 class Started:
-    """A compiled law as a function from what is measured to the voltage [V]."""
+    """A compiled law as a Python function from a `Measured` to the voltage [V]."""
 
     def __init__(self, law: CompiledLaw) -> None:
         self._law, self._measured = law, np.empty(len(Measured._fields))
@@ -56,7 +56,7 @@ class Started:
         self._blocks = law.memory.ctypes.data, self._measured.ctypes.data
 
     def __call__(self, measured: Measured) -> float:
-        """Return the voltage [V] of the next sample."""
+        """Compute the voltage [V] of the next sample."""
         self._measured[:] = measured
         volts = float(self._call(*self._blocks))
         raise_within(self._law)
@@ -76,7 +76,7 @@ LAW = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p)
 
 
 class _Called:
-    """A controller in Python as a law that is called by its address."""
+    """A controller written in Python, as a law that is called by its address."""
 
     def __init__(self, voltage: Callable[[Measured], float]) -> None:
         self._voltage, self._memory = voltage, np.full(1, math.nan)
@@ -99,13 +99,13 @@ class _Called:
 
 
 def law_of(controller: Controller) -> CompiledLaw:
-    """Return a controller's law for one run from its beginning: in machine code, or in Python behind an address."""
+    """Start a controller for one run: return its law in machine code, or in Python behind an address."""
     law: CompiledLaw | None = controller.compiled() if hasattr(controller, "compiled") else None
     return _Called(controller.start()).law if law is None else law
 
 
 def raise_within(law: CompiledLaw) -> None:
-    """Raise what a controller in Python raised when this law, or one within it, was called."""
+    """Raise the exception that a controller in Python raised within this law."""
     kept: Any = law
     while isinstance(kept, CompiledLaw):
         kept = kept.kept
@@ -155,5 +155,5 @@ class Controller(Protocol):
         ...
 
     def start(self) -> Callable[[Measured], float]:
-        """Return a function from what is measured to the voltage [V], for one run from its beginning."""
+        """Start a run: return the function from a `Measured` to the voltage [V]."""
         ...

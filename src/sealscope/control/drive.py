@@ -1,4 +1,4 @@
-"""What a drive must be told so that it gives a flow: the inverse of a pump's speed loop, or of a servo valve."""
+"""Models of a drive in controllers: the voltage for a flow, by the inverse of a pump's speed loop or of a valve."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ DRIVE = layout_of(
 
 @law
 def drive_voltage(m: Any, flow: float, dp: float) -> float:
-    """Return the voltage [V] that makes a drive give a flow [m^3/s] against p_A - p_B [Pa], sample by sample.
+    """Compute the voltage [V] at which a drive gives a flow [m^3/s] against p_A - p_B [Pa], sample by sample.
 
     `m`: a record `DRIVE`.
     """
@@ -48,14 +48,14 @@ def drive_voltage(m: Any, flow: float, dp: float) -> float:
 
 @kernel
 def lagged(values: np.ndarray, fading: float, first: float, out: np.ndarray) -> None:
-    """Write the lag of values (n,) into `out` (n,): each is held from sample to sample, `fading` of the rest stays."""
+    """Write the first-order lag of values (n,) into `out` (n,); `fading` of the difference remains after a sample."""
     for sample in range(values.size):
         out[sample] = first
         first = values[sample] + fading * (first - values[sample])
 
 
 def check_numbers(what: str, source: object, positive: Sequence[str], not_negative: Sequence[str] = ()) -> None:
-    """Raise InputError for a number of `source` that is not finite, not > 0, or not >= 0; `what` has it."""
+    """Raise InputError for a number of `source` that is not finite, not > 0, or not >= 0; `what` is its owner."""
     for name in (*positive, *not_negative):
         value = getattr(source, name)
         if not (math.isfinite(value) and (value > 0 or (value == 0 and name in not_negative))):
@@ -63,21 +63,21 @@ def check_numbers(what: str, source: object, positive: Sequence[str], not_negati
 
 
 class _Invertible(ABC):
-    """What turns a flow into a voltage by its numbers."""
+    """A model of a drive whose flow can be inverted to a voltage."""
 
     @abstractmethod
     def numbers(self, rate: float, dead: float = 0.0) -> Any:
-        """Return the numbers (1,) of the inverse, called at `rate` [Hz], as `drive_voltage` takes them."""
+        """Compute the numbers (1,) of the inverse, called at `rate` [Hz], as `drive_voltage` takes them."""
 
     def inverse(self, rate: float) -> Callable[[float, float], float]:
-        """Return the voltage [V] as a function of its flow [m^3/s] and p_A - p_B [Pa], called at `rate` [Hz]."""
+        """Build the inverse, called at `rate` [Hz]: the voltage [V] for a flow [m^3/s] and p_A - p_B [Pa]."""
         (numbers,) = self.numbers(rate)
         return lambda flow, dp: float(drive_voltage(numbers, flow, dp))
 
 
 @dataclass(frozen=True)
 class Drive(_Invertible):
-    """What a controller assumes of pump and drive.
+    """A controller's model of pump and drive.
 
     Eqs. (4.3), (4.4) without the winding's inductance: k_p (omega_d - omega) + K_i integral = C_e omega + R_c i, so
     that omega_d = omega + (C_e/k_p) s/(s + K_i/k_p) (omega + R_c i/C_e): `shortfall` C_e/k_p, `corner` K_i/k_p [1/s].
@@ -95,8 +95,8 @@ class Drive(_Invertible):
         check_numbers("the drive", self, ("displacement", "omega_per_volt"), ("shortfall", "corner", "droop"))
 
     @classmethod
-    def of(cls, rig: Rig) -> Self:
-        """Return the drive that a rig is said to have; InputError for a valve-controlled one."""
+    def from_rig(cls, rig: Rig) -> Self:
+        """Build the model of a rig's pump and drive; raise InputError for a valve-controlled rig."""
         if rig.valve.spool == "present":
             raise InputError(
                 f"a pump's drive must have a pump-controlled rig (valve.spool = absent), got {rig.name}; ValveDrive is "
@@ -112,38 +112,38 @@ class Drive(_Invertible):
         """Time [s] in which the speed loop takes up what it is short of: infinite without an integral."""
         return (1.0 + self.shortfall) / self.corner if self.corner > 0.0 else math.inf
 
-    def flow(self, u: Array, dp: Array, rate: float, settled: int = 0) -> Array:
-        """Return the flow (n,) [m^3/s] of voltages (n,) [V] at `rate` [Hz] against p_A - p_B (n,) [Pa].
+    def flow(self, u: Array, dp: Array, rate: float, settling: int = 0) -> Array:
+        """Compute the flow (n,) [m^3/s] of voltages (n,) [V] at `rate` [Hz] against p_A - p_B (n,) [Pa].
 
         The drive's law above, solved for omega: with y, omega_d + droop dp after a `lag`, omega = (omega_d + shortfall
         (y - droop dp))/(1 + shortfall). It starts from standstill, where it carries the first dp; or so that y is the
-        same after the first `settled` samples as before them.
+        same after the first `settling` samples as before them.
         """
         commanded, lift = self.omega_per_volt * u, self.droop * dp
-        wanted, late = commanded + lift, np.empty_like(commanded)
+        commanded_and_lift, late = commanded + lift, np.empty_like(commanded)
         decay, first = -1.0 / (self.lag * rate), float(lift[0])
-        if settled and decay < 0.0:
-            lagged(wanted[: settled + 1], math.exp(decay), 0.0, late[: settled + 1])
-            first = float(late[settled]) / -math.expm1(settled * decay)
-        lagged(wanted, math.exp(decay), first, late)
+        if settling and decay < 0.0:
+            lagged(commanded_and_lift[: settling + 1], math.exp(decay), 0.0, late[: settling + 1])
+            first = float(late[settling]) / -math.expm1(settling * decay)
+        lagged(commanded_and_lift, math.exp(decay), first, late)
         return np.asarray(self.displacement * (commanded + self.shortfall * (late - lift)) / (1.0 + self.shortfall))
 
     def numbers(self, rate: float, dead: float = 0.0) -> Any:
-        """Return the numbers (1,) of the inverse, called at `rate` [Hz]; `dead` is of valves alone."""
+        """Compute the numbers (1,) of the inverse, called at `rate` [Hz]; `dead` is of valves alone."""
         return record_of(DRIVE, self, fading=math.exp(-self.corner / rate))
 
     def steady(self, flow: float) -> float:
-        """Return the voltage [V] of a flow [m^3/s] that lasts, of a drive that reaches its commanded speed."""
+        """Compute the voltage [V] of a flow [m^3/s] that lasts, of a drive that reaches its commanded speed."""
         return flow / self.displacement / self.omega_per_volt
 
     def largest(self, u_max: float) -> float:
-        """Return the flow [m^3/s] at the voltage `u_max` [V]."""
+        """Compute the flow [m^3/s] at the voltage `u_max` [V]."""
         return u_max * self.omega_per_volt * self.displacement
 
 
 @dataclass(frozen=True)
 class ValveDrive(_Invertible):
-    """What a controller assumes of a servo valve and its supply.
+    """A controller's model of a servo valve and its supply.
 
     Q = Q_N u/u_N sqrt((p_s - sign(Q) dp)/(2 dp_N)) of a valve with equal edges, half of the pressure lost at each of
     the two that are open (Merritt, Hydraulic Control Systems, 1967, section 5.2); its spool is taken to be where the
@@ -159,8 +159,8 @@ class ValveDrive(_Invertible):
         check_numbers("the valve", self, ("Q_N", "dp_N", "u_N", "p_s"))
 
     @classmethod
-    def of(cls, rig: Rig) -> Self:
-        """Return the valve that a rig is said to have; InputError for a pump-controlled one."""
+    def from_rig(cls, rig: Rig) -> Self:
+        """Build the model of a rig's servo valve; raise InputError for a pump-controlled rig."""
         valve, supply = rig.valve, rig.supply
         if valve.spool == "absent":
             raise InputError(f"a valve's drive must have a servo valve (valve.spool = present), got rig {rig.name}")
@@ -175,14 +175,14 @@ class ValveDrive(_Invertible):
         return record_of(DRIVE, self, dead=dead)
 
     def steady(self, flow: float) -> float:
-        """Return the voltage [V] of a flow [m^3/s] without a load."""
+        """Compute the voltage [V] of a flow [m^3/s] without a load."""
         return self.inverse(1.0)(flow, 0.0)
 
     def largest(self, u_max: float) -> float:
-        """Return the flow [m^3/s] at the voltage `u_max` [V], without a load."""
+        """Compute the flow [m^3/s] at the voltage `u_max` [V], without a load."""
         return u_max / self.steady(1.0)
 
 
 def drive_of(rig: Rig) -> Drive | ValveDrive:
-    """Return what a rig is said to give its cylinder's flow by."""
-    return Drive.of(rig) if rig.valve.spool == "absent" else ValveDrive.of(rig)
+    """Build the model of a rig's pump and drive, or of its servo valve."""
+    return Drive.from_rig(rig) if rig.valve.spool == "absent" else ValveDrive.from_rig(rig)

@@ -1,4 +1,4 @@
-"""Control that tolerates a leak: the flow that crosses the piston is estimated, and the pump gives it beside."""
+"""Control that tolerates a leak: the flow across the piston is estimated, and the pump delivers it in addition."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ _memory_at = record_at(_MEMORY)
 
 
 @entry
-def _tolerant_law(memory: Any, given: Any) -> Any:
-    m, measured = _memory_at(memory), measured_at(given)
-    u = call_at(int(m.inner), int(m.its_memory), address_of(given))
+def _tolerant_law(memory: Any, sample: Any) -> Any:
+    m, measured = _memory_at(memory), measured_at(sample)
+    u = call_at(int(m.inner), int(m.its_memory), address_of(sample))
     if math.isnan(m.mean_A):
         m.mean_A, m.mean_B = measured.p_A, measured.p_B
     m.mean_A += m.averaged * (measured.p_A - m.mean_A)
@@ -53,13 +53,13 @@ def _tolerant_law(memory: Any, given: Any) -> Any:
         observed(o, measured.theta, measured.x, measured.p_A, measured.p_B)
         G, sd, blocks = conductance(o)
         above = G - m.G_assumed
-        wanted = 0.0
+        target_G = 0.0
         if blocks >= _FEWEST:
             unseen = _COUNTS * o.x_step * min(o.area_A, o.area_B) / max(abs(over), 1.0)
             needed = (0.5 if m.stands_out > 0.0 else 1.0) * max(_SIGNIFICANT * sd, unseen)
             m.stands_out = 1.0 if above > needed else 0.0
-            wanted = above if above > needed else 0.0
-        m.G += m.blended * (wanted - m.G)
+            target_G = above if above > needed else 0.0
+        m.G += m.blended * (target_G - m.G)
         if m.stands_out == 0.0 and m.G < 1e-18:
             m.G = 0.0
     if m.G == 0.0:
@@ -71,7 +71,7 @@ def _tolerant_law(memory: Any, given: Any) -> Any:
 
 @dataclass(frozen=True)
 class FaultTolerant:
-    """A controller beside which the leakage across the piston is made good: u = u_inner + inverse of (G dp).
+    """A controller that makes good the leakage across the piston: u = u_inner + inverse of (G dp).
 
     `inner` is any controller; G [m^3/(s Pa)] comes from a Kalman filter (`observed`) on the controller's own signals,
     less the pump's `G_assumed`, and is 0 until it stands out of its own deviation and of a count of the encoder:
@@ -87,12 +87,12 @@ class FaultTolerant:
     known: float | None = None
 
     def __post_init__(self) -> None:
-        given = ("G_assumed",) if self.known is None else ("G_assumed", "known")
-        check_numbers("the controller", self, ("u_max",), given)
+        not_negative = ("G_assumed",) if self.known is None else ("G_assumed", "known")
+        check_numbers("the controller", self, ("u_max",), not_negative)
 
     @classmethod
-    def of(cls, rig: Rig, inner: Controller | None = None, *, known: float | None = None) -> Self:
-        """Return the controller for what a rig is said to be, around `inner`, by default `PositionPI`."""
+    def from_rig(cls, rig: Rig, inner: Controller | None = None, *, known: float | None = None) -> Self:
+        """Build the controller from a rig's parameters around `inner`, by default `PositionPI`."""
         from sealscope.physics.cylinder import volumes_at_middle
 
         c, sensors, makeup = rig.cylinder, rig.sensors, rig.makeup
@@ -112,7 +112,9 @@ class FaultTolerant:
             math.hypot(max(sensors.p_A.noise, sensors.p_B.noise), sensors.common_noise),
             SHUT * (makeup.p_crack + makeup.p_open) if pilots else 0.0,
         )
-        return cls(inner or PositionPI.of(rig), Drive.of(rig), balance, rig.daq.u_max, rig.pump.G_pump, known)
+        return cls(
+            inner or PositionPI.from_rig(rig), Drive.from_rig(rig), balance, rig.daq.u_max, rig.pump.G_pump, known
+        )
 
     @property
     def rate(self) -> float:
@@ -125,11 +127,11 @@ class FaultTolerant:
         return self.inner.delay
 
     def start(self) -> Callable[[Measured], float]:
-        """Return a function from what is measured to the voltage [V], for one run from its beginning."""
+        """Start a run: return the function from a `Measured` to the voltage [V]."""
         return Started(self.compiled())
 
     def compiled(self) -> CompiledLaw:
-        """Return the law in machine code, for one run from its beginning; it calls the inner one."""
+        """Start a run: return the law in machine code, which calls the inner one."""
         inner, rate = law_of(self.inner), self.rate
         memory = record_of(
             _MEMORY,

@@ -1,4 +1,4 @@
-"""Flatness-based control of the piston's position: the target alone says what every state of the machine must be."""
+"""Flatness-based control of the piston's position: the target determines every state of the machine."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from sealscope.compiled import entry, layout_of, record_at, record_of
 from sealscope.control.controller import CompiledLaw, Measured, Started, measured_at
 from sealscope.control.drive import DRIVE, Drive, ValveDrive, check_numbers, drive_of, drive_voltage
-from sealscope.control.position import FOLLOWING, PositionPI, followed
+from sealscope.control.position import FOLLOWING, PositionPI, following_voltage
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -29,8 +29,8 @@ _memory_at = record_at(_MEMORY)
 
 
 @entry
-def _flatness_law(memory: Any, given: Any) -> Any:
-    m, measured = _memory_at(memory), measured_at(given)
+def _flatness_law(memory: Any, sample: Any) -> Any:
+    m, measured = _memory_at(memory), measured_at(sample)
     f, first = m.feedback, m.first > 0.0
     v = measured.target_speed if abs(measured.target_speed) <= m.v_max else 0.0
     a = 0.0 if first else (v - m.v) / m.T
@@ -43,13 +43,13 @@ def _flatness_law(memory: Any, given: Any) -> Any:
     rate = 0.0 if first else (dp - m.dp) / m.T
     flow = m.G * dp + m.C * rate
     m.v, m.dp, m.first = v, dp, 0.0
-    u = followed(f, measured) + drive_voltage(m.drive, flow, dp)
+    u = following_voltage(f, measured) + drive_voltage(m.drive, flow, dp)
     return min(max(u, -f.u_max), f.u_max)
 
 
 @dataclass(frozen=True)
 class Flatness:
-    """Feed-forward of all that the target asks of the machine, beside the feedback of a PI controller.
+    """Feed-forward of the forces and flows that the target requires, and the feedback of a PI controller.
 
     The position is a flat output of the machine: with x = target, v and a its derivatives,
     F = M a + F_f(v) + F_load, dp = F/A, Q = A v + G dp + dp'/(1/C), u = the drive's inverse of (Q, dp).
@@ -77,14 +77,14 @@ class Flatness:
         check_numbers("the controller", self, ("v_th", "v_max"), ("M", "F_C", "F_v", "G", "C"))
 
     @classmethod
-    def of(cls, rig: Rig) -> Self:
-        """Return the controller for what a rig is said to be."""
+    def from_rig(cls, rig: Rig) -> Self:
+        """Build the controller from a rig's parameters."""
         cylinder, friction, drive = rig.cylinder, rig.friction, drive_of(rig)
         greatest = drive.largest(rig.daq.u_max) / min(cylinder.A_A, cylinder.A_B)
         by_valve = rig.valve.spool == "present"
         charge = 0.5 * (drive.p_s + 2.0 * rig.supply.p_return) if isinstance(drive, ValveDrive) else rig.fluid.p_charge
         return cls(
-            PositionPI.of(rig),
+            PositionPI.from_rig(rig),
             drive,
             cylinder.M_eq,
             friction.F_pr + 2.0 * friction.F_cfr * charge,
@@ -106,11 +106,11 @@ class Flatness:
         return self.feedback.delay
 
     def start(self) -> Callable[[Measured], float]:
-        """Return a function from what is measured to the voltage [V], for one run from its beginning."""
+        """Start a run: return the function from a `Measured` to the voltage [V]."""
         return Started(self.compiled())
 
     def compiled(self) -> CompiledLaw:
-        """Return the law in machine code, for one run from its beginning."""
+        """Start a run: return the law in machine code."""
         T = 1.0 / self.rate
         memory = record_of(
             _MEMORY,

@@ -119,13 +119,13 @@ def _close(m: Any, total: float) -> None:
 
 @law
 def conductance(m: Any) -> tuple[float, float, float]:
-    """Return the estimated conductance [m^3/(s Pa)], its deviation, and how many blocks were used."""
+    """Return the estimated conductance [m^3/(s Pa)], its deviation, and the number of blocks used."""
     return m.state[0], math.sqrt(m.P[0, 0]), m.used
 
 
 @dataclass(frozen=True)
 class Balance:
-    """What the observer assumes: displacement `D` [m^3/rad], areas [m^2], volumes at mid-stroke [m^3], `K` [Pa].
+    """The observer's model: displacement `D` [m^3/rad], areas [m^2], volumes at mid-stroke [m^3], `K` [Pa].
 
     `x_step` [m]: a count of the encoder; `noise` [Pa]: deviation of a sample of the pressures; `shut` [Pa]: the least
     |p_A - p_B| at which the valve of the side with the higher pressure is shut.
@@ -143,7 +143,7 @@ class Balance:
 
 
 def observer_of(balance: Balance, rate: float) -> Any:
-    """Return the record (1,) of an observer that has seen nothing, as `observed` takes it."""
+    """Make the record (1,) of an observer before its first sample."""
     return record_of(
         OBSERVER,
         balance,

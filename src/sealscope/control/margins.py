@@ -1,4 +1,4 @@
-"""Margins of a loop: how much gain, phase and delay it has in hand, from rig and controller as they are."""
+"""Margins of a loop: the gain, phase and delay that it tolerates, from rig and controller as they are."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Margins:
 
 
 def margins(rig: Rig, controller: Controller, speed: float = 0.0, load: float = 0.0) -> Margins:
-    """Return the margins of the loop of a rig and a controller, cut at the voltage.
+    """Compute the margins of the loop of a rig and a controller, cut at the voltage.
 
     The rig is linearised over one sample of the controller, about a piston that moves at `speed` [m/s], 0: at
     standstill, under `load` [N] beside the rig's own: y(k+1) = A y(k) + B u(k), by differences of the solver's own
@@ -61,7 +61,7 @@ def margins(rig: Rig, controller: Controller, speed: float = 0.0, load: float = 
     >>> import sealscope as ss
     >>> from sealscope.control import PositionPI, margins
     >>> rig = ss.load_rig("thesis-closed-loop")
-    >>> loop = margins(rig, PositionPI.of(rig), speed=0.01)
+    >>> loop = margins(rig, PositionPI.from_rig(rig), speed=0.01)
     >>> loop.gain > 2.0 and loop.phase > 0.7
     True
     """
@@ -73,13 +73,13 @@ def margins(rig: Rig, controller: Controller, speed: float = 0.0, load: float = 
 def open_loop(
     rig: Rig, controller: Controller, f: Array, speed: float = 0.0, load: float = 0.0
 ) -> tuple[NDArray[np.complex128], bool]:
-    """Return L (n,) at the frequencies `f` (n,) [Hz], and whether the rig rings down by itself: see `margins`."""
-    A, B, about = _linearised(rig, controller.rate, speed, load)
+    """Compute L (n,) at the frequencies `f` (n,) [Hz], and whether the rig rings down by itself (`margins`)."""
+    A, B, state = _linearised(rig, controller.rate, speed, load)
     z = np.exp(2j * math.pi * f / controller.rate)
     values, vectors = np.linalg.eig(A)
     inputs = np.linalg.solve(vectors, B.astype(complex))
     L = np.zeros(f.size, dtype=complex)
-    for row, answer in _answers(controller, about):
+    for row, answer in _answers(controller, state):
         plant = (vectors[row] * inputs / (z[:, None] - values)).sum(axis=1)
         L -= _of_impulse(answer, z) * plant
     return L * z**-controller.delay, bool(np.abs(values).max() < 1.0 + 1e-6)
@@ -97,7 +97,7 @@ def _linearised(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array
     h, implicit, euler = 1.0 / (rate * steps), IMPLICIT if p.throttled else EXPLICIT, rig.motor.integrator == "euler"
     nodes = nodes_of(implicit, h).size
 
-    def advanced(y: Array, u: float, samples: int = 1) -> Array:
+    def advance_state(y: Array, u: float, samples: int = 1) -> Array:
         n = samples * steps
         after, rows = np.array(y), np.empty((samples, len(OUTPUTS)))
         volts, none, force = np.full((n, nodes), u), np.zeros((n, nodes)), np.full((n, nodes), load)
@@ -109,35 +109,35 @@ def _linearised(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array
         u = drive_of(rig).steady(speed * rig.cylinder.A_A)
         samples, limit = round(_SETTLING * rate), rig.daq.u_max
 
-        def moving(u: float) -> tuple[Array, float]:
-            """Return a state that moves, and its mean speed: it may ring."""
-            begun = advanced(y, u, samples)
-            ended = advanced(begun, u, samples)
-            return ended, float(ended[POSITION] - begun[POSITION]) * rate / samples
+        def find_moving_state(u: float) -> tuple[Array, float]:
+            """Simulate a piston that moves; return its state, which may ring, and its mean speed."""
+            first_state = advance_state(y, u, samples)
+            last_state = advance_state(first_state, u, samples)
+            return last_state, float(last_state[POSITION] - first_state[POSITION]) * rate / samples
 
-        _, held = moving(0.0)  # the load may move a piston whose drive gives way
+        _, speed_at_rest = find_moving_state(0.0)  # the load may move a piston whose drive gives way
         for _ in range(5):  # the drive falls short of its command
-            state, reached = moving(min(max(u, -limit), limit))
-            gained = reached - held
-            u *= min(max((speed - held) / gained, 0.2), 5.0) if gained * speed > 0.0 else 1.5
+            state, reached = find_moving_state(min(max(u, -limit), limit))
+            gained = reached - speed_at_rest
+            u *= min(max((speed - speed_at_rest) / gained, 0.2), 5.0) if gained * speed > 0.0 else 1.5
         if not abs(reached - speed) < 0.2 * abs(speed):
             raise InputError(f"speed must be one that the drive can give, got {speed:g} m/s")
         y = state
         y[VELOCITY], y[POSITION] = speed, 0.0
     columns: list[Array] = []
     for k, size in enumerate(_SIZES):
-        moved = np.zeros(y.size)
-        moved[k] = size
-        columns.append((advanced(y + moved, u) - advanced(y - moved, u)) / (2.0 * size))
-    B = (advanced(y, u + 1e-3) - advanced(y, u - 1e-3)) / 2e-3
+        shift = np.zeros(y.size)
+        shift[k] = size
+        columns.append((advance_state(y + shift, u) - advance_state(y - shift, u)) / (2.0 * size))
+    B = (advance_state(y, u + 1e-3) - advance_state(y, u - 1e-3)) / 2e-3
     return np.stack(columns, axis=1), B, y
 
 
-def _answers(controller: Controller, about: Array) -> list[tuple[int, Array]]:
-    """Return, for each state that is measured, its row and the controller's answer to a unit impulse of it."""
+def _answers(controller: Controller, state: Array) -> list[tuple[int, Array]]:
+    """Compute the controller's answer to a unit impulse of each measured state, with the state's row."""
     from sealscope.physics.state import P_A, P_B, POSITION, THETA
 
-    standstill = Measured(0.0, 0.0, 0.0, 0.0, float(about[P_A]), float(about[P_B]), 0.0)
+    standstill = Measured(0.0, 0.0, 0.0, 0.0, float(state[P_A]), float(state[P_B]), 0.0)
     n = round(_MEMORY * controller.rate)
 
     def answer(first: Measured) -> Array:
@@ -147,18 +147,18 @@ def _answers(controller: Controller, about: Array) -> list[tuple[int, Array]]:
         return np.array([voltage(first), *(voltage(standstill) for _ in range(n - 1))])
 
     quiet = answer(standstill)
-    asked = (
+    impulses = (
         (POSITION, _IMPULSE_X, standstill._replace(x=_IMPULSE_X)),
         (P_A, _IMPULSE_P, standstill._replace(p_A=standstill.p_A + _IMPULSE_P)),
         (P_B, _IMPULSE_P, standstill._replace(p_B=standstill.p_B + _IMPULSE_P)),
         (THETA, _IMPULSE_THETA, standstill._replace(theta=_IMPULSE_THETA)),
     )
-    answers = [(row, (answer(first) - quiet) / size) for row, size, first in asked]
+    answers = [(row, (answer(first) - quiet) / size) for row, size, first in impulses]
     return [(row, values) for row, values in answers if np.any(values)]
 
 
 def _of_impulse(answer: Array, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Return sum_n a_n z^-n of an answer that stays at its last value: an integrator's."""
+    """Compute sum_n a_n z^-n of an answer that stays at its last value: an integrator's."""
     tail = answer[-1]
     changing = answer - tail
     last = int(np.flatnonzero(np.abs(changing) > 1e-9 * np.abs(answer).max())[-1]) + 1 if np.any(changing) else 0
@@ -169,7 +169,7 @@ def _of_impulse(answer: Array, z: NDArray[np.complex128]) -> NDArray[np.complex1
 
 
 def margins_of(f: Array, L: NDArray[np.complex128], speed: float = 0.0, damped: bool = True) -> Margins:
-    """Return the margins of a loop L (n,) over frequencies `f` (n,) [Hz], linear between them: see `Margins`."""
+    """Compute the margins of a loop L (n,) over frequencies `f` (n,) [Hz], linear between them: see `Margins`."""
     places = np.arange(f.size)
     unit, turned = _crossings(np.abs(L) - 1.0), _crossings(L.imag)
     crossover, ahead = np.interp(unit, places, f), np.angle(-np.interp(unit, places, L))
@@ -182,6 +182,6 @@ def margins_of(f: Array, L: NDArray[np.complex128], speed: float = 0.0, damped: 
 
 
 def _crossings(values: Array) -> Array:
-    """Return the places, whole numbers those of the values, at which a line through the values changes its sign."""
+    """Find the places, in fractions of an index, at which a line through the values changes its sign."""
     k = np.flatnonzero(np.diff(values > 0.0))
     return k + values[k] / (values[k] - values[k + 1])

@@ -27,8 +27,8 @@ _memory_at = record_at(FOLLOWING)
 
 
 @law
-def followed(m: Any, measured: Any) -> float:
-    """Return the voltage [V] of the PI law over the inverse of a drive; `m`: a record `FOLLOWING`."""
+def following_voltage(m: Any, measured: Any) -> float:
+    """Compute the voltage [V] of the PI law and the inverse of a drive; `m`: a record `FOLLOWING`."""
     m.dp += m.averaged * (measured.p_A - measured.p_B - m.dp)
     error = measured.target - measured.x
     velocity = measured.target_speed + m.k_v * error + m.integral
@@ -41,12 +41,12 @@ def followed(m: Any, measured: Any) -> float:
 
 @entry
 def _position_law(memory: Any, measured: Any) -> Any:
-    return followed(_memory_at(memory), measured_at(measured))
+    return following_voltage(_memory_at(memory), measured_at(measured))
 
 
 @dataclass(frozen=True)
 class PositionPI:
-    """A PI controller of the position with feed-forward of velocity, and what it assumes of machine and drive.
+    """A PI controller of the position with feed-forward of velocity; its fields are its assumptions of the machine.
 
     v_c = v_target + k_v e + k_i integral of e, e = target - x; the voltage is the drive's inverse (`Drive`,
     `ValveDrive`) of the flow v_c A, with the area A of the side that carries the load (the higher pressure). A pump's
@@ -77,8 +77,8 @@ class PositionPI:
         check_numbers("the controller", self, positive, rest)
 
     @classmethod
-    def of(cls, rig: Rig, **gains: float) -> Self:
-        """Return the controller for what a rig is said to be, by its pump or servo valve; `gains`: further fields."""
+    def from_rig(cls, rig: Rig, **gains: float) -> Self:
+        """Build the controller from a rig's parameters, for its pump or servo valve; `gains`: further fields."""
         valve, drive = rig.valve, drive_of(rig)
         gains.setdefault("dead_band", 1.5 * rig.sensors.x.resolution)
         if isinstance(drive, Drive):
@@ -89,15 +89,15 @@ class PositionPI:
         return cls(rig.cylinder.A_A, rig.cylinder.A_B, drive, rig.daq.u_max, **gains)  # type: ignore[arg-type]
 
     def start(self) -> Callable[[Measured], float]:
-        """Return a function from what is measured to the voltage [V], for one run from its beginning."""
+        """Start a run: return the function from a `Measured` to the voltage [V]."""
         return Started(self.compiled())
 
     def compiled(self) -> CompiledLaw:
-        """Return the law in machine code, for one run from its beginning."""
+        """Start a run: return the law in machine code."""
         return CompiledLaw(_position_law.address, self.memory().view(np.float64))
 
     def memory(self) -> Any:
-        """Return the record (1,) of the law as `followed` takes it."""
+        """Make the record (1,) that `following_voltage` takes."""
         T = 1.0 / self.rate
         return record_of(
             FOLLOWING,

@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
 #: What makes each built-in controller for what a rig is said to be.
 CONTROLLERS: Mapping[str, Callable[[Rig], Controller]] = {
-    "pi": PositionPI.of,
-    "flatness": Flatness.of,
-    "fault-tolerant": FaultTolerant.of,
-    "fault-tolerant-flatness": lambda rig: FaultTolerant.of(rig, Flatness.of(rig)),
+    "pi": PositionPI.from_rig,
+    "flatness": Flatness.from_rig,
+    "fault-tolerant": FaultTolerant.from_rig,
+    "fault-tolerant-flatness": lambda rig: FaultTolerant.from_rig(rig, Flatness.from_rig(rig)),
 }
 
 
@@ -44,12 +44,12 @@ def _installed() -> Mapping[str, EntryPoint]:
 
 
 def is_installed(name: str) -> bool:
-    """Return whether a controller of this name is built in or installed, and no program that the name leads to."""
+    """Return whether a controller of this name is built in or installed, and no program of the name's own."""
     return name in CONTROLLERS or name in _installed()
 
 
 def check_name(name: str) -> None:
-    """Raise InputError where no controller can be called so; nothing is imported for that."""
+    """Raise InputError where no controller can have this name; nothing is imported."""
     place, mark, attribute = name.rpartition(":")
     if not is_installed(name) and not (mark and place and attribute):
         known = (*CONTROLLERS, *_installed())
@@ -60,11 +60,11 @@ def check_name(name: str) -> None:
 
 
 def controller_named(name: str, rig: Rig) -> Controller:
-    """Return the controller of a name for what a rig is said to be.
+    """Make the controller of a name from a rig's parameters.
 
     `name`: one of `CONTROLLERS` or of an installed one, or ``MODULE:NAME`` or ``FILE.py:NAME`` of a class or function:
-    called with the rig; where it has a method `of`, that is called instead. Raises InputError for an unknown name, and
-    for what is made without `rate`, `delay` and `start`.
+    called with the rig; where it has a method `from_rig`, that is called instead. Raises InputError for an unknown
+    name, and for a controller without `rate`, `delay` and `start`.
 
     Examples
     --------
@@ -79,19 +79,20 @@ def controller_named(name: str, rig: Rig) -> Controller:
     place, _, attribute = name.rpartition(":")
     try:
         make: Any = _installed()[name].load() if name in _installed() else getattr(_module(place), attribute)
-        made = make.of(rig) if hasattr(make, "of") else make(rig)
+        build = getattr(make, "from_rig", None) or getattr(make, "of", make)  # `of`: the former name
+        controller = build(rig)
     except InputError:
         raise
     except Exception as error:  # a user's code may raise anything
         raise InputError(f"controller {name} could not be made: {type(error).__name__}: {error}") from error
-    missing = [part for part in ("rate", "delay", "start") if not hasattr(made, part)]
+    missing = [part for part in ("rate", "delay", "start") if not hasattr(controller, part)]
     if missing:
         raise InputError(f"a controller must have rate, delay and start, got {name} without {', '.join(missing)}")
-    return made  # type: ignore[no-any-return]
+    return controller  # type: ignore[no-any-return]
 
 
 def source_of(name: str) -> Path | None:
-    """Return the file that a user's own or an installed controller is written in, None for a built-in one.
+    """Find the source file of a user's own or an installed controller; None for a built-in one.
 
     Nothing is imported for that. Raises InputError where there is no such file.
     """
@@ -105,7 +106,7 @@ def source_of(name: str) -> Path | None:
 
 
 def _file_of(module: str) -> Path | None:
-    """Return the file of a module, whose packages are not imported."""
+    """Find the file of a module without importing its packages."""
     parts, folders = module.split("."), None
     for count in range(1, len(parts) + 1):
         name = ".".join(parts[:count])

@@ -33,7 +33,7 @@ def _checked(k: int, n: int) -> None:
 
 
 def clopper_pearson(k: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Return the exact interval (low, high) of a binomial probability after `k` of `n`.
+    """Compute the exact interval (low, high) of a binomial probability after `k` of `n`.
 
     It covers at least as often as it says: ``low = B(alpha/2; k, n-k+1), high = B(1-alpha/2; k+1, n-k)``, B the
     quantile of the beta distribution and alpha = 1 - confidence; 0 and 1 where k is 0 or n. Raises InputError for an
@@ -50,7 +50,7 @@ def clopper_pearson(k: int, n: int, confidence: float = 0.95) -> tuple[float, fl
 
 
 def proportion(k: int, n: int, confidence: float = 0.95) -> Proportion:
-    """Return the proportion `k` of `n` with its Clopper-Pearson interval; nothing is known where n is 0."""
+    """Compute the proportion `k` of `n` with its Clopper-Pearson interval; from 0 to 1 where n is 0."""
     k, n = int(k), int(n)
     share(confidence, "confidence")
     if n == 0 and k == 0:
@@ -60,7 +60,7 @@ def proportion(k: int, n: int, confidence: float = 0.95) -> Proportion:
 
 
 def lower_bound(k: int, n: int, confidence: float = 0.95) -> float:
-    """Return the one-sided exact lower bound of a binomial probability, ``B(1 - confidence; k, n-k+1)``.
+    """Compute the one-sided exact lower bound of a binomial probability, ``B(1 - confidence; k, n-k+1)``.
 
     29 of 29 show 90 % at 95 %.
     """
@@ -71,7 +71,7 @@ def lower_bound(k: int, n: int, confidence: float = 0.95) -> float:
 
 
 def at_least(k: int, n: int, p: float = 0.5) -> float:
-    """Return the probability of `k` or more successes in `n` trials of probability `p`.
+    """Compute the probability of `k` or more successes in `n` trials of probability `p`.
 
     ``I_p(k, n-k+1)``, 1 for k = 0.
 
@@ -86,7 +86,7 @@ def at_least(k: int, n: int, p: float = 0.5) -> float:
 
 
 def sign_test(k: int, n: int) -> float:
-    """Return the two-sided exact p-value of `k` changes one way out of `n` when either way is as likely.
+    """Compute the two-sided exact p-value of `k` changes one way out of `n` where either way is as likely.
 
     ``min(1, 2 P(X >= max(k, n-k)))``. Changes of exactly zero are to be left out of `n`. Source: Arbuthnot, Phil.
     Trans. 27 (1710) 186-190; Conover, Practical Nonparametric Statistics, 3rd ed. (1999), section 3.4.
@@ -96,7 +96,7 @@ def sign_test(k: int, n: int) -> float:
 
 
 def holm(p: Sequence[float]) -> tuple[float, ...]:
-    """Return p-values corrected for having looked at all of them, in the order given.
+    """Correct p-values for their number, in the order given.
 
     The i-th smallest of m (i from 0) becomes ``max over j <= i of min(1, (m - j) p_(j))``. Raises InputError for a
     value outside 0..1. Source: Holm, Scand. J. Statist. 6 (1979) 65-70.

@@ -1,4 +1,4 @@
-"""Checks of the numbers that an evaluation is given, each with one line of complaint."""
+"""Checks of the numbers of an evaluation, each with a message of one line."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Array = npt.NDArray[np.float64]
 
 
 def numbers(values: npt.ArrayLike, what: str) -> Array:
-    """Return `values` as a flat array of one finite double or more; InputError names the first that is not one."""
+    """Convert `values` to a flat array of finite doubles, one or more; InputError names the first that is not."""
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
@@ -27,7 +27,7 @@ def numbers(values: npt.ArrayLike, what: str) -> Array:
 
 
 def sizes(values: npt.ArrayLike, what: str = "leak sizes") -> Array:
-    """Return `values` as sizes of leaks, all > 0: records without a leak belong to the false alarms."""
+    """Convert `values` to sizes of leaks, all > 0: records without a leak belong to the false alarms."""
     array = numbers(values, what)
     bad = np.flatnonzero(array <= 0.0)
     if bad.size:
@@ -36,7 +36,7 @@ def sizes(values: npt.ArrayLike, what: str = "leak sizes") -> Array:
 
 
 def flags(values: npt.ArrayLike, n: int, what: str) -> npt.NDArray[np.bool_]:
-    """Return `values` as n answers yes or no (True/False or 1/0)."""
+    """Convert `values` to n truth values (True/False or 1/0)."""
     array = numbers(np.asarray(values, dtype=np.float64), what)
     if array.size != n:
         raise InputError(f"{what} must be as many as the records, got {array.size} for {n}")
@@ -51,7 +51,7 @@ LEAST_SHARE = 1e-15
 
 
 def share(value: float, what: str) -> float:
-    """Return `value`, a probability strictly between 0 and 1, and not so small that its inverse overflows."""
+    """Convert `value` to a probability strictly between 0 and 1 whose inverse does not overflow."""
     if not 0.0 < value < 1.0:
         raise InputError(f"{what} must be between 0 and 1, got {value}")
     if value < LEAST_SHARE:

@@ -1,4 +1,4 @@
-"""Errors of what a detector states: quantiles and means with intervals, errors of an onset and of a flow."""
+"""Errors of stated values: quantiles and means with intervals, errors of an onset and of a flow."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class EstimateErrors:
 
 
 def order_ranks(n: int, order: float, confidence: float = 0.95) -> tuple[int, int]:
-    """Return the ranks (r, s) of the order statistics that hold the `order` quantile with at least `confidence`.
+    """Find the ranks (r, s) of the order statistics that hold the `order` quantile with at least `confidence`.
 
     r is the largest with ``P(X <= r - 1) <= alpha/2``, s the smallest with ``P(X >= s) <= alpha/2``, X binomial (n,
     order); r = 0 and s = n + 1 stand for no bound. Raises InputError for an impossible order or confidence. Source:
@@ -48,7 +48,7 @@ def order_ranks(n: int, order: float, confidence: float = 0.95) -> tuple[int, in
 
 
 def quantile_of(values: npt.ArrayLike, order: float, confidence: float = 0.95) -> IntervalEstimate:
-    """Return the `order` quantile of a sample, ``x_(ceil(n order))``, and its order-statistic interval.
+    """Compute the `order` quantile of a sample, ``x_(ceil(n order))``, and its order-statistic interval.
 
     The interval holds for any distribution; it is infinite where the sample is too small to bound the quantile.
     `values` (n,) may hold inf for what was not reached; nan is refused. Raises InputError for an empty sample. Source:
@@ -65,7 +65,7 @@ def quantile_of(values: npt.ArrayLike, order: float, confidence: float = 0.95) -
 
 
 def mean_of(values: npt.ArrayLike, confidence: float = 0.95) -> IntervalEstimate:
-    """Return the mean and its Student interval ``mean -+ t s/sqrt(n)``; infinite from one value, nan from none."""
+    """Compute the mean and its Student interval ``mean -+ t s/sqrt(n)``; infinite from one value, nan from none."""
     from scipy.special import stdtrit
 
     share(confidence, "confidence")
@@ -81,14 +81,14 @@ def mean_of(values: npt.ArrayLike, confidence: float = 0.95) -> IntervalEstimate
 
 
 def _coverage(low: npt.ArrayLike | None, high: npt.ArrayLike | None, truth: Array, confidence: float) -> Proportion:
-    """Return how often the stated intervals hold the truth."""
-    low, high = _beside(low, truth.size, "lower limits"), _beside(high, truth.size, "upper limits")
+    """Compute the proportion of stated intervals that hold the truth."""
+    low, high = _as_many(low, truth.size, "lower limits"), _as_many(high, truth.size, "upper limits")
     stated = ~(np.isnan(low) | np.isnan(high))
-    held = (low <= truth) & (truth <= high) & stated
-    return proportion(int(np.count_nonzero(held)), int(stated.sum()), confidence)
+    covered = (low <= truth) & (truth <= high) & stated
+    return proportion(int(np.count_nonzero(covered)), int(stated.sum()), confidence)
 
 
-def _beside(values: npt.ArrayLike | None, n: int, what: str) -> Array:
+def _as_many(values: npt.ArrayLike | None, n: int, what: str) -> Array:
     array = np.full(n, math.nan) if values is None else np.asarray(values, dtype=np.float64)
     if array.shape != (n,):
         raise InputError(f"{what} must be as many as the true values, got {array.shape} for {n}")
@@ -102,18 +102,18 @@ def estimate_errors(
     high: npt.ArrayLike | None = None,
     confidence: float = 0.95,
 ) -> EstimateErrors:
-    """Return the errors of an estimate (a leak in L/min, an onset in s) with intervals.
+    """Compute the errors of an estimate (a leak in L/min, an onset in s) with intervals.
 
     All (n,) in one unit; nan where a record has no estimate or no interval. The interval of the rmse is the square
     root of the Student interval of the mean square error, cut at 0; those of the quantiles are of order statistics.
     Coverage is over the records with an interval. Raises InputError where no record has an estimate.
     """
     true = numbers(truth, "true values")
-    given = _beside(estimates, true.size, "estimates")
-    known = np.isfinite(given)
+    stated = _as_many(estimates, true.size, "estimates")
+    known = np.isfinite(stated)
     if not known.any():
         raise InputError(f"errors need at least one estimate, got none in {true.size} records")
-    error = given[known] - true[known]
+    error = stated[known] - true[known]
     square, size = mean_of(error**2, confidence), np.abs(error)
     roots = [math.sqrt(max(x, 0.0)) for x in (square.value, square.low, square.high)]
     return EstimateErrors(

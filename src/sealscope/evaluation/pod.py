@@ -31,7 +31,7 @@ class SizeDetection:
 
 
 def by_size(leaks: npt.ArrayLike, hits: npt.ArrayLike, confidence: float = 0.95) -> list[SizeDetection]:
-    """Return the detection at each size of leak, with Clopper-Pearson's bounds, in rising order.
+    """Compute the detection at each size of leak, with Clopper-Pearson's bounds, in rising order.
 
     `leaks` (n,) sizes, any unit; `hits` (n,) whether each was found. Raises InputError for sizes <= 0.
     """
@@ -46,7 +46,7 @@ def by_size(leaks: npt.ArrayLike, hits: npt.ArrayLike, confidence: float = 0.95)
 
 
 def proven_size(rows: list[SizeDetection], detection: float = 0.9) -> float:
-    """Return the smallest size from which on every tested size has its lower bound >= `detection`.
+    """Find the smallest size from which on every tested size has its lower bound >= `detection`.
 
     Infinite where none has. With 29 hits of 29 at 95 % the size proves 90 % (a90/95 without a model). Nothing is said
     between the sizes, and the confidence is that of each size alone. Source: Clopper and Pearson (1934), doi
@@ -72,7 +72,7 @@ def _information(design: Array, n: Array, eta: Array) -> Array:
 
 
 def _log_likelihood(design: Array, n: Array, k: Array, eta: Array, firth: bool) -> float:
-    """Return ``sum of k eta - n ln(1 + exp eta)``; Firth's penalty adds half the log determinant of the information."""
+    """Compute ``sum of k eta - n ln(1 + exp eta)``; Firth's penalty adds half the log determinant."""
     value = float(np.sum(k * eta - n * np.logaddexp(0.0, eta)))
     if not firth:
         return value
@@ -81,7 +81,7 @@ def _log_likelihood(design: Array, n: Array, k: Array, eta: Array, firth: bool) 
 
 
 def _fitted(design: Array, n: Array, k: Array, firth: bool) -> Array:
-    """Return the coefficients at the maximum of the log-likelihood."""
+    """Compute the coefficients at the maximum of the log-likelihood."""
     from scipy.optimize import minimize
     from scipy.special import expit
 
@@ -126,13 +126,13 @@ class HitMiss:
     hits: Array
 
     def detection(self, size: npt.ArrayLike) -> Array:
-        """Return the probability of detection at each size."""
+        """Compute the probability of detection at each size."""
         from scipy.special import expit
 
         return np.asarray(expit(self.intercept + self.slope * _log_sizes(size)), dtype=np.float64)
 
     def detection_band(self, size: npt.ArrayLike, confidence: float = 0.95) -> tuple[Array, Array]:
-        """Return the two-sided pointwise Wald interval, on the log odds, of the detection at each size."""
+        """Compute the two-sided pointwise Wald interval, on the log odds, of the detection at each size."""
         from scipy.special import expit, ndtri
 
         x, v = _log_sizes(size), self.covariance
@@ -142,7 +142,7 @@ class HitMiss:
         return np.asarray(expit(eta - half), dtype=np.float64), np.asarray(expit(eta + half), dtype=np.float64)
 
     def size_at(self, detection: float) -> float:
-        """Return the size found with probability `detection`: ``ln(size) = (ln(p/(1-p)) - intercept)/slope``.
+        """Compute the size found with probability `detection`: ``ln(size) = (ln(p/(1-p)) - intercept)/slope``.
 
         Infinite where detection does not rise with the size.
         """
@@ -150,7 +150,7 @@ class HitMiss:
         return _size((_log_odds(detection) - self.intercept) / self.slope) if self.slope > 0.0 else math.inf
 
     def size_bound(self, detection: float = 0.9, confidence: float = 0.95) -> float:
-        """Return the one-sided upper confidence bound of `size_at(detection)`, by default a90/95.
+        """Compute the one-sided upper confidence bound of `size_at(detection)`, by default a90/95.
 
         It is the largest size whose profile log-likelihood is within ``z_c^2/2`` of the maximum (chi square, one
         degree of freedom); infinite where there is none. Source: MIL-HDBK-1823A (2009), appendix G; Cheng and Iles,
@@ -167,18 +167,18 @@ class HitMiss:
         if not self.slope > 0.0 or self.log_likelihood - self.null <= drop:
             return math.inf
 
-        def beyond(at: float) -> float:
-            return self.log_likelihood - self._profile(odds, at) - drop
+        def excess(log_size: float) -> float:
+            return self.log_likelihood - self._profile(odds, log_size) - drop
 
         span = float(np.ptp(_log_sizes(self.size)))
         near, step = (odds - self.intercept) / self.slope, span / 8.0
         far = near + step
-        while beyond(far) < 0.0:
+        while excess(far) < 0.0:
             near, step = far, 2.0 * step
             far += step
             if step > _FARTHEST * span:
                 return math.inf
-        return _size(float(brentq(beyond, near, far, xtol=1e-10 * max(1.0, abs(far)))))
+        return _size(float(brentq(excess, near, far, xtol=1e-10 * max(1.0, abs(far)))))
 
     @property
     def a50(self) -> float:
@@ -195,19 +195,19 @@ class HitMiss:
         """The size found nine times in ten, with 95 % confidence (likelihood ratio)."""
         return self.size_bound()
 
-    def _profile(self, odds: float, at: float) -> float:
-        """Return the log-likelihood of lines with these log odds at the log size `at`, maximised over the slope."""
+    def _profile(self, odds: float, log_size: float) -> float:
+        """Maximise the log-likelihood over the slope of lines with these log odds at `log_size`."""
         from scipy.optimize import minimize_scalar
 
         x = _log_sizes(self.size)
         design = np.column_stack([np.ones(x.size), x])
 
         def loss(slope: float) -> float:
-            eta = odds + slope * (x - at)
+            eta = odds + slope * (x - log_size)
             value = _log_likelihood(design, self.tested, self.hits, eta, self.estimator == "firth")
             return -value if math.isfinite(value) else 1e300
 
-        width = max(float(np.abs(x - at).max()), 1e-300)
+        width = max(float(np.abs(x - log_size).max()), 1e-300)
         return -float(minimize_scalar(loss, bracket=(0.0, 1.0 / width), options={"xtol": 1e-9}).fun)
 
 
@@ -216,7 +216,7 @@ def _log_sizes(values: npt.ArrayLike) -> Array:
 
 
 def _size(log_size: float) -> float:
-    """Return the size of this natural logarithm; infinite where it is too large to be one."""
+    """Compute the size of a natural logarithm; infinite where it overflows."""
     return math.exp(log_size) if log_size < 709.0 else math.inf
 
 
@@ -237,7 +237,7 @@ def fit_hit_miss(leaks: npt.ArrayLike, hits: npt.ArrayLike) -> HitMiss:
     values, where = np.unique(x, return_inverse=True)
     if values.size < 2:
         raise InputError(f"a curve needs leaks of at least 2 sizes, got {hit.size} of one size")
-    n, k = (np.asarray(np.bincount(where, of), dtype=np.float64) for of in (None, hit.astype(np.float64)))
+    n, k = (np.asarray(np.bincount(where, counts), dtype=np.float64) for counts in (None, hit.astype(np.float64)))
     firth = _is_separated(n, k)
     # centred and scaled while fitting, so that the size's unit does not matter
     centre, spread = float(values.mean()), float(np.ptp(values)) / 2.0

@@ -47,12 +47,12 @@ def _scores(leak_free: npt.ArrayLike, leaky: npt.ArrayLike) -> tuple[Array, Arra
 
 
 def _exceeding(scores: Array, thresholds: Array) -> Array:
-    """Return how many of the scores are >= each threshold."""
+    """Count the scores that are >= each threshold."""
     return np.asarray(scores.size - np.searchsorted(np.sort(scores), thresholds, side="left"), dtype=np.float64)
 
 
 def kolmogorov_margin(n: int, confidence: float) -> float:
-    """Return the half width of a band that holds the whole distribution function of n samples.
+    """Compute the half width of a band that holds the whole distribution function of n samples.
 
     ``sqrt(ln(2/alpha) / (2n))``, for every n and every distribution. Source: Massart, Ann. Probab. 18 (1990)
     1269-1283, doi 10.1214/aop/1176990746.
@@ -61,7 +61,7 @@ def kolmogorov_margin(n: int, confidence: float) -> float:
 
 
 def roc_curve(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float = 0.95) -> Roc:
-    """Return the curve of detection over false alarms for a score that is high for leaks, ties as slanted steps.
+    """Compute detection over false alarms for a score that is high for leaks, ties as slanted steps.
 
     The whole true curve lies in the band: each point moves by the margins d (false alarms) and e (detection) of
     `kolmogorov_margin`, each at sqrt(confidence), and the band is their envelope. Raises InputError without scores of
@@ -80,7 +80,7 @@ def roc_curve(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float 
 
 
 def placements(leak_free: Array, leaky: Array) -> tuple[Array, Array]:
-    """Return the share of the other kind's scores on the right side of each score, ties half: (n,), (m,)."""
+    """Compute the share of the other kind's scores on the right side of each score, ties half: (n,), (m,)."""
     a, b = np.sort(leak_free), np.sort(leaky)
     below = (np.searchsorted(a, leaky, "left") + np.searchsorted(a, leaky, "right")) / (2.0 * a.size)
     above = 1.0 - (np.searchsorted(b, leak_free, "left") + np.searchsorted(b, leak_free, "right")) / (2.0 * b.size)
@@ -88,7 +88,7 @@ def placements(leak_free: Array, leaky: Array) -> tuple[Array, Array]:
 
 
 def _newcombe(value: float, leak_free: int, leaky: int, z: float) -> tuple[float, float]:
-    """Return the limits t with ``|t - A| = z SE(t)``; they keep a width where A is 1.
+    """Find the limits t with ``|t - A| = z SE(t)``, which keep a width where A is 1.
 
     SE as Hanley and McNeil's with both numbers at their mean. Source: Newcombe, Stat. Med. 25 (2006) 559-573, doi
     10.1002/sim.2324, method 5.
@@ -107,7 +107,7 @@ def _newcombe(value: float, leak_free: int, leaky: int, z: float) -> tuple[float
 
 
 def auc(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float = 0.95) -> Area:
-    """Return the area under the curve, ``sum of (b > a) + (b = a)/2`` over all pairs / (n m).
+    """Compute the area under the curve, ``sum of (b > a) + (b = a)/2`` over all pairs / (n m).
 
     `leak_free` (n,), `leaky` (m,) scores, high for leaks. The interval is DeLong's, distribution-free, normal and cut
     at 0 and 1; where all scores are apart that has no width and Newcombe's is given instead, as `method` says. Raises

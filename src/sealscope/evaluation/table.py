@@ -1,4 +1,4 @@
-"""Events per hour, and which fault is named for which, with exact intervals."""
+"""Events per hour, and counts of named against true faults, with exact intervals."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CANNOT_TELL = "cannot tell"
 
 
 def poisson_interval(count: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Return the exact interval (low, high) of a Poisson mean after `count` events.
+    """Compute the exact interval (low, high) of a Poisson mean after `count` events.
 
     ``low = G(alpha/2; k), high = G(1 - alpha/2; k + 1)``, G the quantile of the gamma distribution of that shape; 0
     where there was no event. Raises InputError for an impossible count or confidence. Source: Garwood, Biometrika 28
@@ -33,7 +33,7 @@ def poisson_interval(count: int, confidence: float = 0.95) -> tuple[float, float
 
 
 def events_per_hour(count: int, hours: float, confidence: float = 0.95) -> IntervalEstimate:
-    """Return events per operating hour with their exact interval; InputError unless `hours` > 0."""
+    """Compute events per operating hour with their exact interval; raise InputError unless `hours` > 0."""
     if not (math.isfinite(hours) and hours > 0.0):
         raise InputError(f"operating hours must be > 0, got {hours}")
     low, high = poisson_interval(count, confidence)

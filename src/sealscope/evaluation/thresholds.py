@@ -1,4 +1,4 @@
-"""A threshold from leak-free scores, with the distribution of the false-alarm probability that it really has.
+"""A threshold from leak-free scores, with the distribution of its true false-alarm probability.
 
 An order statistic: exact, whatever the scores' distribution.
 """
@@ -40,7 +40,7 @@ class Threshold:
 
 
 def records_needed(false_alarm: float, confidence: float | None = None) -> int:
-    """Return the fewest leak-free records for a false-alarm probability.
+    """Compute the fewest leak-free records for a false-alarm probability.
 
     Without `confidence` on average: ``ceil(1/p) - 1``. With it, the fewest n with ``1 - (1 - p)^n >= confidence``, 299
     for 1 % at 95 %. Raises InputError for an impossible probability or confidence. Source: Wilks, Ann. Math. Stat. 12
@@ -54,7 +54,7 @@ def records_needed(false_alarm: float, confidence: float | None = None) -> int:
 
 
 def _rank(n: int, false_alarm: float, promise: Promise, confidence: float) -> int:
-    """Return the largest rank, counted from the largest score, that keeps the promise; 0 where none does."""
+    """Find the largest rank, counted from the largest score, that keeps the promise; 0 where none does."""
     from scipy.special import betainc
 
     if promise == "average":
@@ -66,7 +66,7 @@ def _rank(n: int, false_alarm: float, promise: Promise, confidence: float) -> in
 def quantile_threshold(
     scores: npt.ArrayLike, false_alarm: float, confidence: float = 0.95, promise: Promise = "average"
 ) -> Threshold:
-    """Return the lowest threshold that keeps the false-alarm probability, from the scores of leak-free records.
+    """Find the lowest threshold that keeps the false-alarm probability, from the scores of leak-free records.
 
     `scores` (n,), high means leak. `average`: rank ``floor(p (n + 1))``, so that the next record's score exceeds it
     with probability <= p (split conformal). `bound`: the largest rank whose true probability is <= p with probability

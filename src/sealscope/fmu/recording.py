@@ -168,7 +168,7 @@ def _driven(
     u, G, C = (values[:, 0] for values in RunInputs(experiment, experiment.leaks).at_nodes(t, np.array([half])))
     if experiment.load is not None and experiment.load.tables() is not None:
         raise InputError(f"a unit takes its load over time, got one over position or velocity ({experiment.load})")
-    load = np.zeros(t.size) if experiment.load is None else np.asarray(experiment.load.at(t + half))
+    load = np.zeros(t.size) if experiment.load is None else np.asarray(experiment.load.value_at(t + half))
     given = {"u": u, "G": G, "C": C, "F": load}
     columns: dict[str, Array] = {}
     for name, values in given.items():

@@ -21,7 +21,7 @@ _LEAST = 100.0
 
 @contracted
 def effective_bulk_modulus(p: float, K_oil: float, air: float, n_air: float) -> float:
-    """Bulk modulus [Pa] of oil with free air at the pressure `p` [Pa gauge].
+    """Compute the bulk modulus [Pa] of oil with free air at the pressure `p` [Pa gauge].
 
     K = K_oil (1 + r)/(1 + r K_oil/(n p_abs)), r = air (p_atm/p_abs)^(1/n): volume of air over volume of oil, compressed
     polytropically from its share `air` at atmospheric pressure; nothing dissolves. K_oil without air, exactly.
@@ -38,7 +38,7 @@ def effective_bulk_modulus(p: float, K_oil: float, air: float, n_air: float) -> 
 
 @contracted
 def oil_density_ratio(dp: float, K_oil: float) -> float:
-    """Return rho(p + dp)/rho(p) = exp(dp/K_oil) of oil without air: the density whose bulk modulus is constant.
+    """Compute rho(p + dp)/rho(p) = exp(dp/K_oil) of oil without air and with a constant bulk modulus.
 
     From K = rho dp/d rho (Merritt, Hydraulic Control Systems, 1967, the definition of the bulk modulus).
     """
@@ -47,7 +47,7 @@ def oil_density_ratio(dp: float, K_oil: float) -> float:
 
 @contracted
 def air_share(p: float, air: float, n_air: float) -> float:
-    """Volume of air over volume of oil at `p` [Pa gauge]: air (p_atm/p_abs)^(1/n)."""
+    """Compute the volume of air over volume of oil at `p` [Pa gauge]: air (p_atm/p_abs)^(1/n)."""
     return air * math.pow(P_ATM / max(p + P_ATM, _LEAST), 1.0 / n_air)
 
 
@@ -64,7 +64,7 @@ def mixture_density_ratio(p: float, p_0: float, K_oil: float, air: float, n_air:
 
 
 def kinematic_viscosity(T: NDArray[np.float64], nu_40: float, nu_100: float) -> NDArray[np.float64]:
-    """Kinematic viscosity [m^2/s] of an oil at the temperatures T [K], from those at 40 and 100 deg C.
+    """Compute the kinematic viscosity [m^2/s] of an oil at the temperatures T [K], from those at 40 and 100 deg C.
 
     log log(nu + 0.7) = A - B log T, nu in mm^2/s: Walther's law, ASTM D341 (above 2 mm^2/s).
     """
@@ -74,7 +74,7 @@ def kinematic_viscosity(T: NDArray[np.float64], nu_40: float, nu_100: float) -> 
 
 
 def thermal_density(T: NDArray[np.float64], T_0: float, alpha: float) -> NDArray[np.float64]:
-    """Density at the temperatures T [K] over that at T_0 [K]: 1 - alpha (T - T_0).
+    """Compute the density at the temperatures T [K] over that at T_0 [K]: 1 - alpha (T - T_0).
 
     Source: Merritt, Hydraulic Control Systems, 1967, section 2.2, density of petroleum fluids; `alpha` [1/K].
     """
@@ -82,7 +82,7 @@ def thermal_density(T: NDArray[np.float64], T_0: float, alpha: float) -> NDArray
 
 
 def thermal_stiffness(T: NDArray[np.float64], T_0: float) -> NDArray[np.float64]:
-    """Bulk modulus at the temperatures T [K] over that at T_0 [K]: 10^(-0.0024 (T - T_0)), of mineral oils.
+    """Compute the bulk modulus at the temperatures T [K] over that at T_0 [K]: 10^(-0.0024 (T - T_0)), of mineral oils.
 
     Source: A. T. J. Hayward, How to estimate the bulk modulus of hydraulic fluids, Hydraulic Pneumatic Power 16 (1970)
     28-40: isentropic secant modulus.

@@ -14,7 +14,7 @@ from sealscope.physics.lanes import exponential, select
 
 @contracted
 def coulomb_friction(p_A: float, p_B: float, F_pr: float, F_cfr: float, of_difference: bool) -> float:
-    """Return the Coulomb force F_C = F_pr + F_cfr (p_A + p_B) [N], eq. (4.20).
+    """Compute the Coulomb force F_C = F_pr + F_cfr (p_A + p_B) [N], eq. (4.20).
 
     `of_difference` takes p_A - p_B, the literal reading.
     """
@@ -23,7 +23,7 @@ def coulomb_friction(p_A: float, p_B: float, F_pr: float, F_cfr: float, of_diffe
 
 @contracted
 def stribeck_level(speed: float, F_C: float, K_brk: float, C_c: float) -> float:
-    """Friction force [N] of steady sliding at `speed` >= 0 [m/s] without its viscous part, eq. (4.21).
+    """Compute the friction force [N] of steady sliding at `speed` >= 0 [m/s] without its viscous part, eq. (4.21).
 
     F_C (1 + (K_brk - 1) exp(-C_c speed)): the breakaway force K_brk F_C at standstill, F_C at speed.
     """
@@ -34,7 +34,7 @@ def stribeck_level(speed: float, F_C: float, K_brk: float, C_c: float) -> float:
 def karnopp_friction(
     v: float, applied: float, breakaway: float, F_C: float, K_brk: float, C_c: float, F_v: float, v_th: float
 ) -> float:
-    """Friction force [N] of a piston that sticks where |v| < v_th, and slides by eq. (4.21) above.
+    """Compute the friction force [N] of a piston that sticks where |v| < v_th, and slides by eq. (4.21) above.
 
     Stuck, it balances the `applied` force [N] up to the `breakaway` force [N]; `stuck_velocity` says how it moves.
 
@@ -49,13 +49,13 @@ def karnopp_friction(
 
 @contracted
 def stuck_velocity(v: float, v_th: float) -> float:
-    """Velocity [m/s] at which a piston of Karnopp's law moves: none where |v| < v_th (source: `karnopp_friction`)."""
+    """Compute the velocity [m/s] at which a piston of Karnopp's law moves: none where |v| < v_th."""
     return select(abs(v) < v_th, 0.0 * v, v)  # type: ignore[no-any-return]
 
 
 @contracted
 def bristle_rate(v: float, z: float, level: float, sigma_0: float) -> float:
-    """Return dz/dt = v - sigma_0 |v|/g z [m/s] of the mean deflection z [m] of the contact, g = `level` > 0 [N].
+    """Compute dz/dt = v - sigma_0 |v|/g z [m/s] of the mean deflection z [m] of the contact, g = `level` > 0 [N].
 
     At a steady v it settles at sigma_0 z = g sign(v), |z| never exceeds g/sigma_0 once below it.
 
@@ -67,7 +67,7 @@ def bristle_rate(v: float, z: float, level: float, sigma_0: float) -> float:
 
 @contracted
 def lugre_friction(v: float, z: float, dz: float, sigma_0: float, sigma_1: float, F_v: float, v_th: float) -> float:
-    """Friction force [N] of a contact with deflection z [m] that changes by dz [m/s], against the velocity v [m/s].
+    """Compute the friction force [N] of a contact with deflection z [m], its rate dz [m/s] and velocity v [m/s].
 
     F = sigma_0 z + sigma_1 exp(-(v/v_th)^2) dz + F_v v. The damping of the contact dies out as it slides, without which
     the force could drive the motion.
@@ -82,7 +82,7 @@ def lugre_friction(v: float, z: float, dz: float, sigma_0: float, sigma_1: float
 def stribeck_friction(
     v: float, F_C: float, K_brk: float, C_c: float, F_v: float, v_th: float, literal_bracket: bool
 ) -> float:
-    """Friction force [N] against the velocity v [m/s], eqs. (4.21)-(4.22).
+    """Compute the friction force [N] against the velocity v [m/s], eqs. (4.21)-(4.22).
 
     |v| > v_th: F = F_C (1 + (K_brk - 1) exp(-C_c |v|)) sign(v) + F_v v;
     |v| <= v_th: F = v [F_C (1 + (K_brk - 1) exp(-C_c v_th)) + F_v v_th] / v_th, continuous at v_th.

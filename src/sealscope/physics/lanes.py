@@ -38,7 +38,7 @@ class Lanes(types.Type):  # type: ignore[misc]
         super().__init__(name=f"Lanes({number}, {width})")
 
     def can_convert_from(self, typingctx: Any, other: Any) -> Any:
-        """Say that any number becomes lanes safely."""
+        """Allow any number to become lanes."""
         from numba.core.typeconv import Conversion
 
         return Conversion.safe if isinstance(other, types.Number) else None
@@ -57,7 +57,7 @@ _MASKS = {LANES: Mask(LANES), SINGLES: Mask(SINGLES)}
 
 
 def _vector(lanes: Lanes) -> Any:
-    """Return the vector in LLVM's code."""
+    """Return the vector type of LLVM's code."""
     return ir.VectorType(ir.DoubleType() if lanes.number == types.float64 else ir.FloatType(), lanes.width)
 
 
@@ -74,7 +74,7 @@ class _MaskModel(models.PrimitiveModel):  # type: ignore[misc]
 
 
 def _spread(builder: Any, scalar: Any, lanes: Lanes) -> Any:
-    """Return the same number in every lane."""
+    """Build the instructions that put the same number into every lane."""
     zero = ir.Constant(ir.IntType(32), 0)
     first = builder.insert_element(ir.Constant(_vector(lanes), ir.Undefined), scalar, zero)
     places = ir.Constant(ir.VectorType(ir.IntType(32), lanes.width), [0] * lanes.width)
@@ -93,10 +93,10 @@ def _cast(context: Any, builder: Any, kind: Any, to: Any, value: Any) -> Any:
 
 
 def _lanes_of(kinds: tuple[Any, ...]) -> Lanes | None:
-    """Return the lanes among kinds, beside which there may be plain numbers; None where there are none, or others."""
+    """Find the lanes among kinds, with plain numbers allowed between them; None for any other mixture."""
     lanes = {kind for kind in kinds if isinstance(kind, Lanes)}
-    alike = len(lanes) == 1 and all(isinstance(kind, Lanes | types.Number) for kind in kinds)
-    return lanes.pop() if alike else None
+    compatible = len(lanes) == 1 and all(isinstance(kind, Lanes | types.Number) for kind in kinds)
+    return lanes.pop() if compatible else None
 
 
 def _define(function: Any, build: Any, *, asks: bool = False) -> None:
@@ -125,7 +125,7 @@ def _arithmetic(name: str) -> Any:
 
 
 def _quotient(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Return lanes over one number: times its reciprocal, which is found once where the number does not change."""
+    """Divide lanes by one number: multiply by its reciprocal, found once where the number does not change."""
     number = context.cast(builder, args[1], sig.args[1], types.float64)
     reciprocal = builder.fdiv(ir.Constant(ir.DoubleType(), 1.0), number)
     lanes = sig.args[0]
@@ -144,7 +144,7 @@ _define(operator.neg, lambda builder, a: builder.fneg(a))
 
 
 def _called(name: str) -> Any:
-    """Return an LLVM intrinsic over the lanes."""
+    """Build a call of an LLVM intrinsic over the lanes."""
 
     def build(builder: Any, *values: Any) -> Any:
         vector = values[0].type
@@ -169,14 +169,14 @@ for _function, _name in ((operator.and_, "and_"), (operator.or_, "or_")):
     @infer_global(_function)
     class _MaskTemplate(AbstractTemplate):  # type: ignore[misc]
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
-            alike = not kws and len(args) == 2 and isinstance(args[0], Mask) and args[0] == args[1]
-            return signature(args[0], *args) if alike else None
+            compatible = not kws and len(args) == 2 and isinstance(args[0], Mask) and args[0] == args[1]
+            return signature(args[0], *args) if compatible else None
 
     lower_builtin(_function, Mask, Mask)(lambda context, builder, sig, args, name=_name: getattr(builder, name)(*args))
 
 
 def lowered(function: Any, arity: int, result: Any, build: Any) -> None:
-    """Give a plain function a compiled form too.
+    """Give a plain function a compiled form as well.
 
     `result(kinds)` is the kind of what it returns (None where it does not take these kinds), and
     `build(context, builder, kinds, values)` makes the instructions.
@@ -196,18 +196,18 @@ def lowered(function: Any, arity: int, result: Any, build: Any) -> None:
 
 
 def select(condition: Any, yes: Any, no: Any) -> Any:
-    """`yes` where the condition holds, `no` elsewhere; both are computed."""
+    """Choose `yes` where the condition holds, `no` elsewhere; both are computed."""
     return yes if condition else no
 
 
-def _chosen(kinds: Any) -> Any:
+def _kind_of_choice(kinds: Any) -> Any:
     if isinstance(kinds[0], Mask):
         return kinds[0].lanes
     return next((kind for kind in kinds if isinstance(kind, Lanes)), types.float64)
 
 
 def _select(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
-    kind = _chosen(kinds)
+    kind = _kind_of_choice(kinds)
     if isinstance(kind, Lanes):
         a, b = (_as_lanes(context, builder, v, k, kind) for v, k in zip(values[1:], kinds[1:], strict=True))
     else:
@@ -215,11 +215,11 @@ def _select(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
     return builder.select(values[0], a, b)
 
 
-lowered(select, 3, _chosen, _select)
+lowered(select, 3, _kind_of_choice, _select)
 
 
 def anywhere(condition: Any) -> Any:
-    """Whether a condition holds in any lane; of a plain truth value: itself."""
+    """Return True where a condition holds in any lane; a plain truth value is returned as it is."""
     return condition
 
 
@@ -240,7 +240,7 @@ def _constant(kind: Any, value: float) -> Any:
 
 
 def nearest_whole(x: Any) -> Any:
-    """Return the whole number next to x, |x| < 2^51 (2^22 in single precision)."""
+    """Round x to the nearest whole number, |x| < 2^51 (2^22 in single precision)."""
     return (x + _ROUND) - _ROUND
 
 
@@ -253,7 +253,7 @@ lowered(nearest_whole, 1, lambda kinds: kinds[0], _nearest_whole)
 
 
 def power_of_two(n: Any) -> Any:
-    """2^n for whole n in -1022..1023, held within -126..127 in single precision; compiled, from the bits of it."""
+    """Compute 2^n for whole n in -1022..1023, held within -126..127 in single precision, from the bits of n."""
     return math.ldexp(1.0, int(n))
 
 
@@ -284,16 +284,16 @@ def _is_block(array: Any) -> bool:
 
 
 def _place(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
-    """Where the lanes of a row are."""
+    """Find the address of the lanes of a row."""
     data = context.make_array(kinds[0])(context, builder, values[0]).data
     row = context.cast(builder, values[1], kinds[1], types.intp)
     lanes = _LOADED[kinds[0].dtype]
-    at = builder.mul(row, ir.Constant(row.type, lanes.width))
-    return builder.bitcast(cgutils.gep_inbounds(builder, data, at), _vector(lanes).as_pointer())
+    place = builder.mul(row, ir.Constant(row.type, lanes.width))
+    return builder.bitcast(cgutils.gep_inbounds(builder, data, place), _vector(lanes).as_pointer())
 
 
 def load(array: Any, row: int) -> Any:
-    """Return the lanes of row `row` of a C-ordered array, rows counted through all leading axes.
+    """Load the lanes of row `row` of a C-ordered array, rows counted through all leading axes.
 
     It is (..., WIDTH) of doubles, or (..., SINGLE_WIDTH) in single precision.
     """
@@ -327,7 +327,7 @@ lowered(store, 3, _stored, _store)
 
 
 def spread(value: Any) -> Any:
-    """Return the same number in every lane of doubles."""
+    """Put the same number into every lane of doubles."""
 
 
 def _spread_out(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
@@ -345,7 +345,7 @@ _ROUND, _ROUND_SINGLE = 6755399441055744.0, 12582912.0
 
 @contracted
 def exponential(x: Any) -> Any:
-    """exp(x) for x in -708..709 (held at these ends): 2^n times a polynomial of degree 11 in r = x - n ln 2.
+    """Compute exp(x) for x in -708..709 (held at these ends): 2^n times a polynomial in r = x - n ln 2.
 
     Within 1e-14 of exp(x), relatively; compiled from this source for a number and for lanes. In single precision it is
     within 2e-6 for x in -60..60, and beyond -87..88 held at a power of two.

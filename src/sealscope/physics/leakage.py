@@ -15,7 +15,7 @@ from sealscope.physics.restrictors import orifice_flow
 
 @contracted
 def laminar_leakage(dp: float, G: float) -> float:
-    """Return Q_L = G (p_A - p_B) [m^3/s] through a laminar gap of leakage conductance G [m^3/(s Pa)].
+    """Compute Q_L = G (p_A - p_B) [m^3/s] through a laminar gap of leakage conductance G [m^3/(s Pa)].
 
     Source: Merritt, Hydraulic Control Systems, 1967, leakage of an actuator.
     """
@@ -24,7 +24,7 @@ def laminar_leakage(dp: float, G: float) -> float:
 
 @contracted
 def piston_leakage(dp: float, G: float, C: float, dp_0: float) -> float:
-    """Q_L [m^3/s] from chamber A to B: a laminar gap G [m^3/(s Pa)] beside an orifice C [m^3/(s Pa^0.5)]."""
+    """Compute Q_L [m^3/s] from chamber A to B: a laminar gap G [m^3/(s Pa)] beside an orifice C [m^3/(s Pa^0.5)]."""
     if not anywhere(C > 0.0):
         return laminar_leakage(dp, G)
     return laminar_leakage(dp, G) + orifice_flow(dp, C, dp_0)
@@ -32,7 +32,7 @@ def piston_leakage(dp: float, G: float, C: float, dp_0: float) -> float:
 
 @kernel
 def leakage_series(dp: np.ndarray, G: np.ndarray, C: np.ndarray, dp_0: float) -> np.ndarray:
-    """`piston_leakage` [m^3/s] sample by sample: `dp` [Pa], `G`, `C` are (n,)."""
+    """Compute `piston_leakage` [m^3/s] for each sample: `dp` [Pa], `G`, `C` are (n,)."""
     flow = np.empty(dp.size)
     for k in range(dp.size):
         flow[k] = piston_leakage(dp[k], G[k], C[k], dp_0)

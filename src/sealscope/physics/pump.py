@@ -16,7 +16,7 @@ from sealscope.physics.restrictors import orifice_flow
 
 @contracted
 def pump_flow(omega: float, dp: float, q_b: float, G_pump: float) -> float:
-    """Return the flow [m^3/s] that the pump delivers into port 1.
+    """Compute the flow [m^3/s] that the pump delivers into port 1.
 
     Q_1 = q_b omega / (2 pi) - G_pump (p_1 - p_2), eq. (4.1) with internal leakage.
 
@@ -27,13 +27,13 @@ def pump_flow(omega: float, dp: float, q_b: float, G_pump: float) -> float:
 
 @contracted
 def pump_torque(dp: float, q_b: float) -> float:
-    """Load torque [N m] of the pressure difference on the shaft: q_b (p_1 - p_2) / (2 pi), eqs. (4.5)-(4.6)."""
+    """Compute the torque [N m] of the pressures on the shaft: q_b (p_1 - p_2) / (2 pi), eqs. (4.5)-(4.6)."""
     return q_b / (2.0 * math.pi) * dp
 
 
 @law
 def loss_coefficients(q_b: float, C_st: float, C_h: float, rho: float) -> tuple[float, float]:
-    """Return c_slip [m^3/(s Pa^0.5)] of the turbulent slip and k_h [N m s^2] of the hydrodynamic torque.
+    """Compute c_slip [m^3/(s Pa^0.5)] of the turbulent slip and k_h [N m s^2] of the hydrodynamic torque.
 
     c_slip = C_st D^(2/3) sqrt(2/rho), k_h = C_h rho D^(5/3)/2, `rho` density [kg/m^3] (Schlosser 1961).
     """
@@ -43,13 +43,13 @@ def loss_coefficients(q_b: float, C_st: float, C_h: float, rho: float) -> tuple[
 
 @contracted
 def turbulent_slip(dp: float, c_slip: float, dp_0: float) -> float:
-    """Flow [m^3/s] that slips back through the pump's gaps, C_st D^(2/3) sqrt(2 |dp|/rho): an orifice's law."""
+    """Compute the slip flow [m^3/s] through the pump's gaps, an orifice's law: C_st D^(2/3) sqrt(2 |dp|/rho)."""
     return orifice_flow(dp, c_slip, dp_0)
 
 
 @contracted
 def friction_torque(omega: float, dp: float, q_b: float, T_f: float, C_f: float, k_h: float, omega_f: float) -> float:
-    """Return the torque [N m] against the turning of motor and pump beside viscous drag.
+    """Compute the friction torque [N m] of motor and pump, without viscous drag.
 
     T = sat(omega/omega_f) (T_f + C_f D |dp|) + k_h omega |omega|: constant friction and one by pressure, made smooth
     below `omega_f` [rad/s] (sat: held within +-1), and the hydrodynamic torque.
@@ -59,5 +59,5 @@ def friction_torque(omega: float, dp: float, q_b: float, T_f: float, C_f: float,
 
 
 def hydraulic_power(Q_1: Any, dp: Any) -> Any:
-    """Power [W] that the pump gives the oil: Q_1 (p_1 - p_2)."""
+    """Compute the power [W] that the pump gives the oil: Q_1 (p_1 - p_2)."""
     return Q_1 * dp

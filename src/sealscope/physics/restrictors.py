@@ -11,12 +11,12 @@ from sealscope.physics.lanes import anywhere, select
 
 @law
 def orifice_coefficient(C_d: float, area: float, rho: float) -> float:
-    """Flow coefficient c = C_d A sqrt(2/rho) [m^3/(s Pa^0.5)] of an orifice (factor of eqs. 4.9-4.12)."""
+    """Compute the flow coefficient c = C_d A sqrt(2/rho) [m^3/(s Pa^0.5)] of an orifice (factor of eqs. 4.9-4.12)."""
     return C_d * area * math.sqrt(2.0 / rho)
 
 
 def behind_shut_off(c: float, c_line: float, opening: Any) -> Any:
-    """Flow coefficient [m^3/(s Pa^0.5)] of a throttle `c` in series with a shut-off valve.
+    """Compute the flow coefficient [m^3/(s Pa^0.5)] of a throttle `c` in series with a shut-off valve.
 
     1/C^2 = 1/c^2 + (1/opening^2 - 1)/c_line^2, solved for C: the valve opens the share `opening` in 0..1 of its line,
     whose whole area has the coefficient `c_line`. Fully open it leaves `c`, shut 0.
@@ -32,13 +32,13 @@ _in_series = law(behind_shut_off)
 
 @law
 def behind_valve(c: float, c_line: float, opening: float) -> float:
-    """`behind_shut_off`, compiled; a valve that is fully open leaves `c` to the last bit."""
+    """Compute `behind_shut_off` in compiled code; a valve that is fully open leaves `c` to the last bit."""
     return c if opening >= 1.0 else _in_series(c, c_line, opening)
 
 
 @contracted
 def orifice_flow(dp: float, c: float, dp_0: float) -> float:
-    """Flow [m^3/s] through an orifice under the pressure difference `dp` [Pa].
+    """Compute the flow [m^3/s] through an orifice under the pressure difference `dp` [Pa].
 
     Q = c dp / (dp^2 + dp_0^2)^(1/4), eqs. 4.9-4.12 with the square root made smooth: Q -> c sign(dp) sqrt|dp| for
     |dp| >> dp_0, and laminar, Q = c dp / sqrt(dp_0), for |dp| << dp_0, where the slope of the bare square root would
@@ -49,13 +49,13 @@ def orifice_flow(dp: float, c: float, dp_0: float) -> float:
 
 @contracted
 def one_way_coefficient(dp: float, c_forward: float, c_reverse: float) -> float:
-    """Coefficient that is in force in a one-way throttle: one for each direction of the pressure difference."""
+    """Choose the coefficient of a one-way throttle by the direction of the pressure difference."""
     return select(dp > 0.0, c_forward, c_reverse)  # type: ignore[no-any-return]
 
 
 @contracted
 def _implicit_share(b: float, a: float) -> float:
-    """Return the share w with w r(w) + a w = b for b >= 0, a >= 0, where r = sqrt((w^2 + sqrt(w^4 + 4))/2) >= 1.
+    """Solve w r(w) + a w = b for the share w, b >= 0, a >= 0, where r = sqrt((w^2 + sqrt(w^4 + 4))/2) >= 1.
 
     w = Q/(c sqrt(dp_0)) is the flow through an orifice and w r its pressure difference over dp_0 (`orifice_flow` solved
     for the difference). The left side grows and is convex, so the root is unique; Halley's method finds it, in one turn
@@ -81,7 +81,7 @@ def _implicit_share(b: float, a: float) -> float:
 
 @contracted
 def implicit_orifice_flow(total: float, g: float, c_forward: float, c_reverse: float, dp_0: float) -> float:
-    """Return the flow Q [m^3/s] of a one-way throttle between two volumes in an implicit stage.
+    """Compute the flow Q [m^3/s] of a one-way throttle between two volumes in an implicit stage.
 
     d + g Q(d) = total, g >= 0 [Pa s/m^3].
 
@@ -96,7 +96,7 @@ def implicit_orifice_flow(total: float, g: float, c_forward: float, c_reverse: f
 
 @contracted
 def clogged_resistance(R: float, passed: float, k: float, n: float) -> float:
-    """Resistance [Pa s/m^3] of a filter that is `R` when new, once the volume `passed` [m^3] has gone through it.
+    """Compute the resistance [Pa s/m^3] of a filter after `passed` [m^3] of oil; `R` when new.
 
     dR/dV = k R_new (R/R_new)^n, the blocking laws of filtration for a steady share of dirt:
     R = R_new (1 + (1 - n) k V)^(1/(1 - n)). That is 1 + k V for a cake (n = 0), exp(k V) for intermediate (1),
@@ -114,7 +114,7 @@ def clogged_resistance(R: float, passed: float, k: float, n: float) -> float:
 def filtered_flow(
     total: float, g: float, R: float, p_bypass: float, G_bypass: float, c_forward: float, c_reverse: float, dp_0: float
 ) -> float:
-    """Return the flow [m^3/s] of a throttle in series with a filter that has a bypass valve beside it.
+    """Compute the flow [m^3/s] of a throttle in series with a filter and its bypass valve.
 
     d + g Q(d) + dp_f(Q) = total, with the filter's dp_f = R Q, and where that is above `p_bypass` [Pa] what the valve
     leaves: Q = dp_f/R + G_bypass (dp_f - p_bypass). Both are straight lines, so each is `implicit_orifice_flow`.
@@ -122,11 +122,11 @@ def filtered_flow(
     through = implicit_orifice_flow(total, g + R, c_forward, c_reverse, dp_0)
     share = 1.0 / (1.0 + G_bypass * R)
     rest = total - math.copysign(G_bypass * R * p_bypass * share, total)
-    beside = implicit_orifice_flow(rest, g + R * share, c_forward, c_reverse, dp_0)
-    return select(R * abs(through) > p_bypass, beside, through)  # type: ignore[no-any-return]
+    bypassed = implicit_orifice_flow(rest, g + R * share, c_forward, c_reverse, dp_0)
+    return select(R * abs(through) > p_bypass, bypassed, through)  # type: ignore[no-any-return]
 
 
 @contracted
 def flow_through_filter(Q: float, R: float, p_bypass: float, G_bypass: float) -> float:
-    """Return the size [m^3/s] of the part of `Q` that passes the filter itself, not its bypass (`filtered_flow`)."""
+    """Compute the flow [m^3/s], without its sign, through the filter itself and not its bypass."""
     return min(abs(Q), (abs(Q) + G_bypass * p_bypass) / (1.0 + G_bypass * R))

@@ -45,7 +45,7 @@ from sealscope.physics.state import (
     VELOCITY,
     Pressures,
     State,
-    pressures_moved,
+    add_to_pressures,
 )
 from sealscope.physics.state import OUTPUTS as OUTPUTS  # noqa: PLC0414
 from sealscope.units import P_ATM
@@ -114,7 +114,7 @@ else:  # numba takes a named tuple apart; its fields are those of the models
 
 @law
 def coefficients_of_throttles(v: RigValues, exponent: float, literal: bool) -> tuple[float, float, float, float]:
-    """Return the flow coefficients (c_A_in, c_A_out, c_B_in, c_B_out) [m^3/(s Pa^0.5)], eqs. (4.7)-(4.12).
+    """Compute the flow coefficients (c_A_in, c_A_out, c_B_in, c_B_out) [m^3/(s Pa^0.5)], eqs. (4.7)-(4.12).
 
     "Closed" is a share of the area (`exponent` 1, eq. 4.8) or of the diameter (2, the text). Metering "meter-out": free
     flow towards the cylinder and throttled return on both sides (the text and Appendix A); `literal`: as eqs.
@@ -134,7 +134,7 @@ def coefficients_of_throttles(v: RigValues, exponent: float, literal: bool) -> t
 
 @law
 def derived_numbers(v: RigValues, exponent: float, literal: bool) -> tuple[float, ...]:
-    """Return the numbers of `DERIVED`; `exponent`, `literal`: see `coefficients_of_throttles`."""
+    """Compute the numbers of `DERIVED`; `exponent`, `literal`: see `coefficients_of_throttles`."""
     c_A_in, c_A_out, c_B_in, c_B_out = coefficients_of_throttles(v, exponent, literal)
     V_A, V_B = cylinder.volumes_at_middle(v)
     c_slip, k_h = pump.loss_coefficients(v.q_b, v.C_st, v.C_h, v.rho)
@@ -142,22 +142,22 @@ def derived_numbers(v: RigValues, exponent: float, literal: bool) -> tuple[float
 
 
 def values_of(rig: Rig) -> RigValues:
-    """Return the rig's parameters that its numbers are made of."""
+    """Collect the parameters of a rig that its numbers are made of."""
     return RigValues(*(float(attrgetter(name)(rig)) for name in VALUES.values()))
 
 
 def throttle_readings(rig: Rig) -> tuple[float, bool]:
-    """Return how the throttles of a rig are read: `exponent` and `literal` of `coefficients_of_throttles`."""
+    """Return `exponent` and `literal` of `coefficients_of_throttles` for a rig."""
     return (2.0 if rig.line.closed_means == "diameter" else 1.0), rig.line.metering == "literal"
 
 
 def throttle_coefficients(rig: Rig) -> tuple[float, float, float, float]:
-    """Return the coefficients of the rig's throttles (`coefficients_of_throttles`)."""
+    """Compute the coefficients of the rig's throttles (`coefficients_of_throttles`)."""
     return coefficients_of_throttles(values_of(rig), *throttle_readings(rig))  # type: ignore[no-any-return]
 
 
 def rig_numbers(rig: Rig) -> RigNumbers:
-    """Return the rig's parameters as the compiled laws take them."""
+    """Collect the rig's parameters as the compiled laws take them."""
     values = values_of(rig)
     choices = {name: attrgetter(parameter)(rig) == value for name, (parameter, value) in _CHOICES.items()}
     choices["made_up"] = rig.makeup.check_valves != "absent"
@@ -192,14 +192,14 @@ def rig_numbers(rig: Rig) -> RigNumbers:
 
 @cache
 def _record(lengths: tuple[int, ...]) -> np.dtype[Any]:
-    """Return the type of the record of `packed`, by the lengths of the laws."""
+    """Build the type of the record of `packed`, by the lengths of the laws."""
     truths = [(name, "?") for name in CHOICES if name not in LAWS]
     laws = [(name, "f8", (length,)) for name, length in zip(LAWS, lengths, strict=True)]
     return np.dtype([*((name, "f8") for name in NUMBERS), *truths, *laws], align=True)  # type: ignore[list-item]
 
 
 def packed(p: RigNumbers) -> Any:
-    """Return the numbers as a record, which compiled functions hand on as one address and so compile faster.
+    """Pack the numbers into a record, whose one address compiled functions hand on: they compile faster.
 
     The tables of a load have no place in it: numbers with them are returned as they are.
     """
@@ -211,7 +211,7 @@ def packed(p: RigNumbers) -> Any:
 
 @contracted
 def within_limits(y: State, p: RigNumbers) -> State:
-    """Return the state after a step: the drive's current is held within its limits.
+    """Limit the drive's current in the state after a step.
 
     Without lines p_1 = p_A and p_2 = p_B; with a servo valve p_2 is the return's, and the spool stays within its
     stroke. What no law of the rig moves is 0, so that the compiler leaves it out.
@@ -231,7 +231,7 @@ def within_limits(y: State, p: RigNumbers) -> State:
 
 @contracted
 def vapour_floor(q: float, p: RigNumbers) -> float:
-    """Pressure [Pa] of a volume whose state is q [Pa]: no lower than the oil's vapour pressure `p_vap` [Pa absolute].
+    """Compute the pressure [Pa] of a volume of state q [Pa]: no lower than the vapour pressure `p_vap` [Pa absolute].
 
     Below it the oil boils: a cavity opens, and q goes on by the oil's own bulk modulus, so that rho(q) V is the mass
     that is there and V (1 - rho(q)/rho(p_vap)) the cavity. Nothing of the balances of oil changes.
@@ -245,13 +245,13 @@ def vapour_floor(q: float, p: RigNumbers) -> float:
 
 @contracted
 def pressures_of(y: State, p: RigNumbers) -> Pressures:
-    """Pressures p_A, p_B, p_1, p_2 [Pa] of a state, no lower than the vapour pressure (`vapour_floor`)."""
+    """Compute the pressures p_A, p_B, p_1, p_2 [Pa] of a state, no lower than the vapour pressure (`vapour_floor`)."""
     return vapour_floor(y[P_A], p), vapour_floor(y[P_B], p), vapour_floor(y[P_1], p), vapour_floor(y[P_2], p)
 
 
 @contracted
 def speed_error(y: State, u: float, p: RigNumbers) -> float:
-    """Commanded less actual motor speed [rad/s]; the pump of a servo valve's supply has one speed."""
+    """Compute the commanded less actual motor speed [rad/s]; the pump of a servo valve's supply has one speed."""
     if len(p.valved) > 0:
         return p.omega_P - y[OMEGA]  # type: ignore[no-any-return]
     return p.omega_per_volt * u - y[OMEGA]  # type: ignore[no-any-return]
@@ -259,7 +259,7 @@ def speed_error(y: State, u: float, p: RigNumbers) -> float:
 
 @contracted
 def pump_difference(y: State, p: RigNumbers) -> float:
-    """Pressure difference [Pa] between the ports of the pump."""
+    """Compute the pressure difference [Pa] between the ports of the pump."""
     p_A, p_B, p_1, p_2 = pressures_of(y, p)
     if len(p.throttled) > 0 or len(p.valved) > 0:
         return p_1 - p_2
@@ -268,7 +268,7 @@ def pump_difference(y: State, p: RigNumbers) -> float:
 
 @contracted
 def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, float]:
-    """Friction [N] on the piston by the law that is in force, and the rate [m/s] of its bristles' deflection.
+    """Compute the friction [N] on the piston by the rig's law, and the rate [m/s] of its bristles' deflection.
 
     `applied` [N]: all other forces on the piston. Eqs. (4.20)-(4.22), unless the rig has another law.
     """
@@ -291,7 +291,7 @@ def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, floa
 
 @contracted
 def filter_resistances(y: State, p: RigNumbers) -> tuple[float, float]:
-    """Resistances [Pa s/m^3] of the filters in line A and B, as the oil that passed has clogged them."""
+    """Compute the resistances [Pa s/m^3] of the filters in line A and B, as the oil that passed has clogged them."""
     if len(p.clogging) == 0:
         return p.R_A, p.R_B
     R_A = restrictors.clogged_resistance(p.R_A, y[PASSED_A], p.k_clog_A, p.n_clog)
@@ -302,7 +302,7 @@ def filter_resistances(y: State, p: RigNumbers) -> tuple[float, float]:
 def implicit_flows(
     total_A: float, total_B: float, g_A: float, g_B: float, y: State, p: RigNumbers
 ) -> tuple[float, float]:
-    """Return the flows Q_A, Q_B [m^3/s] of throttles and filters: d + g Q(d) = total in each line.
+    """Compute the flows Q_A, Q_B [m^3/s] of throttles and filters: d + g Q(d) = total in each line.
 
     The filter is in series with its throttle, p_1 - p_A = d + R Q, and so adds to g.
     """
@@ -320,7 +320,7 @@ def implicit_flows(
 
 @contracted
 def passing_filters(y: State, p: RigNumbers) -> tuple[float, float]:
-    """Return the oil [m^3/s] that passes the filters of line A and B, in either direction, beside their bypasses."""
+    """Compute the oil [m^3/s] that passes the filters of line A and B, in either direction, beside their bypasses."""
     Q_A, Q_B = throttle_flows(y, p)
     if len(p.bypassed) == 0:
         return abs(Q_A), abs(Q_B)
@@ -333,7 +333,7 @@ def passing_filters(y: State, p: RigNumbers) -> tuple[float, float]:
 
 @contracted
 def throttle_flows(y: State, p: RigNumbers) -> tuple[float, float]:
-    """Return the throttles' flows Q_A and Q_B [m^3/s].
+    """Compute the throttles' flows Q_A and Q_B [m^3/s].
 
     Q_A runs from line 1 into chamber A, eqs. (4.9)-(4.10), and Q_B from chamber B into line 2, eqs. (4.11)-(4.12). A
     filter in series takes R Q of the pressure difference (Darcy's law).
@@ -348,13 +348,13 @@ def throttle_flows(y: State, p: RigNumbers) -> tuple[float, float]:
 
 @contracted
 def volumes_at(x: float, p: RigNumbers) -> tuple[float, float]:
-    """Oil volumes [m^3] of both sides, hoses and chambers, at piston position x [m]."""
+    """Compute the oil volumes [m^3] of both sides, hoses and chambers, at piston position x [m]."""
     return cylinder.chamber_volumes(x, p.V_A, p.V_B, p.A_A, p.A_B, p.position_dependent)
 
 
 @contracted
 def bulk_modulus(pressure: float, p: RigNumbers) -> float:
-    """Bulk modulus [Pa] of the oil and its air in a volume at `pressure` [Pa]."""
+    """Compute the bulk modulus [Pa] of the oil and its air in a volume at `pressure` [Pa]."""
     if len(p.aerated) == 0:
         return p.K_oil  # type: ignore[no-any-return]
     return effective_bulk_modulus(vapour_floor(pressure, p), p.K_oil, p.air, p.n_air)
@@ -362,7 +362,7 @@ def bulk_modulus(pressure: float, p: RigNumbers) -> float:
 
 @contracted
 def density_ratio(pressure: float, other: float, p: RigNumbers) -> float:
-    """Density of the oil at `pressure` over that at the `other` pressure [Pa]."""
+    """Compute the density of the oil at `pressure` over that at the `other` pressure [Pa]."""
     if len(p.aerated) == 0:
         return oil_density_ratio(pressure - other, p.K_oil)
     p_a, p_b = vapour_floor(pressure, p), vapour_floor(other, p)
@@ -375,9 +375,9 @@ def density_ratio(pressure: float, other: float, p: RigNumbers) -> float:
 
 @contracted
 def volumes_exchanged(Q: float, source: float, sink: float, p: RigNumbers) -> tuple[float, float]:
-    """Volumes [m^3/s] that leave one volume and enter another, each at its own pressure (`source`, `sink` [Pa]).
+    """Compute the volume flows [m^3/s] at either end of a flow, each at its own pressure (`source`, `sink` [Pa]).
 
-    `Q` > 0 leaves the first, and is counted at the pressure it comes from: mass is conserved, rho_in Q_in = rho_out
+    `Q` > 0 leaves the first, and is quantize at the pressure it comes from: mass is conserved, rho_in Q_in = rho_out
     Q_out. Where the rig balances volumes, both are Q.
     """
     if len(p.conserving) == 0:
@@ -389,7 +389,7 @@ def volumes_exchanged(Q: float, source: float, sink: float, p: RigNumbers) -> tu
 
 @contracted
 def throttle_rates(y: State, Q_A: float, Q_B: float, p: RigNumbers) -> Pressures:
-    """Return what the throttles' flows add to the rates of p_A, p_B, p_1, p_2 [Pa/s], eqs. (4.16)-(4.19)."""
+    """Compute the throttles' part of the rates of p_A, p_B, p_1, p_2 [Pa/s], eqs. (4.16)-(4.19)."""
     V_A, V_B = volumes_at(y[POSITION], p)
     from_1, to_A = volumes_exchanged(Q_A, y[P_1], y[P_A], p)
     from_B, to_2 = volumes_exchanged(Q_B, y[P_B], y[P_2], p)
@@ -403,7 +403,7 @@ def throttle_rates(y: State, Q_A: float, Q_B: float, p: RigNumbers) -> Pressures
 
 @contracted
 def supply_pressure(y: State, p: RigNumbers) -> float:
-    """Pressure [Pa] of the make-up's accumulator."""
+    """Compute the pressure [Pa] of the make-up's accumulator."""
     if len(p.polytropic) > 0:
         return external.polytropic_pressure(y[MADE_UP], p.p_charge, p.V_gas, p.n_gas)
     return external.accumulator_pressure(y[MADE_UP], p.p_charge, p.V_gas)
@@ -411,7 +411,7 @@ def supply_pressure(y: State, p: RigNumbers) -> float:
 
 @contracted
 def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
-    """Return the flows [m^3/s] from the accumulator into side 1 (A) and side 2 (B), through check and relief valves.
+    """Compute the flows [m^3/s] from the accumulator into side 1 (A) and side 2 (B), through check and relief valves.
 
     At the pump's ports, or at the chambers without lines. The pilot of a side's check valve is the other side.
     """
@@ -434,9 +434,9 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
 
 @contracted
 def outer_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
-    """Return what leaves at the rod seals and what the make-up feeds.
+    """Compute the part of the rates that the rod seals and the make-up add.
 
-    Rates of p_A, p_B, p_1, p_2 [Pa/s], and of the oil fed [m^3/s], counted at the accumulator's pressure.
+    Rates of p_A, p_B, p_1, p_2 [Pa/s], and of the oil fed [m^3/s], quantize at the accumulator's pressure.
     """
     V_A, V_B = volumes_at(y[POSITION], p)
     K_A, K_B = bulk_modulus(y[P_A], p), bulk_modulus(y[P_B], p)
@@ -458,7 +458,7 @@ def outer_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
 
 @contracted
 def valve_flows(y: State, p: RigNumbers) -> tuple[float, float, float, float]:
-    """Return the flows [m^3/s] of a servo valve's edges: P to A, A to T, P to B, B to T; x_s > 0 opens P-A and B-T."""
+    """Compute the flows [m^3/s] of a servo valve's edges: P to A, A to T, P to B, B to T; x_s > 0 opens P-A and B-T."""
     x_s, Q_N, dp_N, x_max, dp_lam = y[SPOOL], p.Q_N, p.dp_N, p.x_max, p.dp_lam
     p_A, p_B, p_P, p_T = pressures_of(y, p)
     return (
@@ -471,7 +471,7 @@ def valve_flows(y: State, p: RigNumbers) -> tuple[float, float, float, float]:
 
 @contracted
 def supply_compliance(p_1: float, p: RigNumbers) -> float:
-    """Return the oil [m^3/Pa] that supply line and accumulator take in as p_1 [Pa] rises.
+    """Compute the oil [m^3/Pa] that supply line and accumulator take in as p_1 [Pa] rises.
 
     (V_1 + V_oil)/K + V_gas/(n p_abs), V_oil = V_acc - V_gas the oil in the accumulator.
     """
@@ -482,7 +482,7 @@ def supply_compliance(p_1: float, p: RigNumbers) -> float:
 
 @contracted
 def valve_rates(y: State, Q_1: float, p: RigNumbers) -> Pressures:
-    """Return what a servo valve's edges and its supply add to the rates of p_A, p_B, p_1, p_2 [Pa/s].
+    """Compute the part of a servo valve and its supply in the rates of p_A, p_B, p_1, p_2 [Pa/s].
 
     `Q_1` [m^3/s]: flow of the pump into the supply. The return's pressure stays.
     """
@@ -505,7 +505,7 @@ def valve_rates(y: State, Q_1: float, p: RigNumbers) -> Pressures:
 
 @contracted
 def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> State:
-    """dy/dt of everything but the throttles' flows; `u` [V] command, `G`, `C` leakage coefficients, `F` [N] load."""
+    """Compute dy/dt without the throttles' flows; `u` [V] command, `G`, `C` leakage coefficients, `F` [N] load."""
     p_A, p_B, x, v = vapour_floor(y[P_A], p), vapour_floor(y[P_B], p), y[POSITION], y[VELOCITY]
     if len(p.sticking) > 0:
         v = friction.stuck_velocity(v, p.v_th)
@@ -567,11 +567,11 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
 
 @contracted
 def rates(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> State:
-    """dy/dt of the whole rig."""
+    """Compute dy/dt of the whole rig."""
     dy = rates_without_throttles(y, u, G, C, F, p)
     if len(p.throttled) > 0:
         Q_A, Q_B = throttle_flows(y, p)
-        dy = pressures_moved(dy, 1.0, throttle_rates(y, Q_A, Q_B, p))
+        dy = add_to_pressures(dy, 1.0, throttle_rates(y, Q_A, Q_B, p))
     return dy
 
 

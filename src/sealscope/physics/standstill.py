@@ -24,14 +24,14 @@ BELOW_VACUUM, NOT_HELD = 2, 3
 
 @law
 def carried_at_standstill(x: float, p: RigNumbers) -> float:
-    """Force [N] against +x that the pressures carry at standstill at x [m]: the rig's load less that of a stop."""
+    """Compute the force [N] against +x on the pressures at standstill at x [m]: the rig's load less a stop's."""
     load = load_force(x, p.F_l, p.k_load) + opposing_force(0.0, p.A_opp, p.p_opp, 1.0)
     return load - hard_stop_force(x, 0.0, p.L, p.k_stop, p.d_stop)  # type: ignore[no-any-return]
 
 
 @law
 def pressures_at_standstill(force: float, p: RigNumbers) -> tuple[float, float]:
-    """Return p_A, p_B [Pa] that carry `force` [N] against +x at standstill: p_A A_A - p_B A_B = force.
+    """Compute p_A, p_B [Pa] that carry `force` [N] against +x at standstill: p_A A_A - p_B A_B = force.
 
     With a make-up the lower of both is at the accumulator's charge pressure. Without one the circuit holds as much oil
     as at the charge pressure throughout: the mean of both, weighted by the volumes of the sides (chamber, hose, and the
@@ -45,8 +45,8 @@ def pressures_at_standstill(force: float, p: RigNumbers) -> tuple[float, float]:
     if len(p.throttled) > 0:
         V_A, V_B = V_A + p.V_1, V_B + p.V_2
     lack = force - p.p_charge * (p.A_A - p.A_B)  # of force, at the charge pressure
-    moved = lack / (p.A_A / V_A + p.A_B / V_B)
-    return p.p_charge + moved / V_A, p.p_charge - moved / V_B
+    add_step = lack / (p.A_A / V_A + p.A_B / V_B)
+    return p.p_charge + add_step / V_A, p.p_charge - add_step / V_B
 
 
 @law
@@ -69,7 +69,7 @@ def stand_still(y: Any, x: float, force: float, p: RigNumbers) -> int:
 
 @law
 def pressures_behind_valve(force: float, A_A: float, A_B: float, p_1: float, p_2: float) -> tuple[float, float]:
-    """Return p_A, p_B [Pa] that carry `force` [N] against +x behind a servo valve with equal edges at null.
+    """Compute p_A, p_B [Pa] that carry `force` [N] against +x behind a servo valve with equal edges at null.
 
     p_A + p_B = p_1 + p_2: as much is lost at the supply's edges as at those to the return (Merritt, Hydraulic Control
     Systems, 1967, section 5.2). An overlapped valve may trap any mean; this one is taken.
@@ -100,7 +100,7 @@ def supply_at_standstill(force: float, x: float, p: RigNumbers) -> tuple[float, 
 
 
 def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
-    """State (14,) at standstill with the piston at x_0 [m] from mid-stroke, under `push` [N] beside the rig's own load.
+    """Compute the state (14,) at standstill with the piston at x_0 [m] from mid-stroke, under `push` [N] and its load.
 
     The pressures carry the load (`pressures_at_standstill`), the motor holds the pump against them (`stand_still`). A
     machine that leaks creeps from there. Without a load and with equal areas all pressures are at the charge pressure
@@ -132,7 +132,7 @@ def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
 
 
 def _at_valve(rig: Rig, y: np.ndarray, x: float, force: float, p: RigNumbers) -> np.ndarray:
-    """Return the state `y` at standstill at x [m] behind a servo valve, under `force` [N] against +x."""
+    """Complete the state `y` at standstill at x [m] behind a servo valve, under `force` [N] against +x."""
     m = rig.motor
     p_1, p_A, p_B = supply_at_standstill(force, x, p)
     if not rig.supply.p_return <= min(p_A, p_B) <= max(p_A, p_B) <= p_1:

@@ -24,13 +24,13 @@ Pressures = tuple[float, float, float, float]
 
 @contracted
 def state_of(y: np.ndarray) -> State:
-    """Return the state (14,) as the tuple of numbers that the laws take."""
+    """Unpack the state (14,) into the tuple of numbers that the laws take."""
     return y[0], y[1], y[2], y[3], y[4], y[5], y[6], y[7], y[8], y[9], y[10], y[11], y[12], y[13]
 
 
 @contracted
-def moved(y: State, h: float, dy: State) -> State:
-    """Return y + h dy."""
+def add_step(y: State, h: float, dy: State) -> State:
+    """Compute y + h dy."""
     return (
         y[0] + h * dy[0],
         y[1] + h * dy[1],
@@ -50,7 +50,7 @@ def moved(y: State, h: float, dy: State) -> State:
 
 
 @contracted
-def pressures_moved(y: State, h: float, s: Pressures) -> State:
-    """Return the state with h s added to its pressures."""
+def add_to_pressures(y: State, h: float, s: Pressures) -> State:
+    """Add h s to the pressures of a state."""
     p_A, p_B, p_1, p_2 = y[P_A] + h * s[0], y[P_B] + h * s[1], y[P_1] + h * s[2], y[P_2] + h * s[3]
     return y[0], y[1], y[2], y[3], y[4], y[5], p_A, p_B, p_1, p_2, y[10], y[11], y[12], y[13]

@@ -11,19 +11,19 @@ from sealscope.physics.restrictors import orifice_flow
 
 @contracted
 def spool_target(u: float, u_N: float, x_max: float) -> float:
-    """Position [m] that the command u [V] asks of the spool: x_max u/u_N, within its stroke +-x_max."""
+    """Compute the position [m] that the command u [V] asks of the spool: x_max u/u_N, within its stroke +-x_max."""
     return x_max * min(max(u / u_N, -1.0), 1.0)
 
 
 @contracted
 def spool_speed(v_s: float, v_max: float) -> float:
-    """dx_s/dt [m/s]: the spool's speed, held within +-v_max (the rate limit of its drive)."""
+    """Compute dx_s/dt [m/s]: the spool's speed, held within +-v_max (the rate limit of its drive)."""
     return min(max(v_s, -v_max), v_max)
 
 
 @contracted
 def spool_acceleration(x_s: float, v_s: float, x_d: float, omega_s: float, zeta_s: float, v_max: float) -> float:
-    """dv_s/dt [m/s^2] = omega_s^2 (x_d - x_s) - 2 zeta_s omega_s v_s; the drive lets the speed grow no further.
+    """Compute dv_s/dt [m/s^2] = omega_s^2 (x_d - x_s) - 2 zeta_s omega_s v_s; the drive lets the speed grow no further.
 
     `x_d` [m] target of the spool, `omega_s` [rad/s], `zeta_s` damping ratio, `v_max` [m/s].
 
@@ -36,7 +36,7 @@ def spool_acceleration(x_s: float, v_s: float, x_d: float, omega_s: float, zeta_
 
 @contracted
 def spool_within_stroke(x_s: float, v_s: float, x_max: float, v_max: float) -> tuple[float, float]:
-    """Return position [m] and speed [m/s] of a spool that its stroke and its drive hold; at its stop it stands."""
+    """Compute position [m] and speed [m/s] of a spool that its stroke and its drive hold; at its stop it stands."""
     v = min(max(v_s, -v_max), v_max)
     v = select(x_s >= x_max, min(v, 0.0), select(x_s <= -x_max, max(v, 0.0), v))
     return min(max(x_s, -x_max), x_max), v
@@ -44,7 +44,7 @@ def spool_within_stroke(x_s: float, v_s: float, x_max: float, v_max: float) -> t
 
 @contracted
 def edge_flow(dp: float, way: float, overlap: float, Q_N: float, dp_N: float, x_max: float, dp_lam: float) -> float:
-    """Flow [m^3/s] through an edge under `dp` [Pa], with the spool moved `way` [m] to where it opens.
+    """Compute the flow [m^3/s] through an edge under `dp` [Pa], with the spool add_step `way` [m] to where it opens.
 
     c = Q_N/sqrt(dp_N) max(way - overlap, 0)/x_max in the orifice law (`orifice_flow`): the area grows evenly beyond
     the overlap, and an edge without one passes `Q_N` at `dp_N` and full stroke. An underlap is an overlap < 0.

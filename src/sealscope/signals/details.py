@@ -54,21 +54,21 @@ class Details:
         return np.asarray(self.values[level - 1])
 
     def product(self) -> Array:
-        """Return the sample product d_3 d_4, (n,) [unit^2], edges included: the thesis's d3d4."""
+        """Compute the sample product d_3 d_4, (n,) [unit^2], edges included: the thesis's d3d4."""
         return self[3] * self[4]
 
     def quantities(self) -> Array:
-        """Return d1..d4 [unit] and d3d4 [unit^2] of details to level 4, (5, n), edges included (`QUANTITIES`)."""
+        """Stack d1..d4 [unit] and d3d4 [unit^2] of details to level 4, (5, n), edges included (`QUANTITIES`)."""
         return np.vstack([self.values, self.product()])
 
     def inside(self, level: int | None = None) -> slice:
-        """Return the samples at which a level, by default the deepest and so any, does not touch the padding."""
+        """Find the samples that do not touch the padding at a level, by default the deepest and so at any."""
         before, after = self.edges[(level or self.levels) - 1]
         return slice(int(before), self.values.shape[1] - int(after))
 
 
 def edge_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "stationary") -> IntArray:
-    """Return how many samples at the beginning and the end of each level touch the padding, (levels, 2).
+    """Count the samples at the beginning and the end of each level that touch the padding, (levels, 2).
 
     Stationary: the filters' reach. Decimated: from sample ``2^j ceil(2 before_j / 2^j) - before_j`` the first held
     coefficient that saw no padding. Reconstructed: analysis and synthesis together reach ``(L - 1)(2^j - 1)`` to both
@@ -87,7 +87,7 @@ def edge_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "
 
 
 def shortest(wavelet: str = "db8", levels: int = 4, transform: Transform = "stationary") -> int:
-    """Return the least number of samples that leaves each level a sample free of padding; db8 to level 4 needs 226."""
+    """Compute the fewest samples that leave each level one free of padding; db8 to level 4 needs 226."""
     return int(edge_samples(wavelet, levels, transform)[-1].sum()) + 1
 
 
@@ -99,7 +99,7 @@ def details(
     transform: Transform = "stationary",
     edge: Edge = "symmetric",
 ) -> Details:
-    """Return the wavelet details d_1 .. d_levels of `signal`, (n,), all at its length and on its time base.
+    """Compute the wavelet details d_1 .. d_levels of `signal`, (n,), all at its length and on its time base.
 
     ``a_0 = signal, d_j[n] = sum_k g[k] a_(j-1)[n + 2^(j-1)(L/2 - k)]``, a_j the same with h (stationary; `reach` says
     how far each level looks). This is PyWavelets' alignment; the energy of an event stands 5, 7, 9 and 13 samples
@@ -126,16 +126,16 @@ def details(
 
 
 def mean_squares(transformed: Details, bounds: ArrayLike) -> Array:
-    """Return the mean squares of the `QUANTITIES` between consecutive samples `bounds`, (len(bounds) - 1, 5)."""
+    """Compute the mean squares of the `QUANTITIES` between consecutive samples `bounds`, (len(bounds) - 1, 5)."""
     return segment_means(np.square(transformed.quantities()), bounds).T
 
 
 def segment_means(values: Array, bounds: ArrayLike) -> Array:
-    """Return the means of rows (r, n) between consecutive samples `bounds`, (r, len(bounds) - 1)."""
-    at = np.asarray(bounds)
-    sums = np.add.reduceat(values, at[:-1], axis=1)
-    sums[:, -1] = values[:, at[-2] : at[-1]].sum(axis=1)
-    return np.asarray(sums / np.diff(at))
+    """Compute the means of rows (r, n) between consecutive samples `bounds`, (r, len(bounds) - 1)."""
+    begin = np.asarray(bounds)
+    sums = np.add.reduceat(values, begin[:-1], axis=1)
+    sums[:, -1] = values[:, begin[-2] : begin[-1]].sum(axis=1)
+    return np.asarray(sums / np.diff(begin))
 
 
 def _one_of(value: object, choices: Any, name: str) -> None:
@@ -152,8 +152,8 @@ def _stationary(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Array,
     after += -(x.size + before + after) % 2**levels
     padded = pywt.pad(x, (before, after), edge)
     approximation, *deepest_first = pywt.swt(padded, wavelet, level=levels, trim_approx=True, norm=False)
-    kept = slice(before, before + x.size)
-    return np.array([detail[kept] for detail in reversed(deepest_first)]), approximation[kept].copy()
+    inside = slice(before, before + x.size)
+    return np.array([detail[inside] for detail in reversed(deepest_first)]), approximation[inside].copy()
 
 
 def _decimated(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Array, Array]:
@@ -162,12 +162,12 @@ def _decimated(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Array, 
     approximation, *deepest_first = pywt.wavedec(x, wavelet, mode=edge, level=levels)
     before = [0, *reach(wavelet.name, levels)[:, 0].tolist()]
 
-    def held(coefficients: Array, level: int) -> Array:
+    def hold(coefficients: Array, level: int) -> Array:
         # coefficient o is the stationary detail at sample 2^j o - before_j
         return np.repeat(coefficients, 2**level)[before[level] : before[level] + x.size]
 
-    values = [held(coefficients, level) for level, coefficients in enumerate(reversed(deepest_first), start=1)]
-    return np.array(values), held(approximation, levels)
+    values = [hold(coefficients, level) for level, coefficients in enumerate(reversed(deepest_first), start=1)]
+    return np.array(values), hold(approximation, levels)
 
 
 def _reconstructed(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Array, Array]:
@@ -175,8 +175,8 @@ def _reconstructed(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Arr
 
     coefficients = pywt.wavedec(x, wavelet, mode=edge, level=levels)
 
-    def alone(place: int) -> Array:
-        only = [c if i == place else np.zeros_like(c) for i, c in enumerate(coefficients)]
-        return np.asarray(pywt.waverec(only, wavelet, mode=edge), dtype=np.float64)[: x.size]
+    def reconstruct_level(place: int) -> Array:
+        single = [c if i == place else np.zeros_like(c) for i, c in enumerate(coefficients)]
+        return np.asarray(pywt.waverec(single, wavelet, mode=edge), dtype=np.float64)[: x.size]
 
-    return np.array([alone(place) for place in range(levels, 0, -1)]), alone(0)
+    return np.array([reconstruct_level(place) for place in range(levels, 0, -1)]), reconstruct_level(0)

@@ -20,7 +20,7 @@ MAX_LEVELS = 12
 
 @cache
 def discrete_wavelet(name: str) -> Any:
-    """Return PyWavelets' discrete wavelet of that name; raises InputError for a name it does not know."""
+    """Load PyWavelets' discrete wavelet of a name; raise InputError for an unknown one."""
     import pywt
 
     if not isinstance(name, str) or name not in pywt.wavelist(kind="discrete"):
@@ -42,14 +42,14 @@ def decomposition_filters(wavelet: str = "db8") -> tuple[Array, Array]:
 
 
 def checked_levels(levels: int) -> int:
-    """Return `levels` as an int between 1 and MAX_LEVELS; raises InputError otherwise."""
+    """Convert `levels` to an int from 1 to MAX_LEVELS; raise InputError for anything else."""
     if isinstance(levels, bool) or not isinstance(levels, (int, np.integer)) or not 1 <= levels <= MAX_LEVELS:
         raise InputError(f"levels must be a whole number from 1 to {MAX_LEVELS}, got {levels!r}")
     return int(levels)
 
 
 def reach(wavelet: str = "db8", levels: int = 4) -> IntArray:
-    """Return how many samples before and after its own a detail of the stationary transform reads, (levels, 2).
+    """Count the samples before and after a sample that its details read, in each level, (levels, 2).
 
     ``before_j = (L/2 - 1)(2^j - 1)``, ``after_j = (L/2)(2^j - 1)`` with L taps, PyWavelets' alignment. For db8: 7, 21,
     49, 105 before and 8, 24, 56, 120 after.
@@ -60,7 +60,7 @@ def reach(wavelet: str = "db8", levels: int = 4) -> IntArray:
 
 
 def finite_array(values: ArrayLike, name: str = "signal", ndim: int | None = None) -> Array:
-    """Return `values` as doubles; raises InputError unless real, finite and (where given) of `ndim` dimensions."""
+    """Convert `values` to doubles; raise InputError unless real, finite and of `ndim` dimensions where stated."""
     try:
         array = np.asarray(values)
         if np.iscomplexobj(array) or array.dtype.kind in "SUMm":
@@ -69,8 +69,8 @@ def finite_array(values: ArrayLike, name: str = "signal", ndim: int | None = Non
     except (TypeError, ValueError):
         raise InputError(f"{name} must be real numbers, got {type(values).__name__}") from None
     if array.ndim == 0 or (ndim is not None and array.ndim != ndim):
-        wanted = f"{ndim}-dimensional" if ndim else "at least one-dimensional"
-        raise InputError(f"{name} must be {wanted}, got shape {array.shape}")
+        dimensions = f"{ndim}-dimensional" if ndim else "at least one-dimensional"
+        raise InputError(f"{name} must be {dimensions}, got shape {array.shape}")
     finite = np.isfinite(array)
     if not finite.all():
         first = tuple(int(i) for i in np.argwhere(~finite)[0])
@@ -83,7 +83,7 @@ def finite_array(values: ArrayLike, name: str = "signal", ndim: int | None = Non
 
 
 def whole_number(value: object, name: str, unit: str = "") -> int:
-    """Return `value` as an int; raises InputError unless it is a whole number of 1 or more."""
+    """Convert `value` to an int; raise InputError unless it is a whole number of 1 or more."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
         raise InputError(f"{name} must be a whole number >= 1{unit}, got {value!r}")
     return int(value)

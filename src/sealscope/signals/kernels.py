@@ -20,9 +20,9 @@ CHUNK = 64
 def filter_rows(
     rows: Array, source: int, stride: int, hole: int, taps: Array, tap: int, count: int, out: Array, to: int, m: int
 ) -> None:
-    """``out[to + i] = sum_k taps[tap + k] rows[source + stride i - hole k]``, i < m, k < count: eight rows at a time.
+    """Filter eight signals: ``out[to + i] = sum_k taps[tap + k] rows[source + stride i - hole k]``, i < m, k < count.
 
-    Rows and taps hold a number for each lane.
+    Rows and taps hold a number for each lane; eight rows are filtered at a time.
     """
     i = 0
     while i + 8 <= m:
@@ -59,16 +59,16 @@ def filter_rows(
 
 @contracted
 def split_levels(
-    buffers: Array, start: int, at: int, m: int, low: Array, high: Array, levels: int, capacity: int, details: Array
+    buffers: Array, start: int, row_in: int, m: int, low: Array, high: Array, levels: int, capacity: int, details: Array
 ) -> None:
-    """Filter m new rows of a channel's first buffer (rows start + at, ..) through all levels, into `details`.
+    """Filter m new rows of a channel's first buffer, from row start + row_in on, through all levels into `details`.
 
     `details`: (levels, CHUNK, WIDTH). Shallower levels are read late, so that a row belongs to one sample.
     """
     count = low.shape[0]
     for j in range(levels):
         hole = 1 << j
-        row = start + j * capacity + at
+        row = start + j * capacity + row_in
         late = count // 2 * ((1 << levels) - 2 * hole)
         filter_rows(buffers, row - late, 1, hole, high, 0, count, details, j * CHUNK, m)
         if j + 1 < levels:
@@ -77,7 +77,7 @@ def split_levels(
 
 @contracted
 def turn_back(buffers: Array, start: int, levels: int, capacity: int, fill: int, history: int) -> None:
-    """Move the last `history` of the `fill` rows of each of a channel's buffers back to the front."""
+    """Move the last `history` of the `fill` rows of each buffer of a channel to the front."""
     for j in range(levels):
         row = start + j * capacity
         for i in range(history):
@@ -103,26 +103,26 @@ def advance_details(
     """
     channels, actuators, n = block.shape
     levels, capacity = buffers.shape[2], buffers.shape[3]
-    flat, given = details.reshape(-1), buffers.reshape(-1)
-    at = fill
+    flat, flat_buffers = details.reshape(-1), buffers.reshape(-1)
+    filled = fill
     for g in range(groups[0], groups[1]):
         lanes = min(WIDTH, actuators - WIDTH * g)
         for c in range(channels):
             start = (g * channels + c) * levels * capacity
-            at, done = fill, 0
+            filled, done = fill, 0
             while done < n:
-                if at == capacity:
-                    turn_back(buffers, start, levels, capacity, at, history)
-                    at = history
-                m = min(n - done, capacity - at)
+                if filled == capacity:
+                    turn_back(buffers, start, levels, capacity, filled, history)
+                    filled = history
+                m = min(n - done, capacity - filled)
                 for lane in range(lanes):
                     for i in range(m):
-                        given[(start + at + i) * WIDTH + lane] = block[c, WIDTH * g + lane, done + i]
-                split_levels(buffers, start, at, m, low, high, levels, capacity, details)
+                        flat_buffers[(start + filled + i) * WIDTH + lane] = block[c, WIDTH * g + lane, done + i]
+                split_levels(buffers, start, filled, m, low, high, levels, capacity, details)
                 for lane in range(lanes):
                     for j in range(levels):
                         for i in range(m):
                             out[c, WIDTH * g + lane, j, done + i] = flat[(j * CHUNK + i) * WIDTH + lane]
-                at += m
+                filled += m
                 done += m
-    return at
+    return filled

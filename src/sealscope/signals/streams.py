@@ -127,20 +127,22 @@ class DetailStream:
         """
         from sealscope.signals.kernels import advance_details
 
-        wanted = self.channels if isinstance(self.channels, tuple) else (self.channels,)
-        single = wanted == (1,) and np.ndim(block) == 1
-        if not single and (np.ndim(block) == 0 or np.shape(block)[:-1] != wanted):
-            sizes = "" if wanted == (1,) else "".join(f"{size}, " for size in wanted)
+        shape = self.channels if isinstance(self.channels, tuple) else (self.channels,)
+        single = shape == (1,) and np.ndim(block) == 1
+        if not single and (np.ndim(block) == 0 or np.shape(block)[:-1] != shape):
+            sizes = "" if shape == (1,) else "".join(f"{size}, " for size in shape)
             raise InputError(f"block must have shape ({sizes or 'n,'}{'n' if sizes else ''}), got {np.shape(block)}")
         n = np.shape(block)[-1]
         x = np.ascontiguousarray(block, dtype=np.float64).reshape(*self._table, n).view()
         x.setflags(write=False)  # one type for what is read, whether the caller's array may be written or not
-        shape = (*np.shape(block)[:-1], self.levels, n)
+        out_shape = (*np.shape(block)[:-1], self.levels, n)
         if out is None:
-            out = np.empty(shape)
-        elif not (out.shape == shape and out.dtype == np.float64 and out.flags.c_contiguous and out.flags.writeable):
+            out = np.empty(out_shape)
+        elif not (
+            out.shape == out_shape and out.dtype == np.float64 and out.flags.c_contiguous and out.flags.writeable
+        ):
             raise InputError(
-                f"out must be C-contiguous, writeable doubles of shape {shape}, got {out.dtype} {out.shape}"
+                f"out must be C-contiguous, writeable doubles of shape {out_shape}, got {out.dtype} {out.shape}"
             )
         if n == 0:
             return out
@@ -161,7 +163,7 @@ class DetailStream:
         return ThreadPoolExecutor(len(self._shares))
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that the stream knows: settings, number of samples, and the `history` to filter with."""
+        """Return the state of the stream: settings, number of samples, and the `history` to filter with."""
         history = np.moveaxis(self.buffers[:, :, :, self._fill - self._history : self._fill], 0, -2)
         return {
             "channels": self.channels,
@@ -173,7 +175,7 @@ class DetailStream:
 
     @classmethod
     def from_state(cls, state: dict[str, Any], *, threads: int = 1) -> DetailStream:
-        """Return the stream that `state_dict` described, bit for bit; raises InputError for a wrong state."""
+        """Continue the stream that `state_dict` described, bit for bit; raise InputError for a wrong state."""
         channels, levels, wavelet = (part_of(state, name, object) for name in ("channels", "levels", "wavelet"))
         table = tuple(channels) if isinstance(channels, list) else channels
         stream = cls(table, levels, wavelet=wavelet, threads=threads)
@@ -187,7 +189,7 @@ class DetailStream:
 
 
 def aligned(shape: tuple[int, ...]) -> Array:
-    """Return zeros that begin at a cache line, so that no row of lanes lies on two."""
+    """Make an array of zeros that begins at a cache line, so that no row of lanes lies on two."""
     values = np.zeros(math.prod(shape) + 8)
     skip = -(values.ctypes.data // 8) % 8
     return values[skip : skip + math.prod(shape)].reshape(shape)

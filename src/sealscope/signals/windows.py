@@ -40,7 +40,7 @@ class WindowedRms(NamedTuple):
 
 
 def rms(series: ArrayLike) -> Any:
-    """Return ``sqrt(mean(x^2))`` over the last axis [unit of x]; a float for a single series, (...,) for several.
+    """Compute ``sqrt(mean(x^2))`` over the last axis [unit of x]; a float for a single series, (...,) for several.
 
     Raises InputError for an empty series or one that is not finite.
     """
@@ -54,7 +54,7 @@ def rms(series: ArrayLike) -> Any:
 def windowed_rms(
     series: ArrayLike | Details, size: int = WINDOW_SIZE, step: int = WINDOW_STEP, *, first: int = 0
 ) -> WindowedRms:
-    """Return the RMS of each window of `size` samples, every `step` samples, over the last axis of `series` (..., n).
+    """Compute the RMS of each window of `size` samples, every `step` samples, over the last axis of (..., n).
 
     `first` is the sample number of the series' first value and moves `ends` alone. Of `Details` every level is taken,
     only where no level touches the padding, and `ends` counts samples of the signal. A series shorter than one window
@@ -153,7 +153,7 @@ class RmsStream:
         return WindowedRms(ends, values)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that the stream knows, as numbers and arrays; `from_state` continues from it."""
+        """Return the state of the stream as numbers and arrays; `from_state` continues from it."""
         return {
             "size": self.size,
             "step": self.step,
@@ -166,7 +166,7 @@ class RmsStream:
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> RmsStream:
-        """Return the stream that `state_dict` described; raises InputError for a wrong state."""
+        """Continue the stream that `state_dict` described; raise InputError for a wrong state."""
         size, step, rest, sums = (part_of(state, name, object) for name in ("size", "step", "rest", "sums"))
         stream = cls(size, step, skip=count_of(state, "skip"))
         stream._next_end, stream._ahead = count_of(state, "next_end"), count_of(state, "ahead")
@@ -181,14 +181,14 @@ class RmsStream:
 
 
 def _piece_sums(x: Array, piece: int) -> Array:
-    """Return the sum of squares of each full piece, (..., n // piece), summed pairwise along a contiguous row."""
+    """Compute the sum of squares of each full piece, (..., n // piece), pairwise along a contiguous row."""
     pieces = x.shape[-1] // piece
     whole = np.ascontiguousarray(x[..., : pieces * piece])
     return np.asarray(np.add.reduce(np.square(whole.reshape(-1, piece)), axis=-1)).reshape(*x.shape[:-1], pieces)
 
 
 def _rms_of_pieces(sums: Array, size: int, step: int) -> Array:
-    """Return the RMS of each whole window from its pieces' sums of squares (..., pieces), added in their order."""
+    """Compute the RMS of each whole window from its pieces' sums of squares (..., pieces), added in their order."""
     piece = math.gcd(size, step)
     per_window, per_step = size // piece, step // piece
     windows = max(0, (sums.shape[-1] - per_window) // per_step + 1)

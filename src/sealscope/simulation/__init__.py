@@ -1,1 +1,1 @@
-"""Experiments, and how they are simulated, recorded and run side by side."""
+"""Experiments: their description, simulation, recording, and runs side by side."""

@@ -46,7 +46,7 @@ _CONTROLLER = (
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments:
-    """What an experiment is made of, as texts with units or as numbers in SI units."""
+    """The arguments of an experiment, as texts with units or as numbers in SI units."""
 
     rig: Rig | str | os.PathLike[str] = argument(
         "thesis", "Rig, str or path-like", "A rig by name, or by the path of its TOML file"

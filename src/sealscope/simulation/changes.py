@@ -1,4 +1,4 @@
-"""What changes within a run: numbers of the machine over time, held in short blocks, and readings of its instruments.
+"""Changes within a run: numbers of the machine over time, constant within short blocks, and instrument readings.
 
 Drifts (here) and faults (`faults`) say which: an `Effect` is a number of the compiled laws or a parameter of an
 instrument that changes, a `Hold` a reading that repeats itself.
@@ -65,9 +65,9 @@ class Effect:
         return self.field.startswith("sensors.")
 
 
-def changed(own: T, effects: Sequence[Effect], field: str, t: Array) -> T | Array:
-    """Return a number at times t [s]: (own value + sum of what is added to it) x product of its factors."""
-    value: T | Array = own
+def apply_effects(rig_value: T, effects: Sequence[Effect], field: str, t: Array) -> T | Array:
+    """Compute a number at times t [s]: (rig's value + sum of additions) x product of factors."""
+    value: T | Array = rig_value
     for effect in sorted(effects, key=lambda effect: not effect.added):  # sums before products
         if effect.field == field:
             value = value + effect.change(t) if effect.added else value * effect.change(t)
@@ -75,13 +75,13 @@ def changed(own: T, effects: Sequence[Effect], field: str, t: Array) -> T | Arra
 
 
 def values_of(effects: Sequence[Effect], base: RigNumbers, t: Array) -> dict[str, Array]:
-    """Return the numbers of `base` that change, by name, at times t [s]."""
+    """Compute the numbers of `base` that change, by name, at times t [s]."""
     names = dict.fromkeys(effect.field for effect in effects)
-    return {name: changed(np.full(t.size, float(getattr(base, name))), effects, name, t) for name in names}
+    return {name: apply_effects(np.full(t.size, float(getattr(base, name))), effects, name, t) for name in names}
 
 
 def blocks_of(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarray:
-    """Return the bounds (n + 1,) in outputs at `rate` [Hz] of the blocks over which changing numbers are held.
+    """Compute the bounds (n + 1,) in outputs at `rate` [Hz] of the blocks over which changing numbers are held.
 
     A block is at most `LONGEST_BLOCK` long, and so short (down to the effect's shortest) that no effect moves by more
     than its resolution; a jump falls on a block's boundary, within one output interval.
@@ -103,7 +103,7 @@ def blocks_of(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarray:
 
 
 def extremes(effects: Sequence[Effect], base: RigNumbers) -> tuple[RigNumbers, ...]:
-    """Return `base`, and the numbers at either side of each bend of the effects that have no shortest block."""
+    """Collect `base`, and the numbers just before and after each bend of effects without a shortest block."""
     quick = [effect for effect in effects if effect.shortest < SHORTEST_BLOCK]
     bends = np.array(sorted({jump for effect in quick for jump in effect.jumps if math.isfinite(jump)}))
     values = values_of(quick, base, np.concatenate([bends - 1e-9, bends + 1e-9])) if bends.size else {}
@@ -138,7 +138,7 @@ class Schedule:
         rows = table[:, new].T.tolist()
         self.numbers = [whole._replace(**dict(zip(values, row, strict=True))) for row in rows]
 
-    def within(self, first: int, last: int) -> Iterator[tuple[int, int, RigNumbers]]:
+    def blocks_between(self, first: int, last: int) -> Iterator[tuple[int, int, RigNumbers]]:
         """Yield the parts (start, stop, numbers) of the outputs first <= k < last."""
         k = int(np.searchsorted(self.bounds, first, side="right")) - 1
         while first < last:
@@ -158,34 +158,34 @@ class Hold:
 
 @dataclass(frozen=True)
 class Readings:
-    """All that changes at the instruments of a run; nothing by default."""
+    """All changes at the instruments of a run; none by default."""
 
     effects: tuple[Effect, ...] = ()
     holds: tuple[Hold, ...] = ()
 
-    def value(self, parameter: str, own: float, t: Array) -> Array | float:
-        """Return the parameter at times t [s], its own value where nothing changes it."""
-        return changed(own, self.effects, parameter, t)
+    def value(self, parameter: str, rig_value: float, t: Array) -> Array | float:
+        """Compute a parameter of an instrument at times t [s]; `rig_value` where nothing changes it."""
+        return apply_effects(rig_value, self.effects, parameter, t)
 
-    def held(self, channel: str, read: Array, t: Array) -> Array:
-        """Return the readings (n,) with every hold of this channel in them."""
+    def hold_readings(self, channel: str, values: Array, t: Array) -> Array:
+        """Apply the holds of a channel to its readings (n,)."""
         for hold in self.holds:
             still = np.flatnonzero((t >= hold.start) & (t < hold.stop))
             if hold.channel == channel and still.size:
-                read = read.copy()
-                read[still] = read[still[0]]
-        return read
+                values = values.copy()
+                values[still] = values[still[0]]
+        return values
 
 
 class Shape(Protocol):
-    """How a parameter drifts: its change since the start, as a share of its value (or in its unit)."""
+    """The course of a drift: a parameter's change since the start, as a share of its value or in its unit."""
 
-    def at(self, t: Array) -> Array:
-        """Return the change at times t [s] (any shape); 0 at t = 0."""
+    def value_at(self, t: Array) -> Array:
+        """Compute the change at times t [s] (any shape); 0 at t = 0."""
         ...
 
     def bends(self) -> tuple[float, ...]:
-        """Return the times [s] at which it jumps or bends."""
+        """List the times [s] of its jumps and bends."""
         ...
 
 
@@ -205,8 +205,8 @@ class Wander:
         if not (all(map(math.isfinite, (*self.weights, self.slope))) and self.duration > 0):
             raise InputError(f"a wander must have finite weights and last > 0 s, got {self}")
 
-    def at(self, t: Array) -> Array:
-        """Return the change at times t [s]."""
+    def value_at(self, t: Array) -> Array:
+        """Compute the change at times t [s]."""
         phase = np.pi / self.duration * np.maximum(t, 0.0)
         change = np.asarray(self.slope / np.pi * phase)
         if self.weights:  # sin(a + phi) = 2 cos(phi) sin(a) - sin(a - phi)
@@ -218,27 +218,27 @@ class Wander:
         return change
 
     def bends(self) -> tuple[float, ...]:
-        """Return no times: it is smooth."""
+        """Return an empty tuple: the path is smooth."""
         return ()
 
     def scaled(self, size: float) -> Wander:
-        """Return the same path with the distance `size` between its highest and lowest point within the duration."""
-        path = self.at(np.linspace(0.0, self.duration, 1001))
+        """Scale the path to the distance `size` between its highest and lowest point within the duration."""
+        path = self.value_at(np.linspace(0.0, self.duration, 1001))
         span = float(np.ptp(path))
         return self.times(size / span) if span > 0 else self
 
     def times(self, factor: float) -> Wander:
-        """Return the same path, `factor` times as large."""
+        """Multiply the path by `factor`."""
         return Wander(tuple(weight * factor for weight in self.weights), self.duration, self.slope * factor)
 
     def plus(self, other: Wander) -> Wander:
-        """Return the sum of two paths of one duration."""
+        """Add another path of the same duration."""
         pairs = zip_longest(self.weights, other.weights, fillvalue=0.0)
         return Wander(tuple(a + b for a, b in pairs), self.duration, self.slope + other.slope)
 
 
 def linear(size: float, duration: float) -> Wander:
-    """Return an even change of `size` over `duration` [s], going on as long as the run does."""
+    """Make a linear change of `size` over `duration` [s], which continues as long as the run does."""
     return Wander((), duration, size)
 
 
@@ -247,7 +247,7 @@ _STEPS = {"F_l": 0.2}
 
 
 def drifts_absolutely(parameter: str) -> bool:
-    """Whether a parameter drifts in its own unit: an error or a load, which may be zero."""
+    """Return whether a parameter drifts in its own unit: an error or a load, which may be zero."""
     return parameter.rpartition(".")[2] in ("offset", "gain_error", "scale_error", *_STEPS)
 
 
@@ -274,8 +274,8 @@ class ParameterDrift:
         if not (self._of_instruments() or fields_of(self.parameter)):
             raise InputError(f"{self.parameter} cannot drift within a run")
         if self.absolute != drifts_absolutely(self.parameter):
-            wanted = "relative" if self.absolute else "absolute"
-            raise InputError(f"a drift of {self.parameter} must be {wanted}")
+            kind = "relative" if self.absolute else "absolute"
+            raise InputError(f"a drift of {self.parameter} must be {kind}")
 
     def __str__(self) -> str:
         return f"{self.parameter} drifts"
@@ -285,17 +285,17 @@ class ParameterDrift:
 
     def check(self, t: Array) -> None:
         """Raise InputError where a relative drift takes its parameter to zero or below at the times t [s]."""
-        if not self.absolute and (least := float(np.min(self.shape.at(t), initial=0.0))) <= -1.0:
+        if not self.absolute and (least := float(np.min(self.shape.value_at(t), initial=0.0))) <= -1.0:
             raise InputError(f"a relative drift must stay above -100 %, got {100 * least:.4g} % ({self.parameter})")
 
     def effects(self) -> tuple[Effect, ...]:
-        """Return what it changes, in the machine or at the instruments."""
+        """Build the effects of the drift on the machine or its instruments."""
         jumps = self.shape.bends()
 
         def effect(field: str, power: float) -> Effect:
             if self.absolute:
-                return Effect(field, self.shape.at, _STEPS.get(field, math.inf), added=True, jumps=jumps)
-            return Effect(field, lambda t: (1.0 + self.shape.at(t)) ** power, RESOLUTION, jumps=jumps)
+                return Effect(field, self.shape.value_at, _STEPS.get(field, math.inf), added=True, jumps=jumps)
+            return Effect(field, lambda t: (1.0 + self.shape.value_at(t)) ** power, RESOLUTION, jumps=jumps)
 
         fields = ((self.parameter, 1.0),) if self._of_instruments() else fields_of(self.parameter)
         return tuple(effect(field, power) for field, power in fields)
@@ -303,7 +303,7 @@ class ParameterDrift:
 
 @cache
 def fields_of(parameter: str) -> tuple[tuple[str, float], ...]:
-    """Return the numbers of the compiled laws that go with a parameter, each with its power; () where there is none."""
+    """Find the numbers of the compiled laws that follow a parameter, each with its power; () where there is none."""
     from sealscope.physics.rig import NUMBERS
 
     if parameter in GROUPS:

@@ -1,4 +1,4 @@
-"""A controller around the rig: it samples, and the voltage that it gives is held until its next output."""
+"""A controller around the rig: it samples, and its voltage is held until its next output."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _MOST_OUTPUTS = 64
 
 
 def outputs_per_sample(rate: float, controller_rate: float, least: int) -> int:
-    """Return the outputs per sample of a recording at `rate` [Hz], `least` or more, that a controller can sample.
+    """Find the outputs per sample, `least` or more, at which a controller can sample a recording at `rate` [Hz].
 
     Raises InputError where no whole number does.
     """
     for outputs in range(least, _MOST_OUTPUTS + 1):
-        apart = rate * outputs / controller_rate
-        if apart >= 1.0 - 1e-9 and abs(apart - round(apart)) < 1e-9 * apart:
+        spacing = rate * outputs / controller_rate
+        if spacing >= 1.0 - 1e-9 and abs(spacing - round(spacing)) < 1e-9 * spacing:
             return outputs
     raise InputError(
         f"rate of the controller must be a whole multiple or a whole fraction of the sampling rate, {rate:g} Hz, got "
@@ -34,7 +34,7 @@ def outputs_per_sample(rate: float, controller_rate: float, least: int) -> int:
 
 
 class Feedback:
-    """The voltage of a controller over a run, sample after sample (`Loop`, of which the solver calls the controller).
+    """The voltage of a controller over a run, sample by sample; the solver calls the controller through a `Loop`.
 
     Position, angle and pressures are read as the rig's encoders and transducers do: whole counts, and the transducer's
     own noise, from `seed`. A controller in machine code (`compiled`) is called as it is, one in Python through C.
@@ -46,18 +46,18 @@ class Feedback:
         """Begin a run; `outputs`: duration [s] of it, and rate [Hz] of the solver's outputs."""
         duration, rate = outputs
         self._controller = controller
-        self._apart = round(rate / controller.rate)
-        samples = round(duration * rate) // self._apart + 1
+        self._spacing = round(rate / controller.rate)
+        samples = round(duration * rate) // self._spacing + 1
         t = np.arange(samples + 1) / controller.rate
-        given = np.zeros((samples + 1, 5))
-        given[:, 0], given[:, 1] = t, target.at(t)
+        inputs = np.zeros((samples + 1, 5))
+        inputs[:, 0], inputs[:, 1] = t, target.value_at(t)
         # the voltage of a sample acts from `delay` to `delay + 1` samples later
-        ahead = target.at(t + controller.delay / controller.rate)
-        given[:-1, 2] = np.diff(np.broadcast_to(ahead, t.shape)) * controller.rate
+        ahead = target.value_at(t + controller.delay / controller.rate)
+        inputs[:-1, 2] = np.diff(np.broadcast_to(ahead, t.shape)) * controller.rate
         random = np.random.default_rng([seed, 2])
         sensors = rig.sensors
-        given[:-1, 3:] = random.standard_normal((samples, 2)) * (sensors.p_A.noise, sensors.p_B.noise)
-        self._given = given
+        inputs[:-1, 3:] = random.standard_normal((samples, 2)) * (sensors.p_A.noise, sensors.p_B.noise)
+        self._inputs = inputs
         floor = rig.fluid.p_vap - P_ATM if rig.fluid.p_vap > 0 else -math.inf
         self._numbers = sensors.x.resolution, 2.0 * math.pi / sensors.theta.counts, floor, rig.daq.u_max, 0.0
         self.loop: Loop
@@ -65,35 +65,35 @@ class Feedback:
 
     def restart(self) -> None:
         """Begin the run anew."""
-        controller, samples = self._controller, len(self._given)
+        controller, samples = self._controller, len(self._inputs)
         measured = np.empty(len(Measured._fields))
         self._law = law_of(controller)
         memory = self._law.memory
         self.loop = Loop(
-            self._given,
+            self._inputs,
             np.zeros(samples + controller.delay),
             np.zeros(samples),
             measured,
             memory,
             np.array([self._law.address, memory.ctypes.data, measured.ctypes.data]),
             np.array(self._numbers),
-            np.array([self._apart, controller.delay, 0, 0]),
+            np.array([self._spacing, controller.delay, 0, 0]),
         )
 
     def refuse(self) -> None:
-        """Raise what a controller in Python raised, or else SimulationFailed for its voltage that is not finite."""
+        """Raise the exception of a controller in Python, or else SimulationFailed for a voltage that is not finite."""
         raise_within(self._law)
-        t = self._given[self.loop.whole[TAKEN], 0]
+        t = self._inputs[self.loop.whole[TAKEN], 0]
         raise SimulationFailed(
             f"the controller must give a finite voltage, got {self.loop.numbers[ASKED]} at t = {t:.4g} s"
         )
 
     def volts(self, outputs: int) -> Array:
         """Return the voltages [V], (n,), at the first outputs of the solver."""
-        return np.asarray(self.loop.volts[np.arange(outputs) // self._apart])
+        return np.asarray(self.loop.volts[np.arange(outputs) // self._spacing])
 
     def compensated(self, outputs: int) -> Array | None:
-        """Return the leakage flow [m^3/s] that is made good, at the first outputs; None where none is reported."""
+        """Return the compensated leakage flow [m^3/s] at the first outputs; None where none is reported."""
         if not self.loop.whole[REPORTED]:
             return None
-        return np.asarray(self.loop.compensated[np.arange(outputs) // self._apart])
+        return np.asarray(self.loop.compensated[np.arange(outputs) // self._spacing])

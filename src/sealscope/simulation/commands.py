@@ -16,15 +16,15 @@ from sealscope.units import parse_quantity
 
 
 def number_text(value: float) -> str:
-    """Return the shortest text that reads back as exactly this number."""
+    """Format a number as the shortest text that reads back as exactly the same."""
     return repr(float(value)).removesuffix(".0")
 
 
 class Command(Protocol):
-    """A command: volts as a function of time, and its own description in the form that `parse_command` reads."""
+    """A command: volts as a function of time, and its text, which `parse_command` reads."""
 
     def volts(self, t: Array) -> Array:
-        """Return u [V] at times t [s] (any shape); 0 before t = 0."""
+        """Compute u [V] at times t [s] (any shape); 0 before t = 0."""
         ...
 
     def __str__(self) -> str: ...
@@ -40,7 +40,7 @@ class Sine:
     offset: float = 0.0
 
     def volts(self, t: Array) -> Array:
-        """Return u [V] at times t [s]."""
+        """Compute u [V] at times t [s]."""
         return self.offset + self.amplitude * np.sin(self.omega * t + self.phase)
 
     def __str__(self) -> str:
@@ -62,7 +62,7 @@ class MultiSine:
             raise InputError(f"a multi-sine must be of two sines or more, an offset in the last alone, got {self}")
 
     def volts(self, t: Array) -> Array:
-        """Return u [V] at times t [s]."""
+        """Compute u [V] at times t [s]."""
         return np.asarray(sum(sine.volts(t) for sine in self.parts))
 
     def __str__(self) -> str:
@@ -84,7 +84,7 @@ class Trapezoid:
             )
 
     def volts(self, t: Array) -> Array:
-        """Return u [V] at times t [s]."""
+        """Compute u [V] at times t [s]."""
         since = np.mod(np.maximum(t, 0.0), self.period)
         up, down = since / self.rise, (since - 0.5 * self.period) / self.rise
         return np.asarray(self.level * (np.clip(up, 0.0, 1.0) - np.clip(down, 0.0, 1.0)))
@@ -106,7 +106,7 @@ class Alternating:
                 raise InputError(f"a duty in turn must be of periods >= 1 of sines from zero, got {periods} of {sine}")
 
     def volts(self, t: Array) -> Array:
-        """Return u [V] at times t [s]."""
+        """Compute u [V] at times t [s]."""
         lengths = np.array([2.0 * np.pi * periods / sine.omega for periods, sine in self.parts])
         ends = np.cumsum(lengths)
         since = np.mod(t, ends[-1])
@@ -122,7 +122,7 @@ class Alternating:
 
 @dataclass(frozen=True, eq=False)
 class Polyline:
-    """What is linear over time between points, and constant before the first and after the last.
+    """A course that is linear between points, and constant before the first and after the last.
 
     `t`, `y`: (n,) times [s] that do not fall, and values; of two points at one time the later holds from there on.
     `words`: what it is called, in the form that parsers read. Of two equal ones all three are the same.
@@ -132,26 +132,26 @@ class Polyline:
     y: Array
     words: str
 
-    def at(self, t: Array) -> Array:
-        """Return the values at times t [s] (any shape)."""
+    def value_at(self, t: Array) -> Array:
+        """Compute the values at times t [s] (any shape)."""
         return np.interp(t, self.t, self.y)
 
     def volts(self, t: Array) -> Array:
-        """Return u [V] at times t [s]."""
-        return self.at(t)
+        """Compute u [V] at times t [s]."""
+        return self.value_at(t)
 
     def bends(self) -> tuple[float, ...]:
-        """Return the times [s] at which it jumps or bends; none for a table too long to follow each."""
+        """List the times [s] of its jumps and bends; none for a table too long to follow each."""
         return tuple(map(float, np.unique(self.t))) if self.t.size < _LONGEST_FOLLOWED else ()
 
     def onset(self) -> float:
-        """Return the time [s] from which it leaves 0: 0 where it never was, infinity where it never does."""
+        """Find the time [s] from which it is not 0: 0 for a course that begins so, infinity for one that stays 0."""
         first = int(np.argmax(self.y > 0)) if np.any(self.y > 0) else -1
         return math.inf if first < 0 else float(self.t[first - 1]) if first else 0.0
 
     @property
     def rise(self) -> tuple[float, float] | None:
-        """When [s] an even rise from 0 to 1 begins and ends, None where it is another course."""
+        """Begin and end [s] of a linear rise from 0 to 1, None for another course."""
         return (float(self.t[0]), float(self.t[1])) if self.y.tolist() == [0.0, 1.0] else None
 
     def __eq__(self, other: object) -> bool:
@@ -170,13 +170,13 @@ _LONGEST_FOLLOWED = 1000
 
 
 def polyline(points: Sequence[tuple[float, float]], words: str) -> Polyline:
-    """Return the course through points (t, y)."""
+    """Make the course through points (t, y)."""
     t, y = np.array(points, dtype=np.float64).T
     return Polyline(t, y, words)
 
 
 def tabulated(t: Array, y: Array, what: str = "a table") -> Polyline:
-    """Return the course through the points of a table; InputError where its times fall, or a value is not finite."""
+    """Make the course through the points of a table; raise InputError for falling times and infinite values."""
     if t.ndim != 1 or t.shape != y.shape or t.size < 1 or np.any(np.diff(t) < 0):
         raise InputError(f"{what} must have one value for each time, and its times must rise")
     if not (np.all(np.isfinite(t)) and np.all(np.isfinite(y))):
@@ -184,13 +184,13 @@ def tabulated(t: Array, y: Array, what: str = "a table") -> Polyline:
     return Polyline(t, y, f"table of {t.size} points over {t[0]:g}..{t[-1]:g} s")
 
 
-def step(level: float, at: float = 0.0) -> Polyline:
-    """Return u = 0 before `at` [s], `level` [V] from then on."""
-    return polyline([(at, 0.0), (at, level)], f"step {number_text(level)} at {number_text(at)} s")
+def step(level: float, start: float = 0.0) -> Polyline:
+    """Make u = 0 before `start` [s], `level` [V] from then on."""
+    return polyline([(start, 0.0), (start, level)], f"step {number_text(level)} at {number_text(start)} s")
 
 
 def ramp(level: float, start: float, stop: float) -> Polyline:
-    """Return u that rises evenly from 0 at `start` [s] to `level` [V] at `stop` [s] and stays there."""
+    """Make u that rises linearly from 0 at `start` [s] to `level` [V] at `stop` [s] and stays there."""
     if not stop > start:
         raise InputError(f"a ramp must stop after it starts, got {start:g} s to {stop:g} s")
     words = f"ramp {number_text(level)} from {number_text(start)} s to {number_text(stop)} s"
@@ -214,7 +214,7 @@ class Chirp:
             raise InputError(f"a chirp must have frequencies >= 0 Hz and a duration > 0 s, got {self}")
 
     def volts(self, t: Array) -> Array:
-        """Return u [V] at times t [s]."""
+        """Compute u [V] at times t [s]."""
         within = np.minimum(t, self.duration)
         cycles = self.f_0 * within + (self.f_1 - self.f_0) * within**2 / (2.0 * self.duration)
         return self.amplitude * np.sin(2.0 * np.pi * (cycles + self.f_1 * (t - within)))
@@ -245,7 +245,7 @@ class PseudoRandom:
             raise InputError(f"a pseudo-random command must hold each value for > 0 s, got {self.hold:g} s")
 
     def volts(self, t: Array) -> Array:
-        """Return u [V] at times t [s]."""
+        """Compute u [V] at times t [s]."""
         slot = np.clip(np.floor(t / self.hold), 0.0, 2.0**63).astype(np.uint64)
         start = np.random.SeedSequence(self.seed).generate_state(1, np.uint64)
         z = start + (slot + np.uint64(1)) * np.uint64(GOLDEN)
@@ -259,14 +259,14 @@ class PseudoRandom:
 
 
 def recorded(t: Array, u: Array, origin: str = "recorded") -> Polyline:
-    """Return a course that was recorded: linear between its samples, its last value afterwards."""
+    """Make a recorded course: linear between its samples, its last value afterwards."""
     if t.size < 2 or np.any(np.diff(t) == 0):
         raise InputError(f"a recorded course must have two samples or more, one at a time, got {t.size} ({origin})")
     return replace(tabulated(t, u, f"a recorded course ({origin})"), words=f"file {origin}")
 
 
 def recorded_command(recording: Recording, origin: str) -> Polyline:
-    """Return the command channel `u` of a recording as a command of its own; the first sample is at t = 0."""
+    """Make a command of the channel `u` of a recording; its first sample is at t = 0."""
     return recorded(recording.t - recording.t[0], recording["u"], origin)
 
 
@@ -319,7 +319,7 @@ _FORMS: tuple[tuple[str, Callable[[list[str | None]], Command]], ...] = (
 
 
 def seconds(text: str | None) -> float:
-    """Time [s] that a match of `TIME` states; 0 for None."""
+    """Compute the time [s] of a match of `TIME`; 0 for None."""
     return 0.0 if text is None else parse_quantity(text.lower(), "s", name="a time")
 
 
@@ -336,7 +336,7 @@ _LONGEST_TEXT = 1000
 
 
 def plain_text(text: str, what: str) -> str:
-    """Return the text of an option with single blanks, but for a path after ``file``.
+    """Reduce the blanks in the text of an option to single ones, except in a path after ``file``.
 
     Raises InputError for one of more than 1000 characters.
     """
@@ -351,7 +351,7 @@ _SINES = re.compile(rf"\s*([-+])?\s*({_N})?\s*\*?\s*sin\(\s*({_N})?\s*\*?\s*t\s*
 
 
 def _sines(text: str) -> Sine | MultiSine | None:
-    """Return the sine or the sum of sines that a text is, the offset after the last; None where it is neither."""
+    """Read a sine or a sum of sines, the offset after the last; None for another text."""
     parts: list[Sine] = []
     end = 0
     while (match := _SINES.match(text, end)) is not None and (match[1] or not parts):

@@ -1,4 +1,4 @@
-"""Courses of what is no voltage: the position that a piston is to take, the force of a load (also over x and v)."""
+"""Courses other than voltages: the position target of a piston, and the force of a load over t, x or v."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ Bends = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class Position:
-    """A target for the piston: x = course(t) [m] from mid-stroke, followed by a controller; `words` as it was given."""
+    """A target for the piston: x = course(t) [m] from mid-stroke, followed by a controller; `words`: its text."""
 
     course: Command
     words: str
 
-    def at(self, t: Array) -> Array:
-        """Return the target [m] at times t [s]."""
+    def value_at(self, t: Array) -> Array:
+        """Compute the target [m] at times t [s]."""
         return self.course.volts(t)
 
     def __str__(self) -> str:
@@ -47,7 +47,7 @@ class Position:
 
 @dataclass(frozen=True)
 class Force:
-    """A load beside the rig's own: F = course(t) [N] against +x; `words` as it was given.
+    """A load besides the rig's own: F = course(t) [N] against +x; `words`: its text.
 
     `over_x`, `over_v`: what is linear between bends over position [m] and velocity [m/s] of the piston is added.
     """
@@ -57,12 +57,12 @@ class Force:
     over_x: Bends = ()
     over_v: Bends = ()
 
-    def at(self, t: Array) -> Array:
-        """Return the force [N] at times t [s], but for what depends on the piston."""
+    def value_at(self, t: Array) -> Array:
+        """Compute the force [N] at times t [s], without its part over the piston's position and velocity."""
         return self.course.volts(t)
 
     def tables(self) -> tuple[Array, Array] | None:
-        """Return the bends over position and velocity as `physics.cylinder.force_over` takes them; None without any."""
+        """Build the bends over position and velocity for `physics.cylinder.force_over`; None without any."""
         if not (self.over_x or self.over_v):
             return None
         x, v = (np.array(bends or ((0.0, 0.0),), dtype=np.float64) for bends in (self.over_x, self.over_v))
@@ -73,7 +73,7 @@ class Force:
 
 
 def numbers_under(rig: Rig, load: Force | None) -> RigNumbers:
-    """Return the numbers of a rig with the laws of a load beside its own."""
+    """Build the numbers of a rig under a load."""
     from sealscope.physics.rig import rig_numbers
 
     numbers = rig_numbers(rig)
@@ -81,24 +81,24 @@ def numbers_under(rig: Rig, load: Force | None) -> RigNumbers:
 
 
 def state_under(rig: Rig, load: Force | None, x: float) -> Array:
-    """Return the state of a rig at t = 0 with its piston at standstill at x [m] under a load beside its own."""
+    """Compute the state of a rig at t = 0 with its piston at standstill at x [m] under a load."""
     from sealscope.physics.cylinder import force_over
     from sealscope.physics.standstill import initial_state
 
-    force, tables = (0.0, None) if load is None else (float(load.at(np.zeros(()))), load.tables())
+    force, tables = (0.0, None) if load is None else (float(load.value_at(np.zeros(()))), load.tables())
     if tables is not None:
         force = float(force + force_over(x, tables[0]) + force_over(0.0, tables[1]))
     return initial_state(rig, x, force)
 
 
 def bends_of(s: Array, F: Array) -> Bends:
-    """Return the force linear between the points (s, F), s rising; the first and the last force hold beyond them."""
+    """Build the bends of a force through the points (s, F), s rising, constant beyond the first and the last."""
     slopes = np.concatenate([[0.0], np.diff(F) / np.diff(s), [0.0]])
     return (float(F[0]), 0.0), *zip(s.tolist(), np.diff(slopes).tolist(), strict=True)
 
 
 def _course(words: str, units: Mapping[str, float], what: str) -> Command:
-    """Return the words of a command whose size has one of `units` as a command in SI."""
+    """Read a command whose size has one of `units`, in SI."""
     names = "|".join(sorted(units, key=len, reverse=True))
     sized = re.compile(rf"({UNSIGNED})\s*\[?({names})\b\]?")
     if not sized.search(words):
@@ -137,12 +137,12 @@ def parse_position(text: str) -> Position | None:
 
 
 def command_or_target(text: str) -> Command | Position:
-    """Read what a machine is asked for: a target for its piston, or else a command for its drive."""
+    """Read a target for the piston, or else a command for the drive."""
     return parse_position(text) or parse_command(text)
 
 
 def _recorded_force(path: str, words: str) -> Force:
-    """Return the force of a text table: column ``F [N]`` over ``t [s]``, ``x [m]`` or ``v [m/s]``, in any unit.
+    """Read the force of a text table: column ``F [N]`` over ``t [s]``, ``x [m]`` or ``v [m/s]``, in any unit.
 
     Linear between the rows. Over time the first row is at t = 0; where there are times, positions are not looked at.
     Beyond the first and the last row their forces hold.
@@ -219,4 +219,4 @@ def parse_force(text: str) -> Force:
 
 
 def _spelled(unit: str, units: Mapping[str, float]) -> str:
-    return next(own for own in units if own.replace(" ", "") == unit.replace(" ", ""))
+    return next(known for known in units if known.replace(" ", "") == unit.replace(" ", ""))

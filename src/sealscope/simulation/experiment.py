@@ -1,4 +1,4 @@
-"""An experiment: a rig, a command, leaks, other faults and drifts, how long, and how it is sampled and integrated."""
+"""An experiment: rig, command, leaks, other faults and drifts, duration, sampling and integration."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _Kind = TypeVar("_Kind", Leak, Fault)
 
 
 def choose_method(rig: Rig, method: Method) -> Literal["rk4", "imex"]:
-    """Return the stated method, or the one that suits the rig: implicit-explicit with throttles, explicit without."""
+    """Return the stated method, or choose by the rig: implicit-explicit with throttles, explicit without."""
     if method not in ("auto", "rk4", "imex"):
         raise InputError(f"method must be auto, rk4 or imex, got {method!r}")
     throttled = rig.line.orifices == "present"
@@ -54,7 +54,7 @@ def choose_method(rig: Rig, method: Method) -> Literal["rk4", "imex"]:
 
 def check_target(target: Position, t: Array, half: float) -> None:
     """Raise InputError where a target leaves the stroke, +-`half` [m], at any of the times `t` [s]."""
-    x = np.broadcast_to(target.at(t), t.shape)
+    x = np.broadcast_to(target.value_at(t), t.shape)
     bad = ~(np.abs(x) <= half)
     if bad.any():
         k = int(np.argmax(bad))
@@ -162,7 +162,7 @@ class Experiment:
 
     @staticmethod
     @with_arguments_of(Arguments)
-    def of(given: Arguments) -> Experiment:
+    def of(arguments: Arguments) -> Experiment:
         """Make an experiment of numbers in SI units and texts with units; the arguments are those of `simulate`.
 
         Returns
@@ -179,25 +179,25 @@ class Experiment:
         from sealscope.parameters import load_rig
 
         numbers: dict[str, Any] = {}
-        for own in fields(given):
-            value, unit = getattr(given, own.name), own.metadata["unit"]
-            if unit and value is not own.default:
-                value = parse_quantity(value, unit, name=own.name, finite=False)
+        for declared in fields(arguments):
+            value, unit = getattr(arguments, declared.name), declared.metadata["unit"]
+            if unit and value is not declared.default:
+                value = parse_quantity(value, unit, name=declared.name, finite=False)
             if unit:
-                numbers[own.name] = value
+                numbers[declared.name] = value
         rate = numbers.pop("rate")
-        if not isinstance(given.set, Mapping | None):
-            raise InputError(f"set must map names of parameters to values, got {given.set!r}")
-        overrides = {**(given.set or {}), **({} if rate is None else {"daq.sample_rate": rate})}
-        rig = load_rig(given.rig)
-        command = command_or_target(given.command) if isinstance(given.command, str) else given.command
+        if not isinstance(arguments.set, Mapping | None):
+            raise InputError(f"set must map names of parameters to values, got {arguments.set!r}")
+        overrides = {**(arguments.set or {}), **({} if rate is None else {"daq.sample_rate": rate})}
+        rig = load_rig(arguments.rig)
+        command = command_or_target(arguments.command) if isinstance(arguments.command, str) else arguments.command
         if not (hasattr(command, "volts") or isinstance(command, Position)):
             raise InputError(f"command must be a text or a Command, got {command!r}")
-        if not isinstance(given.load, str | Force | None):
-            raise InputError(f"load must be a text or a Force, got {given.load!r}")
-        if isinstance(given.seed, bool) or not isinstance(given.seed, int | np.integer):
-            raise InputError(f"seed must be a whole number, got {given.seed!r}")
-        controller = given.controller
+        if not isinstance(arguments.load, str | Force | None):
+            raise InputError(f"load must be a text or a Force, got {arguments.load!r}")
+        if isinstance(arguments.seed, bool) or not isinstance(arguments.seed, int | np.integer):
+            raise InputError(f"seed must be a whole number, got {arguments.seed!r}")
+        controller = arguments.controller
         if isinstance(controller, str):
             from sealscope.control import controller_named
 
@@ -205,13 +205,13 @@ class Experiment:
         return Experiment(
             rig=rig.with_overrides(overrides) if overrides else rig,
             command=command,
-            leaks=_each(given.leak, Leak, parse_leak, "leak"),
-            seed=int(given.seed),
-            method=given.method,
-            allow_unresolved=given.allow_unresolved,
-            faults=_each(given.fault, Fault, parse_fault, "fault"),
-            drifts=tuple(given.drifts),
-            load=parse_force(given.load) if isinstance(given.load, str) else given.load,
+            leaks=_parse_several(arguments.leak, Leak, parse_leak, "leak"),
+            seed=int(arguments.seed),
+            method=arguments.method,
+            allow_unresolved=arguments.allow_unresolved,
+            faults=_parse_several(arguments.fault, Fault, parse_fault, "fault"),
+            drifts=tuple(arguments.drifts),
+            load=parse_force(arguments.load) if isinstance(arguments.load, str) else arguments.load,
             controller=controller,
             **numbers,
         )
@@ -248,10 +248,10 @@ class Experiment:
             return None
         from sealscope.control import PositionPI
 
-        return self.controller or PositionPI.of(self.rig)
+        return self.controller or PositionPI.from_rig(self.rig)
 
     def effects(self) -> tuple[Effect, ...]:
-        """Return what changes in the machine within the run."""
+        """Collect the changes in the machine within the run."""
         return tuple(effect for effect in self._effects() if not effect.of_instrument)
 
     def _effects(self) -> tuple[Effect, ...]:
@@ -259,7 +259,7 @@ class Experiment:
         return (*drifting, *(effect for fault in self.faults for effect in fault.effects(self.rig)))
 
     def flowing(self, leaks: tuple[Leak, ...]) -> tuple[Leak, ...]:
-        """Return leaks as they flow in the run's oil: a laminar one passes more where the oil is warmer than the rig's.
+        """Adapt leaks to the run's oil: a laminar one passes more where the oil is warmer than the rig's.
 
         Their coefficients are those at the rig's own viscosity.
         """
@@ -277,7 +277,7 @@ class Experiment:
         return tuple(fault for fault in self.faults if fault.viscosity(self.rig) is not None)
 
     def readings(self) -> Readings:
-        """Return what changes at the instruments within the run."""
+        """Collect the changes at the instruments within the run."""
         effects = tuple(effect for effect in self._effects() if effect.of_instrument)
         return Readings(effects, tuple(hold for fault in self.faults for hold in fault.holds()))
 
@@ -292,7 +292,7 @@ class Experiment:
         return self.rig.daq.sample_rate
 
     def sample_times(self) -> Array:
-        """Return the times [s] of the recording's samples."""
+        """Compute the times [s] of the recording's samples."""
         return np.arange(round(self.duration * self.rate)) / self.rate
 
     def onset(self) -> float | None:
@@ -302,7 +302,7 @@ class Experiment:
         return max(0.0, min(onsets)) if onsets else None
 
     def describe(self) -> dict[str, Any]:
-        """Return the experiment as plain values, without what only the truth may know (leaks, faults, drifts)."""
+        """Convert the experiment to plain values, without its truth (leaks, faults, drifts)."""
         return {
             "rig": self.rig.name,
             "overrides": {
@@ -320,7 +320,7 @@ class Experiment:
         }
 
     def key(self) -> str:
-        """Return a short name that is the same for equal experiments only."""
+        """Compute a short name that equal experiments alone share."""
         values = {name: repr(value) for name, value in self.rig.present().items()}
         inputs = [exact(self.command), *(exact(leak) for leak in self.leaks)]
         inputs += [exact(change) for change in (*self.faults, *self.drifts)]
@@ -332,7 +332,7 @@ class Experiment:
 
 
 def exact(value: Any) -> Any:
-    """Return a command or a leak as plain values that differ wherever its numbers do.
+    """Convert a command or a leak to plain values that differ wherever its numbers do.
 
     Down to the last digit, and deep in a table.
     """
@@ -343,14 +343,16 @@ def exact(value: Any) -> Any:
     return repr(value)
 
 
-def _each(given: Any, kind: type[_Kind], parse: Callable[[str], _Kind | None], name: str) -> tuple[_Kind, ...]:
-    """Return the leaks or faults of an argument: one or several, as texts or as objects.
+def _parse_several(
+    argument: Any, kind: type[_Kind], parse: Callable[[str], _Kind | None], name: str
+) -> tuple[_Kind, ...]:
+    """Read the leaks or faults of an argument: one or several, as texts or as objects.
 
     Raises InputError for anything else.
     """
-    several = [] if given is None else [given] if isinstance(given, (str, kind)) else given
+    several = [] if argument is None else [argument] if isinstance(argument, (str, kind)) else argument
     if not isinstance(several, Iterable):
-        raise InputError(f"{name} must be a text, a {kind.__name__} or several of them, got {given!r}")
+        raise InputError(f"{name} must be a text, a {kind.__name__} or several of them, got {argument!r}")
     result = []
     for item in several:
         if not isinstance(item, (str, kind)):

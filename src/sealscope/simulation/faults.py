@@ -59,7 +59,7 @@ def _number(text: str | None) -> float:
 
 @dataclass(frozen=True)
 class FaultRow:
-    """What a fault of a kind changes, in what words: an entry of `faults.toml`, whose head says what its keys are."""
+    """The effects and words of a kind of fault: an entry of `faults.toml`, whose head explains its keys."""
 
     name: str
     kind: str
@@ -84,15 +84,15 @@ class FaultRow:
         return self.kind.startswith("sensor")
 
     def read(self, text: str) -> Fault | None:
-        """Return the fault that a text states; None where it is another."""
+        """Read the fault of a text; None where it is another kind."""
         pattern = self.pattern.format(**_PATTERNS).replace(" ", r"\s+") + _WHEN[self.when]
         match = re.fullmatch(pattern, text, re.IGNORECASE)
         if match is None:
             return None
         part = match.groupdict()
-        at = part.get("at") or ""
-        at = at if self.of_sensor else at.upper()
-        return Fault(self.name, self._value(part), at, opening_of(part), _number(part.get("pace") or "1"))
+        place = part.get("at") or ""
+        place = place if self.of_sensor else place.upper()
+        return Fault(self.name, self._value(part), place, opening_of(part), _number(part.get("pace") or "1"))
 
     def _value(self, part: Part) -> float:
         if part.get("size") is not None:
@@ -144,11 +144,11 @@ class Fault:
         return self.row.kind
 
     def onset(self) -> float:
-        """Return the first time [s] at which it is there."""
+        """Return the first time [s] at which the fault is present."""
         return self.opening.onset()
 
     def effects(self, rig: Rig) -> tuple[Effect, ...]:
-        """Return what it changes, in the machine or at a sensor; InputError where it cannot be on this rig."""
+        """Build the effects on the machine or a sensor; raise InputError where the fault cannot be on this rig."""
         row = self.row
         if row.needs is not None and rig[name := row.needs[0].format(at=self.at)] == 0:
             raise InputError(f"{row.needs[1]} {name} > 0, got 0 ({self})")
@@ -163,7 +163,7 @@ class Fault:
         return tuple(
             Effect(
                 name.format(at=self.at, gain=GAINS.get(self.at)),
-                lambda t: whole + size * self.opening.at(t),
+                lambda t: whole + size * self.opening.value_at(t),
                 step,
                 added=not row.factor,
                 jumps=self.opening.bends(),
@@ -173,18 +173,18 @@ class Fault:
         )
 
     def holds(self) -> tuple[Hold, ...]:
-        """Return the readings that it makes repeat themselves."""
+        """List the readings that repeat themselves because of the fault."""
         if self.name != "sensor stuck":
             return ()
         stop = math.inf if self.opening.y[-1] > 0 else float(self.opening.t[-1])
         return (Hold(self.at, self.onset(), stop),)
 
     def commanded(self, command: Command) -> Command:
-        """Return the command that the rig gets instead of `command`."""
+        """Build the command that the rig receives in place of `command`."""
         return ChangedDuty(command, self) if self.name == "duty" else command
 
     def viscosity(self, rig: Rig) -> Callable[[Array], Array] | None:
-        """Return the oil's viscosity over that of the rig, as a function of times [s]; None where it stays."""
+        """Build the oil's viscosity over that of the rig, as a function of times [s]; None where it is constant."""
         if self.name != "oil":
             return None
         from sealscope.physics.fluid import kinematic_viscosity, thermal_density
@@ -200,7 +200,7 @@ class Fault:
         return ratio
 
     def _warmth(self, rig: Rig, t: Array) -> Array:
-        return np.asarray(rig.fluid.T_oil + self.value * self.opening.at(t))
+        return np.asarray(rig.fluid.T_oil + self.value * self.opening.value_at(t))
 
     def __str__(self) -> str:
         words = self.row.words
@@ -216,13 +216,13 @@ class Fault:
 
 @dataclass(frozen=True)
 class ChangedDuty:
-    """The command `before`, made larger and faster as `change` says, without a jump in its phase."""
+    """The command `before`, made larger and faster as `change` states, without a jump in its phase."""
 
     before: Command
     change: Fault
 
     def clock(self, t: Array) -> Array:
-        """Return the time on the command's own clock: t + (pace - 1) x integral of the opening."""
+        """Compute the time on the command's own clock: t + (pace - 1) x integral of the opening."""
         start, stop = self.change.opening.rise or (math.inf, math.inf)
         since = np.maximum(t - start, 0.0)
         if stop > start:
@@ -231,8 +231,8 @@ class ChangedDuty:
         return np.asarray(t + (self.change.pace - 1.0) * since)
 
     def volts(self, t: Array) -> Array:
-        """Return u [V] at times t [s]."""
-        size = 1.0 + (self.change.value - 1.0) * self.change.opening.at(t)
+        """Compute u [V] at times t [s]."""
+        size = 1.0 + (self.change.value - 1.0) * self.change.opening.value_at(t)
         return np.asarray(size * self.before.volts(self.clock(t)))
 
     def __str__(self) -> str:
@@ -240,7 +240,7 @@ class ChangedDuty:
 
 
 def _shut_off(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
-    """Return the change of the coefficients of the line's throttle; a valve needs a line."""
+    """Build the change of the coefficients of the line's throttle; raise InputError for a rig without a line."""
     from sealscope.physics.restrictors import behind_shut_off, orifice_coefficient
     from sealscope.physics.rig import throttle_coefficients
 
@@ -252,11 +252,11 @@ def _shut_off(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
     before = line.open_A if fault.at == "A" else line.open_B
 
     def effect(name: str, c: float) -> Effect:
-        own = c if before >= 1.0 else behind_shut_off(c, c_line, before)
+        initial = c if before >= 1.0 else behind_shut_off(c, c_line, before)
 
         def change(t: Array) -> Array:
-            s = before + (fault.value - before) * fault.opening.at(t)
-            return np.asarray(np.where(s >= 1.0, c, behind_shut_off(c, c_line, s)) - own)
+            s = before + (fault.value - before) * fault.opening.value_at(t)
+            return np.asarray(np.where(s >= 1.0, c, behind_shut_off(c, c_line, s)) - initial)
 
         return Effect(name, change, 1e-6 * c, added=True, jumps=fault.opening.bends(), shortest=_VALVE_BLOCK)
 
@@ -264,7 +264,7 @@ def _shut_off(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
 
 
 def _warmer(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
-    """Return the change of all numbers that go with the oil: its viscosity, density and bulk modulus.
+    """Build the change of all numbers that follow the oil: its viscosity, density and bulk modulus.
 
     Laminar gaps (pump, rod seals, piston, filters: R = 1/G) pass oil as 1/viscosity, viscous friction of piston and
     shaft goes with it.

@@ -1,4 +1,4 @@
-"""The instruments: what the rig's sensors and its data acquisition make of the truth (thesis, ch. 2.4)."""
+"""The instruments: from the truth to the readings of the rig's sensors and data acquisition (thesis, ch. 2.4)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Outputs(Protocol):
 
 
 def anti_alias_taps(factor: int, delay: float = 0.0) -> Array:
-    """Return the taps of the zero-phase anti-alias filter at `factor` times the recording's rate.
+    """Compute the taps of the zero-phase anti-alias filter at `factor` times the recording's rate.
 
     (2 FILTER_REACH factor + 1,): a Kaiser-windowed sinc of gain 1, late by `delay` < 1 taps; a single 1 where there is
     nothing to filter.
@@ -47,7 +47,7 @@ def anti_alias_taps(factor: int, delay: float = 0.0) -> Array:
 
 
 def decimate(values: Array, factor: int, n: int, delay: float = 0.0) -> Array:
-    """Return `n` samples out of `values`, one in `factor`, after a zero-phase Kaiser-windowed sinc.
+    """Compute `n` samples of `values`, one in `factor`, after a zero-phase Kaiser-windowed sinc.
 
     The sinc is at -6 dB at 0.9 of the new Nyquist frequency. `values` runs FILTER_REACH new samples beyond the last
     one; before the first the signal is at rest at its first value. `delay` >= 0 in samples of `values`, whole or not:
@@ -66,7 +66,7 @@ def decimate(values: Array, factor: int, n: int, delay: float = 0.0) -> Array:
 
 
 def lagging(values: Array, lag: float, rate: float) -> Array:
-    """Return what a transducer of the first order makes of a signal at `rate` [Hz]: lag dy/dt + y = signal.
+    """Filter a signal at `rate` [Hz] by a transducer of the first order: lag dy/dt + y = signal.
 
     Exact for a signal that is linear between its values, at rest before the first one; `lag` [s] of 0 leaves it as it
     is.
@@ -83,7 +83,7 @@ def lagging(values: Array, lag: float, rate: float) -> Array:
 
 
 def at_jittered(sampled: Callable[[Array], Array], values: Array, late: Array | None) -> Array:
-    """Return samples that a clock takes `late` (n,) by so many intervals of `values`, -1 to 1; None: by none.
+    """Compute samples of a clock that is `late` (n,) by -1 to 1 intervals of `values`; None: punctual.
 
     `sampled(values)` are the samples of a punctual clock; between the values a parabola is taken.
     """
@@ -95,7 +95,7 @@ def at_jittered(sampled: Callable[[Array], Array], values: Array, late: Array | 
 
 
 def convert(pressure: Array, sensor: PressureTransducer, daq: Daq) -> Array:
-    """Return the pressure [Pa] as read back from the converter.
+    """Compute the pressure [Pa] as read back from the converter.
 
     The transducer saturates at its range, the converter counts in steps of `daq.step` [V].
     """
@@ -115,21 +115,22 @@ def read_pressure(
     daq: Daq,
     rate: float,
     random: np.random.Generator,
-    of: Callable[[str, float], Array | float],
+    parameter: Callable[[str, float], Array | float],
 ) -> Array:
-    """Return what one pressure channel reads [Pa].
+    """Compute the readings of one pressure channel [Pa].
 
     Gain and offset, own and common noise, drift, hum with its harmonics, saturation, conversion, stuck and lost
-    samples; `of(symbol, own)` is a parameter of the sensor over time.
+    samples; `parameter(symbol, value)` is a parameter of the sensor over time,
+    `value` that of the rig.
     """
     t = np.arange(true.size) / rate
     walk = np.cumsum(random.standard_normal(true.size)) * sensor.drift / np.sqrt(rate)
-    hum = of("hum", sensor.hum) * np.sin(2.0 * np.pi * (sensor.hum_frequency * t + random.random()))
-    own = of("noise", sensor.noise) * random.standard_normal(true.size)
+    hum = parameter("hum", sensor.hum) * np.sin(2.0 * np.pi * (sensor.hum_frequency * t + random.random()))
+    noise = parameter("noise", sensor.noise) * random.standard_normal(true.size)
     if sensor.hum_harmonics > 0:
-        hum = hum + of("hum", sensor.hum) * _harmonics(sensor, t, random)
-    gain, offset = 1.0 + of("gain_error", sensor.gain_error), of("offset", sensor.offset)
-    read = convert(gain * true + offset + walk + hum + own + common, sensor, daq)
+        hum = hum + parameter("hum", sensor.hum) * _harmonics(sensor, t, random)
+    gain, offset = 1.0 + parameter("gain_error", sensor.gain_error), parameter("offset", sensor.offset)
+    read = convert(gain * true + offset + walk + hum + noise + common, sensor, daq)
     if sensor.stuck_rate > 0:  # a stuck reading holds for a second on average
         for start in np.flatnonzero(random.random(true.size) < sensor.stuck_rate / rate):
             read[start : start + 1 + int(random.exponential(rate))] = read[start]
@@ -138,21 +139,21 @@ def read_pressure(
 
 
 def _harmonics(sensor: PressureTransducer, t: Array, random: np.random.Generator) -> Array:
-    """Return the harmonics 2 to `HUM_HARMONICS` of a hum of amplitude 1, each with a phase of its own."""
+    """Compute the harmonics 2 to `HUM_HARMONICS` of a hum of amplitude 1, each with a phase of its own."""
     orders = np.arange(2, HUM_HARMONICS + 1)
     phases = random.random(orders.size)
     turns = sensor.hum_frequency * np.outer(orders, t) + phases[:, None]
     return np.asarray(sensor.hum_harmonics ** (orders - 1) @ np.sin(2.0 * np.pi * turns))
 
 
-def _counted(values: Array, resolution: float) -> Array:
+def _quantize(values: Array, resolution: float) -> Array:
     return values if resolution == 0 else np.floor(values / resolution) * resolution
 
 
 def record(
     rig: Rig, trajectory: Outputs, u: Array, factor: int, seed: int, readings: Readings | None = None
 ) -> Recording:
-    """Return the Recording that the rig's instruments make of a trajectory.
+    """Record a trajectory with the rig's instruments.
 
     `trajectory` is sampled `factor` times faster than the recording and runs FILTER_REACH samples longer; `u`: (n,)
     command [V] at the recording's samples. Analog channels (pressures, flow meter) pass the anti-alias filter,
@@ -171,8 +172,8 @@ def record(
     t = np.arange(n) / rate
     readings = readings or Readings()
 
-    def of(channel: str) -> Callable[[str, float], Array | float]:
-        return lambda symbol, own: readings.value(f"sensors.{channel}.{symbol}", own, t)
+    def parameters_of(channel: str) -> Callable[[str, float], Array | float]:
+        return lambda symbol, rig_value: readings.value(f"sensors.{channel}.{symbol}", rig_value, t)
 
     late = None
     if rig.daq.jitter > 0:
@@ -185,27 +186,28 @@ def record(
         return at_jittered(lambda shifted: decimate(shifted, factor, n, delay), values, late)
 
     count = 2.0 * np.pi / sensors.theta.counts
-    theta = _counted(read_at(trajectory["theta"]), count)
-    x = (1.0 + of("x")("scale_error", sensors.x.scale_error)) * read_at(trajectory["x"]) + of("x")("offset", 0.0)
-    x = x + of("x")("noise", sensors.x.noise) * random["x"].standard_normal(n)
+    theta = _quantize(read_at(trajectory["theta"]), count)
+    of_x = parameters_of("x")
+    x = (1.0 + of_x("scale_error", sensors.x.scale_error)) * read_at(trajectory["x"]) + of_x("offset", 0.0)
+    x = x + of_x("noise", sensors.x.noise) * random["x"].standard_normal(n)
     common = readings.value("sensors.common_noise", sensors.common_noise, t) * random["common"].standard_normal(n)
     channels: dict[str, Array] = {
         "u": u,
         "omega": np.diff(theta, prepend=theta[:1]) * rate,
         "theta": theta,
-        "x": _counted(x, sensors.x.resolution),
+        "x": _quantize(x, sensors.x.resolution),
     }
     for name in PRESSURES:
         sensor = getattr(sensors, name)
         true = filtered(lagging(trajectory[name], sensor.lag, rate * factor), sensor.delay * rate * factor)
-        channels[name] = read_pressure(true, common, sensor, rig.daq, rate, random[name], of(name))
+        channels[name] = read_pressure(true, common, sensor, rig.daq, rate, random[name], parameters_of(name))
     flow = sensors.q_leak
-    true = (1.0 + of("q_leak")("gain_error", 0.0)) * filtered(trajectory["q_leak"])
-    true = true + of("q_leak")("offset", 0.0)
-    read = true + of("q_leak")("noise", flow.noise) * random["q_leak"].standard_normal(n)
+    true = (1.0 + parameters_of("q_leak")("gain_error", 0.0)) * filtered(trajectory["q_leak"])
+    true = true + parameters_of("q_leak")("offset", 0.0)
+    read = true + parameters_of("q_leak")("noise", flow.noise) * random["q_leak"].standard_normal(n)
     read = np.clip(read, -flow.range_hi, flow.range_hi)
     channels["q_leak"] = read if flow.resolution == 0 else np.rint(read / flow.resolution) * flow.resolution
     if rig.valve.spool == "present":  # the supply's motor has no encoder
         del channels["omega"], channels["theta"]
-    channels = {name: readings.held(name, values, t) for name, values in channels.items()}
+    channels = {name: readings.hold_readings(name, values, t) for name, values in channels.items()}
     return Recording(t, channels, CHANNEL_UNITS, rate)

@@ -1,4 +1,4 @@
-"""Integrate the rig over an experiment: its inputs at the nodes of the steps, the choice of the step, and its checks.
+"""Integrate the rig over an experiment: inputs at the nodes of the steps, choice of the step, and checks.
 
 A step is chosen by error or stated; either way short windows of the run are integrated again at half the step, and a
 run that moves further than it may is refused.
@@ -25,7 +25,7 @@ from sealscope.simulation.courses import Force, numbers_under, state_under
 from sealscope.simulation.experiment import LONGEST_STEP, PRESSURE_TOLERANCE, Experiment, choose_method
 from sealscope.simulation.instruments import FILTER_REACH
 from sealscope.simulation.leaks import Leak
-from sealscope.simulation.sizing import leak_flow, mean_while_open, settled
+from sealscope.simulation.sizing import leak_flow, mean_while_open, size_leaks
 from sealscope.units import LITRE_PER_MINUTE, P_ATM
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ class Trajectory:
 
 
 class RunInputs:
-    """What drives a run: command and leakage of an experiment; `leaks` have their coefficients."""
+    """The inputs of a run: command and leakage of an experiment; `leaks` have their coefficients."""
 
     def __init__(self, experiment: Experiment, leaks: tuple[Leak, ...]) -> None:
         self._leaks = experiment.flowing(leaks)
@@ -85,12 +85,12 @@ class RunInputs:
         self._duration, self._limit = experiment.duration, experiment.rig.daq.u_max
 
     def at_nodes(self, start: Array, offsets: Array) -> tuple[Array, Array, Array]:
-        """Return command [V], G [m^3/(s Pa)] and C [m^3/(s Pa^0.5)] at times start[:, None] + offsets [s]."""
+        """Compute command [V], G [m^3/(s Pa)] and C [m^3/(s Pa^0.5)] at times start[:, None] + offsets [s]."""
         t = start[:, None] + offsets
         return self._within_limit(self._command.volts(t), t), *self._leakage(t)
 
     def largest(self, t: Array) -> tuple[float, float]:
-        """Return the largest G and C at times t [s]."""
+        """Compute the largest G and C at times t [s]."""
         G, C = self._leakage(t)
         return float(G.max(initial=0.0)), float(C.max(initial=0.0))
 
@@ -99,7 +99,7 @@ class RunInputs:
         for leak in self._leaks:
             if not leak.coefficient or t.max(initial=-math.inf) < leak.opening.onset():
                 continue
-            more = leak.coefficient * leak.opening.at(t)
+            more = leak.coefficient * leak.opening.value_at(t)
             G, C = (G + more, C) if leak.law == "laminar" else (G, C + more)
         return G, C
 
@@ -112,7 +112,7 @@ class RunInputs:
 
 
 def oversampling(experiment: Experiment) -> int:
-    """Return the outputs per sample: enough for the anti-alias filter, no more than the solver has steps."""
+    """Compute the outputs per sample: enough for the anti-alias filter, no more than the solver has steps."""
     longest = experiment.step or DEFAULT_STEP[choose_method(experiment.rig, experiment.method)]
     least = oversampling_of(experiment.rate, longest)
     controller = experiment.controlled
@@ -120,12 +120,12 @@ def oversampling(experiment: Experiment) -> int:
 
 
 def oversampling_of(rate: float, step: float) -> int:
-    """Return the outputs per sample at `rate` [Hz] where the solver has a step about every `step` [s]."""
+    """Compute the outputs per sample at `rate` [Hz] for a solver with a step of about `step` [s]."""
     return min(_OVERSAMPLING, steps_per_output(rate, step))
 
 
 def steps_per_output(rate: float, step: float) -> int:
-    """Return the steps between outputs at `rate` [Hz]: as few as keep the step within `step` [s]."""
+    """Compute the steps between outputs at `rate` [Hz]: the fewest that keep the step within `step` [s]."""
     return max(1, math.ceil(1.0 / (rate * step) * (1.0 - 1e-9)))
 
 
@@ -138,7 +138,7 @@ def trajectory(
     duration: float | None = None,
     progress: Progress | None = None,
 ) -> Trajectory:
-    """Integrate an experiment and report states and flows as often as its instruments need them.
+    """Integrate an experiment, with states and flows as often as its instruments need them.
 
     `leaks` take the place of the experiment's and have coefficients; `step` [s], if given, that of its own step, and is
     not checked: the caller compares runs. `error` [Pa] takes the place of its own, `duration` [s] of its length and of
@@ -168,12 +168,12 @@ def trajectory(
 
 
 def _unsized(leaks: Sequence[Leak]) -> tuple[Leak, ...]:
-    """Return leaks in which those of a stated mean have a coefficient of 0."""
+    """Set the coefficients of leaks of a stated mean to 0."""
     return tuple(leak if leak.mean is None else replace(leak, mean=None, coefficient=0.0) for leak in leaks)
 
 
 def sized_leaks(experiment: Experiment) -> tuple[Leak, ...]:
-    """Return the experiment's leaks with a coefficient each, so that each one's mean is what was asked for."""
+    """Find the coefficients of the experiment's leaks that give their stated means."""
     if not any(leak.mean for leak in experiment.leaks):
         return _unsized(experiment.leaks)
     return sized_run(experiment)[0]
@@ -184,7 +184,7 @@ def sized_run(
     progress: Callable[[str, float], None] | None = None,
     simulating: Callable[[float], None] | None = None,
 ) -> tuple[tuple[Leak, ...], Trajectory]:
-    """Return the experiment's leaks with a coefficient each, and its run with them.
+    """Find the coefficients of the experiment's leaks, and integrate its run with them.
 
     `progress` is called while leaks are sized, `simulating` with the time reached where there is nothing to size.
 
@@ -219,7 +219,7 @@ def sized_run(
         return units, (now, run)
 
     sizes = np.array([leak.coefficient or 0.0 for leak in current])
-    return settled(leaks, sizes, measure, progress)[1]
+    return size_leaks(leaks, sizes, measure, progress)[1]
 
 
 def integrate(
@@ -289,7 +289,7 @@ def integrate(
                 if start <= first and end <= stop:
                     before, fine = rows[first, : len(STATES)].copy(), np.empty((end - first, len(OUTPUTS)))
                     run.advance(before, first, end, 2 * every, fine, first)
-                    times = max(times, check.beyond(rows[first:end, pressures], fine[:, pressures]))
+                    times = max(times, check.excess(rows[first:end, pressures], fine[:, pressures]))
             if times > 1.0 and every < finest and step is None:
                 break
         h = 1.0 / (rate * every)
@@ -310,7 +310,7 @@ def integrate(
 
 @dataclass
 class _Run:
-    """One run of a rig, to be integrated at one step or another."""
+    """One run of a rig, which can be integrated at one step or another."""
 
     inputs: RunInputs
     schedule: Schedule
@@ -345,9 +345,9 @@ class _Run:
             first, last = last, min(last + block, stop)
             steps = np.arange(first * every, last * every, dtype=np.float64)
             u, G, C = map(np.ascontiguousarray, self.inputs.at_nodes(steps * h, nodes))
-            F = unloaded if self.load is None else np.ascontiguousarray(self.load.at(steps[:, None] * h + nodes))
+            F = unloaded if self.load is None else np.ascontiguousarray(self.load.value_at(steps[:, None] * h + nodes))
             worst = float(G.max()), float(C.max())
-            for k, end, p in self.schedule.within(first, last):
+            for k, end, p in self.schedule.blocks_between(first, last):
                 if not self.allow_unresolved and max(worst) > 0.0:
                     refuse_long(h, longest_step(p, *worst), "the leak")
                 part = slice((k - first) * every, (end - first) * every)
@@ -411,7 +411,7 @@ def refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
 
 
 def windows(n_out: int, rate: float) -> list[tuple[int, int]]:
-    """Return the outputs (start, stop) of the windows in which a run of `n_out` outputs at `rate` [Hz] is checked."""
+    """Choose the outputs (start, stop) of the windows in which a run of `n_out` outputs at `rate` [Hz] is checked."""
     first = min(n_out, round(FIRST_WINDOW * rate))
     checked = [(0, first)]
     length = round(LATER_WINDOW * rate)
@@ -437,8 +437,8 @@ class StepErrorCheck:
         self._squares, self._samples = np.zeros((LEVELS, 4)), 0
         self.moved = self.changed = 0.0
 
-    def beyond(self, coarse: Array, fine: Array) -> float:
-        """Return how many times further than it may anything has moved, with one window more.
+    def excess(self, coarse: Array, fine: Array) -> float:
+        """Compare one more window; return the largest difference so far over its tolerance.
 
         `coarse`, `fine`: (n, 4) p_A, p_B, p_1, p_2 [Pa]. Each window's pressures are judged by themselves, the RMS of
         db8's d_1 .. d_4 in both chambers over all windows so far, at the recording's rate and with its noise.
@@ -457,13 +457,13 @@ class StepErrorCheck:
         return max(pressure / self._tolerance, change / DETAIL_TOLERANCE)
 
     def worst(self) -> str:
-        """Return what moved furthest beyond its tolerance, by how much, and how much it may."""
+        """Return name, size and tolerance of the quantity furthest beyond its tolerance."""
         if self.moved / self._tolerance >= self.changed / DETAIL_TOLERANCE:
             return f"a pressure by {self.moved:.4g} Pa rms, which must be <= {self._tolerance:.4g} Pa"
         return f"the RMS of a detail by {100 * self.changed:.3g} %, which must be <= {100 * DETAIL_TOLERANCE:.3g} %"
 
     def _add(self, coarse: Array, fine: Array) -> None:
-        """Sum the squares of a window's details where they see nothing but the window."""
+        """Add the squares of a window's details that do not reach beyond the window."""
         import pywt
 
         from sealscope.signals.filters import reach

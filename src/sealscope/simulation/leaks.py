@@ -1,4 +1,4 @@
-"""Leaks across the piston over time, as data and as text; an opening says how far one is open at each instant.
+"""Leaks across the piston over time, as data and as text; an opening states how far one is open at each instant.
 
 A text such as ``0.0042 L/min from 90 s`` is read by `parse_leak`.
 """
@@ -36,7 +36,7 @@ _LEAK = rf"(?:{_MEAN}|(?P<letter>[GC])\s*=\s*(?P<coefficient>{UNSIGNED}))(?:\s+(
 
 
 def from_time(start: float = 0.0, stop: float = math.inf, ramp: float = 0.0) -> Polyline:
-    """Return what opens evenly within `ramp` [s] from `start` on, and shuts as evenly from `stop` [s] on."""
+    """Make an opening that rises linearly within `ramp` [s] from `start` on, and falls likewise from `stop` [s] on."""
     if not (math.isfinite(ramp) and ramp >= 0.0):
         raise InputError(f"a ramp must be >= 0 s and finite, got {ramp:g} s")
     if not stop >= start + ramp:
@@ -50,7 +50,7 @@ def from_time(start: float = 0.0, stop: float = math.inf, ramp: float = 0.0) -> 
 
 
 def growing(start: float, stop: float) -> Polyline:
-    """Return what opens evenly from `start` to `stop` [s] and stays open."""
+    """Make an opening that rises linearly from `start` to `stop` [s] and stays open."""
     if not stop > start:
         raise InputError(f"a growing leak must stop growing after it starts, got {start:g} s to {stop:g} s")
     words = f"growing from {number_text(start)} s to {number_text(stop)} s"
@@ -59,15 +59,15 @@ def growing(start: float, stop: float) -> Polyline:
 
 @dataclass(frozen=True, eq=False)
 class Thinned:
-    """The `opening` of a laminar gap, as a share of what it passes at the rig's viscosity: over `viscosity` at t."""
+    """The `opening` of a laminar gap over the oil's `viscosity` at t, that of the rig being 1."""
 
     opening: Opening
     viscosity: Callable[[Array], Array]
     rise: ClassVar[None] = None
 
-    def at(self, t: Array) -> Array:
-        """Return the opening at times t [s] over the oil's viscosity, that of the rig being 1."""
-        return self.opening.at(t) / self.viscosity(t)
+    def value_at(self, t: Array) -> Array:
+        """Compute the opening at times t [s] over the oil's viscosity, that of the rig being 1."""
+        return self.opening.value_at(t) / self.viscosity(t)
 
     def onset(self) -> float:
         """Return the onset [s] of the gap."""
@@ -98,11 +98,11 @@ class Leak:
     def __post_init__(self) -> None:
         if self.law not in ("laminar", "orifice"):
             raise InputError(f"leak law must be laminar or orifice, got {self.law!r}")
-        given = [value for value in (self.coefficient, self.mean) if value is not None]
-        if len(given) != 1:
+        stated = [value for value in (self.coefficient, self.mean) if value is not None]
+        if len(stated) != 1:
             raise InputError("a leak needs either a coefficient or a mean flow, and not both")
-        if not (math.isfinite(given[0]) and given[0] >= 0):
-            raise InputError(f"a leak must be >= 0 and finite, got {given[0]}")
+        if not (math.isfinite(stated[0]) and stated[0] >= 0):
+            raise InputError(f"a leak must be >= 0 and finite, got {stated[0]}")
         if isinstance(self.opening, Polyline) and not np.all((self.opening.y >= 0) & (self.opening.y <= 1)):
             raise InputError(f"openings of a leak must be in 0..1, got {self.opening}")
 
@@ -113,7 +113,7 @@ class Leak:
 
 
 def opening_of(part: Part) -> Polyline:
-    """Return the opening that the groups of a text state; open from the start where they state nothing."""
+    """Read the opening from the groups of a text; open from the start where they state nothing."""
     if part.get("start") is not None:
         return growing(seconds(part["start"]), seconds(part["stop"]))
     until = part.get("until")
@@ -146,11 +146,11 @@ def parse_leak(text: str) -> Leak | None:
             "leak must be like '0.0042 L/min from 90 s', '0.01 L/min orifice growing from 60 s to 120 s', "
             f"'G = 6.1e-13 from 90 s', 'C = 2e-10', 'table LEAK.csv' or 'none', got {text!r}"
         )
-    part, asked = match.groupdict(), (match["law"] or "").lower()
+    part, stated_law = match.groupdict(), (match["law"] or "").lower()
     if letter := (part["letter"] or "").upper():
         law: Literal["laminar", "orifice"] = "laminar" if letter == "G" else "orifice"
-        if asked not in ("", law):
-            raise InputError(f"{letter} is the coefficient of the {law} law, got law {asked} ({text!r})")
+        if stated_law not in ("", law):
+            raise InputError(f"{letter} is the coefficient of the {law} law, got law {stated_law} ({text!r})")
         return Leak(law, coefficient=float(part["coefficient"]), opening=opening_of(part))
     mean = parse_quantity(part["mean"], "m^3/s", name="a leak")
-    return Leak(asked or "laminar", mean=mean, opening=opening_of(part))  # type: ignore[arg-type]
+    return Leak(stated_law or "laminar", mean=mean, opening=opening_of(part))  # type: ignore[arg-type]

@@ -42,7 +42,7 @@ _STATES = {"omega": "rad/s", "theta": "rad", "x": "m", "v": "m/s"}
 
 @dataclass(frozen=True)
 class Truth:
-    """What a real rig would not tell: leaks, faults and drifts, and every state without noise at the samples.
+    """The truth of a run, which no rig would tell: leaks, faults, drifts, and states without noise at the samples.
 
     `onset_s` and the mean are those of the leaks across the piston.
     """
@@ -58,7 +58,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class Difference:
-    """How far one quantity moved: `difference` and `tolerance` (None: reported only) in `unit`."""
+    """The change of one quantity: `difference` and `tolerance` (None: reported only) in `unit`."""
 
     name: str
     difference: float
@@ -67,7 +67,7 @@ class Difference:
 
     @property
     def resolved(self) -> bool:
-        """Whether it moved no further than it may."""
+        """Whether the difference is within its tolerance."""
         return self.tolerance is None or self.difference <= self.tolerance
 
 
@@ -86,7 +86,7 @@ class Proof:
         return all(difference.resolved for difference in self.differences)
 
     def text(self) -> str:
-        """Return the proof as lines of text: what moved, by how much, and how much it may."""
+        """Format the proof as lines of text: each change and its limit."""
         lines = [f"halving the step ({self.method}, {self.step:.3g} s to {self.halved:.3g} s) moves"]
         for row in self.differences:
             limit = "" if row.tolerance is None else f" (at most {row.tolerance:.3g})"
@@ -96,21 +96,21 @@ class Proof:
         return "\n".join(lines)
 
     def worst(self) -> Difference:
-        """Return the difference furthest beyond, or nearest to, its tolerance."""
+        """Find the difference furthest beyond, or nearest to, its tolerance."""
         judged = [row for row in self.differences if row.tolerance]
         return max(judged, key=lambda row: row.difference / (row.tolerance or math.inf))
 
 
 @dataclass(frozen=True)
 class Run:
-    """A simulated experiment: the recording, apart from it the truth, and the proof where one was asked for."""
+    """A simulated experiment: the recording, its truth, and the proof where one was asked for."""
 
     recording: Recording
     truth: Truth
     proof: Proof | None = None
 
     def lines(self) -> list[str]:
-        """Return the run in words: its solver and step, leaks, other faults, and mean flows."""
+        """Describe the run in lines: its solver and step, leaks, other faults, and mean flows."""
         solver = self.recording.provenance["solver"]
         lines = [f"{solver['method']}, h = {solver['step_s']:.3g} s"]
         lines += [f"leak: {leak}" for leak in self.truth.leaks] + [f"fault: {fault}" for fault in self.truth.faults]
@@ -205,7 +205,7 @@ def simulate_experiment(experiment: Experiment, progress: Progress | None = None
 
 
 def powers(outputs: Mapping[str, Array], rig: Rig) -> dict[str, Array]:
-    """Return the powers [W] of a run: into the motor, from the pump into the oil, from the pressures into the piston.
+    """Compute the powers [W] of a run: into the motor, from the pump into the oil, from the pressures to the piston.
 
     A servo valve's pump feeds the supply: its power is that of the supply.
     """
@@ -222,7 +222,7 @@ def powers(outputs: Mapping[str, Array], rig: Rig) -> dict[str, Array]:
 
 
 def compare(experiment: Experiment, coarse: Trajectory, fine: Trajectory) -> tuple[Difference, ...]:
-    """Return the differences between two trajectories: rms of each channel, and change of each detail's RMS."""
+    """Compare two trajectories: rms of each channel, and change of each detail's RMS."""
     from sealscope.signals.details import QUANTITIES, details, mean_squares
     from sealscope.signals.windows import rms
 
@@ -241,7 +241,7 @@ def compare(experiment: Experiment, coarse: Trajectory, fine: Trajectory) -> tup
         noise = getattr(experiment.rig.sensors, name).noise ** 2 + experiment.rig.sensors.common_noise**2
         transformed = [details(decimate(run[name], factor, n)) for run in (coarse, fine)]
         inside = transformed[0].inside()
-        ours, theirs = (np.sqrt(mean_squares(own, [inside.start, inside.stop])[0] + noise) for own in transformed)
+        ours, theirs = (np.sqrt(mean_squares(levels, [inside.start, inside.stop])[0] + noise) for levels in transformed)
         for quantity, a, b in zip(QUANTITIES[:4], ours, theirs, strict=False):
             differences.append(
                 Difference(f"RMS of {quantity} of {name}", float(abs(a - b)), "Pa", float(DETAIL_TOLERANCE * b))
@@ -283,7 +283,7 @@ def prove(experiment: Experiment, progress: Progress | None = None) -> Proof:
 
 
 def write_truth(truth: Truth, path: str | os.PathLike[str]) -> None:
-    """Write what was put in as JSON.
+    """Write the truth of a run as JSON.
 
     Leaks with their coefficients, onset [s], mean leak while open [L/min], other faults with their onsets [s], and what
     drifted from the start to the end, in per cent (or in the SI unit).
@@ -311,7 +311,7 @@ def write_truth(truth: Truth, path: str | os.PathLike[str]) -> None:
 
 
 def _drift_of(drift: ParameterDrift, t: Array) -> dict[str, Any]:
-    change = drift.shape.at(t)
+    change = drift.shape.value_at(t)
     span, end = float(np.ptp(change)), float(change[-1] - change[0])
     if drift.absolute:
         return {"parameter": drift.parameter, "span": span, "start_to_end": end}

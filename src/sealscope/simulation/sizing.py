@@ -21,24 +21,24 @@ _LEAST_SLOPE = 0.1
 
 
 def leak_flow(leak: Leak, t: Array, dp: Array, dp_0: float) -> Array:
-    """Return |Q_L| [m^3/s] of a leak with a known coefficient under the chambers' pressure difference `dp` [Pa]."""
+    """Compute |Q_L| [m^3/s] of a leak with a known coefficient under the pressure difference `dp` [Pa]."""
     from sealscope.physics.leakage import laminar_leakage, leakage_series
 
-    size = (leak.coefficient or 0.0) * leak.opening.at(t)
+    size = (leak.coefficient or 0.0) * leak.opening.value_at(t)
     if leak.law == "laminar":
         return np.asarray(np.abs(laminar_leakage(dp, size)))  # type: ignore[arg-type]
     return np.asarray(np.abs(leakage_series(np.ascontiguousarray(dp), np.zeros_like(size), size, dp_0)))
 
 
 def mean_while_open(leak: Leak, t: Array, flow: Array) -> float:
-    """Return the mean flow [m^3/s] while open, per unit of opening: the sum of |Q_L| over the sum of the opening."""
-    opening = leak.opening.at(t)
+    """Compute the mean flow [m^3/s] while open, per unit of opening: sum of |Q_L| over sum of the opening."""
+    opening = leak.opening.value_at(t)
     total = float(opening.sum())
     return float(flow.sum()) / total if total > 0 else 0.0
 
 
 def scaled_size(mean: float, before: tuple[float, float], now: tuple[float, float]) -> float:
-    """Return the coefficient to try next for a mean flow `mean` [m^3/s].
+    """Compute the coefficient to try next for a mean flow `mean` [m^3/s].
 
     `before`, `now`: coefficient and mean flow of the run before and of this run; with a coefficient of 0, the flow is
     that of a coefficient of 1. The slope d log flow / d log coefficient between the two is kept within what a leak can
@@ -53,13 +53,13 @@ def scaled_size(mean: float, before: tuple[float, float], now: tuple[float, floa
     return float(c_1 * (mean / q_1) ** (1.0 / slope))
 
 
-def settled(
+def size_leaks(
     leaks: Sequence[Leak],
     sizes: Array,
     measure: Callable[[Array], tuple[Array, T]],
     progress: Callable[[str, float], None] | None = None,
 ) -> tuple[Array, T]:
-    """Return coefficients (n,) with which each leak of a stated mean has it, and what `measure` returned with them.
+    """Find the coefficients (n,) with which the leaks have their stated means; return them and the last measurement.
 
     `sizes`: the coefficients to begin with, of the other leaks those that stay; `measure(sizes)`: mean flows while open
     for a coefficient of 1 (n,), and anything else. A small leak's flow is proportional to its coefficient (friction
@@ -68,7 +68,7 @@ def settled(
     starting from the rig without these leaks. Raises SimulationFailed where the search does not settle.
     """
     means = np.array([leak.mean or 0.0 for leak in leaks])
-    wanted = np.flatnonzero(means > 0.0)
+    sized = np.flatnonzero(means > 0.0)
     before = np.zeros((2, sizes.size))  # coefficients and mean flows of the run before
     closest: tuple[float, Array, T] | None = None
     for attempt in range(MOST_RUNS):
@@ -76,7 +76,7 @@ def settled(
             progress("sizing the leak", 1.0 - 0.5**attempt)
         units, measured = measure(sizes)
         got = units * sizes
-        worst = float(np.abs(got[wanted] / means[wanted] - 1.0).max(initial=0.0))
+        worst = float(np.abs(got[sized] / means[sized] - 1.0).max(initial=0.0))
         if worst < (closest[0] if closest else SCATTERED):
             closest = worst, sizes, measured
         if closest and (worst <= TOLERANCE or attempt == MOST_RUNS - 1):
@@ -84,7 +84,7 @@ def settled(
                 progress("sizing the leak", 1.0)
             return closest[1:]
         following = sizes.copy()
-        for k in wanted:
+        for k in sized:
             now = sizes[k], got[k] if sizes[k] > 0.0 else units[k]
             following[k] = scaled_size(means[k], (before[0, k], before[1, k]), now)
         before, sizes = np.stack([sizes, got]), following

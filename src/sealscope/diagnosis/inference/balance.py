@@ -313,7 +313,7 @@ def commanded(samples: Mapping[str, Array], rig: Rig, rate: float, *, loaded: bo
     `loaded`: under p_A - p_B, whose sense is that of the command; else what the load costs the drive is in the leak's
     level.
     """
-    drive = Drive.of(rig)
+    drive = Drive.from_rig(rig)
     made = {START: np.exp(-np.arange(len(samples["p_A"])) / (rate * drive.lag))}
     if flow_source(samples) == "u":
         u, load = _held(samples["u"]), np.zeros(len(samples["u"]))

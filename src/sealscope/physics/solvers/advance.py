@@ -7,7 +7,7 @@ import numpy as np
 from sealscope.compiled import kernel
 from sealscope.physics.rig import RigNumbers, observe
 from sealscope.physics.solvers.imex import IMEX_NODES, implicit_step
-from sealscope.physics.solvers.loop import APART, Loop, sampled
+from sealscope.physics.solvers.loop import APART, Loop, sample_controller
 from sealscope.physics.solvers.rk4 import RK4_NODES, explicit_step
 from sealscope.physics.state import state_of
 
@@ -18,7 +18,7 @@ IMPLICIT: Implicit = (True,)
 
 
 def nodes_of(implicit: Implicit, h: float) -> np.ndarray:
-    """Return where in a step of h [s] the inputs are looked up [s]: its first and last node just inside it."""
+    """Compute the times [s] within a step of h [s] at which inputs are looked up, the ends just inside it."""
     nodes = np.array(IMEX_NODES if implicit else RK4_NODES)
     nodes[0], nodes[-1] = 1e-9, 1.0 - 1e-9
     return nodes * h
@@ -38,7 +38,7 @@ def advance(
     every: int,
     rows: np.ndarray,
 ) -> None:
-    """Advance `y` (14,) in place by n steps of h [s]; every `every` steps, before the step, write a row of outputs.
+    """Advance `y` (14,) in place by n steps of h [s], and write a row of outputs before each `every`-th step.
 
     `u`, `G`, `C`: (n, nodes) command [V] and leakage coefficients at the nodes of each step (`nodes_of`); `F`: (n,
     nodes) load [N] beside the rig's own, (0, 0) without one; `rows`: (n // every, 21). `euler_integral` takes eq. (4.2)
@@ -75,15 +75,15 @@ def advance_closed(
 
     Return how many outputs there are: fewer than rows where a voltage is not finite.
     """
-    apart, n = loop.whole[APART], rows.shape[0]
-    u = np.empty((apart * every, G.shape[1]))
+    spacing, n = loop.whole[APART], rows.shape[0]
+    u = np.empty((spacing * every, G.shape[1]))
     first = 0
     while first < n:
-        k = (start + first) // apart
-        if (start + first) % apart == 0 and not sampled(loop, k, y):
+        k = (start + first) // spacing
+        if (start + first) % spacing == 0 and not sample_controller(loop, k, y):
             break
         u[:] = loop.volts[k]
-        last = min((k + 1) * apart - start, n)
+        last = min((k + 1) * spacing - start, n)
         begin, end = first * every, last * every
         load = F[begin:end] if F.shape[0] > 0 else F
         volts, part = u[: end - begin], rows[first:last]

@@ -26,8 +26,8 @@ from sealscope.physics.state import (
     POSITION,
     Pressures,
     State,
-    moved,
-    pressures_moved,
+    add_step,
+    add_to_pressures,
 )
 from sealscope.units import P_ATM
 
@@ -69,8 +69,8 @@ W = (82889 / 524892, 0.0, 15625 / 83664, 69875 / 102672, -2260 / 8211, GAMMA)
 
 @contracted
 def _after(z: State, h: float, e: float, f: State, i: float, s: Pressures) -> State:
-    """Return the state with a stage's explicit and implicit rates added, each with its weight."""
-    return pressures_moved(moved(z, h * e, f), h * i, s)
+    """Add a stage's explicit and implicit rates to the state, each with its weight."""
+    return add_to_pressures(add_step(z, h * e, f), h * i, s)
 
 
 @contracted
@@ -84,38 +84,38 @@ def _solved(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
     step = GAMMA * h
     p_A, p_B, p_1, p_2 = rig.pressures_of(z, p)
     total_A, total_B = p_1 - p_A, p_B - p_2
-    moved = z
+    add_step = z
     s = (z[P_A], z[P_B], z[P_1], z[P_2])
     turns = AIR_TURNS if len(p.aerated) + len(p.conserving) + len(p.boiling) > 0 else 1
     for _ in range(turns):
-        K_A, K_B = rig.bulk_modulus(moved[P_A], p), rig.bulk_modulus(moved[P_B], p)
-        K_1, K_2 = rig.bulk_modulus(moved[P_1], p), rig.bulk_modulus(moved[P_2], p)
+        K_A, K_B = rig.bulk_modulus(add_step[P_A], p), rig.bulk_modulus(add_step[P_B], p)
+        K_1, K_2 = rig.bulk_modulus(add_step[P_1], p), rig.bulk_modulus(add_step[P_2], p)
         r_A, r_B = pressure_rate(1.0, V_A, K_A), pressure_rate(1.0, V_B, K_B)
         r_1, r_2 = pressure_rate(1.0, p.V_1, K_1), pressure_rate(1.0, p.V_2, K_2)
         if len(p.boiling) > 0:
             least = p.p_vap - P_ATM
-            boils_A, boils_B = moved[P_A] < least, moved[P_B] < least
-            boils_1, boils_2 = moved[P_1] < least, moved[P_2] < least
+            boils_A, boils_B = add_step[P_A] < least, add_step[P_B] < least
+            boils_1, boils_2 = add_step[P_1] < least, add_step[P_2] < least
             total_A = select(boils_1, least, z[P_1]) - select(boils_A, least, z[P_A])
             total_B = select(boils_B, least, z[P_B]) - select(boils_2, least, z[P_2])
             r_A, r_B = select(boils_A, 0.0 * r_A, r_A), select(boils_B, 0.0 * r_B, r_B)
             r_1, r_2 = select(boils_1, 0.0 * r_1, r_1), select(boils_2, 0.0 * r_2, r_2)
         g_A, g_B = step * (r_A + r_1), step * (r_B + r_2)
         Q_A, Q_B = rig.implicit_flows(total_A, total_B, g_A, g_B, z, p)
-        s = rig.throttle_rates(moved, Q_A, Q_B, p)
-        before = moved
-        moved = pressures_moved(z, step, s)
+        s = rig.throttle_rates(add_step, Q_A, Q_B, p)
+        before = add_step
+        add_step = add_to_pressures(z, step, s)
         if turns > 1:
-            settled_A = max(abs(moved[P_A] - before[P_A]), abs(moved[P_1] - before[P_1]))
-            settled_B = max(abs(moved[P_B] - before[P_B]), abs(moved[P_2] - before[P_2]))
+            settled_A = max(abs(add_step[P_A] - before[P_A]), abs(add_step[P_1] - before[P_1]))
+            settled_B = max(abs(add_step[P_B] - before[P_B]), abs(add_step[P_2] - before[P_2]))
             if not anywhere(max(settled_A, settled_B) >= AIR_SETTLED):
                 break
-    return moved, s
+    return add_step, s
 
 
 @contracted
 def imex_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, F: Nodes, p: RigNumbers) -> State:
-    """Return the state a step of h [s] later; `u`, `G`, `C` and the load `F` at the nodes of the step."""
+    """Compute the state a step of h [s] later; `u`, `G`, `C` and the load `F` at the nodes of the step."""
     Q_A, Q_B = rig.throttle_flows(y, p)
     s1 = rig.throttle_rates(y, Q_A, Q_B, p)
     f1 = rig.rates_without_throttles(y, u[0], G[0], C[0], F[0], p)
@@ -132,7 +132,7 @@ def imex_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, F: Nodes, p: Rig
     z, s5 = _solved(z, h, p)
     f5 = rig.rates_without_throttles(z, u[4], G[4], C[4], F[4], p)
     z = _after(_after(y, h, E_6[0], f1, W[0], s1), h, E_6[2], f3, W[2], s3)
-    z = _after(_after(moved(z, h * E_6[1], f2), h, E_6[3], f4, W[3], s4), h, E_6[4], f5, W[4], s5)
+    z = _after(_after(add_step(z, h * E_6[1], f2), h, E_6[3], f4, W[3], s4), h, E_6[4], f5, W[4], s5)
     z, s6 = _solved(z, h, p)
     f6 = rig.rates_without_throttles(z, u[5], G[5], C[5], F[5], p)
     z = _after(_after(y, h, W[0], f1, W[0], s1), h, W[2], f3, W[2], s3)
@@ -144,7 +144,7 @@ def imex_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, F: Nodes, p: Rig
 def implicit_step(
     z: State, h: float, u: np.ndarray, G: np.ndarray, C: np.ndarray, F: np.ndarray, step: int, p: RigNumbers
 ) -> State:
-    """`imex_step` with the inputs of row `step`; `F` is not looked at where no load is beside the rig's own."""
+    """Compute `imex_step` with the inputs of row `step`; `F` is read only where a load acts on the rig."""
     volts = (u[step, 0], u[step, 1], u[step, 2], u[step, 3], u[step, 4], u[step, 5])
     laminar = (G[step, 0], G[step, 1], G[step, 2], G[step, 3], G[step, 4], G[step, 5])
     orifice = (C[step, 0], C[step, 1], C[step, 2], C[step, 3], C[step, 4], C[step, 5])

@@ -15,7 +15,7 @@ DECAY_LIMIT = 2.785
 
 
 def _end_volumes(p: RigNumbers) -> tuple[tuple[float, float], ...]:
-    """Volumes (V_A, V_B) [m^3] with the piston at either end of its stroke, where one of them is smallest."""
+    """Compute the volumes (V_A, V_B) [m^3] at either end of the stroke, where one of them is smallest."""
     if not p.position_dependent:
         return ((p.V_A, p.V_B),)
     half = 0.5 * p.L
@@ -23,7 +23,7 @@ def _end_volumes(p: RigNumbers) -> tuple[tuple[float, float], ...]:
 
 
 def _longest_for_pair(damping: float, stiffness: float) -> float:
-    """Longest step [s] for s^2 + damping s + stiffness = 0: a radian of an oscillation, stability of a decay."""
+    """Compute the longest step [s] for s^2 + damping s + stiffness = 0: a radian, or stability of a decay."""
     square = damping * damping - 4.0 * stiffness
     if square < 0.0:
         return OSCILLATION_LIMIT / math.sqrt(stiffness)
@@ -32,12 +32,12 @@ def _longest_for_pair(damping: float, stiffness: float) -> float:
 
 
 def _steepest_rise(bends: np.ndarray) -> float:
-    """Return the steepest rise [N/m] or [N s/m] of a load that is linear between bends (`force_over`), 0 if none."""
+    """Compute the steepest rise [N/m] or [N s/m] of a load that is linear between bends (`force_over`), 0 if none."""
     return max(0.0, float(np.cumsum(bends[:, 1]).max()))
 
 
 def stiffest_rate(p: RigNumbers) -> float:
-    """Return the fastest decay rate [1/s] of the throttled rig.
+    """Compute the fastest decay rate [1/s] of the throttled rig.
 
     It is that of a line volume against its chamber through the throttle's laminar slope at dp = 0, lambda = K_oil
     (1/V_1 + 1/V) c / sqrt(dp_0), with the chamber at the end of the stroke where it is smallest. An explicit method is
@@ -49,7 +49,7 @@ def stiffest_rate(p: RigNumbers) -> float:
 
 
 def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
-    """Return the longest step [s] at which an explicit method resolves all but the throttles, for leaks up to `G`, `C`.
+    """Compute the longest step [s] of an explicit method for all but the throttles, for leaks up to `G`, `C`.
 
     The shortest of: speed loop (winding and shaft), piston between its oil columns (running, and within the linear part
     of the friction, F_C/v_th with F_C = F_pr + F_cfr (p_A + p_B) at the charge pressure, with the load's spring and
@@ -92,7 +92,7 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
 
 
 def _longest_of_valve(p: RigNumbers, ends: tuple[tuple[float, float], ...]) -> float:
-    """Longest step [s] for a servo valve: its spool, a chamber behind its laminar edges, the supply behind all."""
+    """Compute the longest step [s] for a servo valve: its spool, a chamber behind its laminar edges, the supply."""
     overlaps = (p.o_PA, p.o_AT, p.o_PB, p.o_BT)
     steepest = p.Q_N / math.sqrt(p.dp_N * p.dp_lam)  # of an edge at full stroke
     most = steepest * (1.0 + 2.0 * max(0.0, *(-o for o in overlaps)) / p.x_max)  # both edges of a chamber
@@ -107,5 +107,5 @@ def _longest_of_valve(p: RigNumbers, ends: tuple[tuple[float, float], ...]) -> f
 
 
 def longest_step_on_stop(p: RigNumbers) -> float:
-    """Return the longest step [s] that resolves the piston against a cap: M_eq on k_stop and d_stop."""
+    """Compute the longest step [s] that resolves the piston against a cap: M_eq on k_stop and d_stop."""
     return _longest_for_pair(p.d_stop / p.M_eq, p.k_stop / p.M_eq)

@@ -1,4 +1,4 @@
-"""A loop around a rig: what the methods call at each sample of a controller, of which they know the address."""
+"""A loop around a rig: the methods call the controller by its address at each of its samples."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ COUNT_X, COUNT_THETA, FLOOR, LIMIT, ASKED = range(5)
 class Loop(NamedTuple):
     """A controller over a run.
 
-    `given` (samples, 5): time [s], target [m], its speed [m/s], noise of p_A and p_B [Pa]; `volts` (samples + delay,)
+    `inputs` (samples, 5): time [s], target [m], its speed [m/s], noise of p_A and p_B [Pa]; `volts` (samples + delay,)
     that act from each sample on; `compensated` (samples,) the flow [m^3/s] that is made good; `measured` (7,) of the
     last sample, which the law reads; `memory` of the law, whose first number is that flow or NaN; `addresses` (3,) of
     the law, its memory and `measured`; `numbers`, `whole`: see above.
     """
 
-    given: np.ndarray
+    inputs: np.ndarray
     volts: np.ndarray
     compensated: np.ndarray
     measured: np.ndarray
@@ -38,23 +38,23 @@ class Loop(NamedTuple):
 
 
 @law
-def counted(value: float, count: float) -> float:
-    """Return a value in whole counts, rounded down, as an encoder gives it; a `count` of 0 is none."""
+def quantize(value: float, count: float) -> float:
+    """Round a value down to whole counts of an encoder; a `count` of 0 leaves it."""
     return np.floor(value / count) * count if count > 0.0 else value  # type: ignore[no-any-return]
 
 
 @law
-def sampled(loop: Loop, k: int, y: np.ndarray) -> bool:
-    """Let the controller see the state `y` at its sample k, unless it has; False where its voltage is not finite."""
+def sample_controller(loop: Loop, k: int, y: np.ndarray) -> bool:
+    """Call the controller at its sample k of the state `y`, once; return False where its voltage is not finite."""
     whole, numbers, measured = loop.whole, loop.numbers, loop.measured
     if k < whole[TAKEN]:
         return True
     for m in range(3):
-        measured[m] = loop.given[k, m]
-    measured[3] = counted(y[POSITION], numbers[COUNT_X])
-    measured[4] = max(y[P_A], numbers[FLOOR]) + loop.given[k, 3]
-    measured[5] = max(y[P_B], numbers[FLOOR]) + loop.given[k, 4]
-    measured[6] = counted(y[THETA], numbers[COUNT_THETA])
+        measured[m] = loop.inputs[k, m]
+    measured[3] = quantize(y[POSITION], numbers[COUNT_X])
+    measured[4] = max(y[P_A], numbers[FLOOR]) + loop.inputs[k, 3]
+    measured[5] = max(y[P_B], numbers[FLOOR]) + loop.inputs[k, 4]
+    measured[6] = quantize(y[THETA], numbers[COUNT_THETA])
     u = call_at(loop.addresses[0], loop.addresses[1], loop.addresses[2])
     numbers[ASKED] = u
     if not isfinite(u):

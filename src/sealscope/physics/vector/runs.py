@@ -32,44 +32,44 @@ Account = tuple[float, float, float, float, float]
 FLOW, OPEN, REACH, LEAST, DIVERGED = range(ACCOUNTS)
 
 
-def _written(text: str, **scope: Any) -> Any:
-    """Return the compiled law of a text: numba needs every element of a tuple written out."""
+def _compile(text: str, **scope: Any) -> Any:
+    """Compile a law written as text: numba needs every element of a tuple written out."""
     scope["load"] = load
     exec(text, scope)
     return contracted(scope["law"])
 
 
 def _rows(count: int) -> Any:
-    """Return the compiled function (array, at): the tuple of the lanes of `count` rows from row `at` on."""
-    return _written(f"def law(array, at):\n    return ({', '.join(f'load(array, at + {k})' for k in range(count))})")
+    """Build the compiled function (array, at), which loads `count` rows of lanes from row `at` on."""
+    return _compile(f"def law(array, at):\n    return ({', '.join(f'load(array, at + {k})' for k in range(count))})")
 
 
 lane_state, lane_leak, lane_account = _rows(len(STATES)), _rows(LEAK_ROWS), _rows(ACCOUNTS)
 _FIELDS = [*(f"{name}=load(table, at + {row})" for row, name in enumerate(NUMBERS)), *(f"{c}=p.{c}" for c in CHOICES)]
 #: Of (table, at, p): the choices of `p`, and the group's numbers from rows at, at + 1, ..
-lane_numbers = _written(f"def law(table, at, p):\n    return RigNumbers({', '.join(_FIELDS)})", RigNumbers=RigNumbers)
+lane_numbers = _compile(f"def law(table, at, p):\n    return RigNumbers({', '.join(_FIELDS)})", RigNumbers=RigNumbers)
 
 
 @contracted
 def opening(leak: Leak, t: float) -> float:
-    """How far a leak (`LEAK_ROWS`) is open at t [s]: 0 to 1, evenly from its start with its slope."""
+    """Compute the opening of a leak (`LEAK_ROWS`) at t [s]: 0 to 1, rising evenly from its start."""
     return min(max((t - leak[2]) * leak[3], 0.0), 1.0)
 
 
 def _inputs(count: int) -> Any:
-    """Return the compiled function (t, nodes, shape, k, drive, leak, p): u, G, C, F at the `count` nodes of step k."""
+    """Build the compiled function (t, nodes, shape, k, drive, leak, p): u, G, C, F at the `count` nodes of step k."""
 
-    def each(text: str) -> str:
+    def for_nodes(text: str) -> str:
         return ", ".join(text.format(n=n, behind=count + n) for n in range(count))
 
-    return _written(
+    return _compile(
         f"""def law(t, nodes, shape, k, drive, leak, p):
-    s = ({each("opening(leak, t + nodes[{n}])")})
-    u = ({each("drive[1] + drive[0] * shape[k, {n}]")})
-    G, C = ({each("leak[0] * s[{n}]")}), ({each("leak[1] * s[{n}]")})
-    F = ({each("0.0")})
+    s = ({for_nodes("opening(leak, t + nodes[{n}])")})
+    u = ({for_nodes("drive[1] + drive[0] * shape[k, {n}]")})
+    G, C = ({for_nodes("leak[0] * s[{n}]")}), ({for_nodes("leak[1] * s[{n}]")})
+    F = ({for_nodes("0.0")})
     if len(p.pushed) > 0:
-        F = ({each("shape[k, {behind}]")})
+        F = ({for_nodes("shape[k, {behind}]")})
     return u, G, C, F
 """,
         opening=opening,
@@ -80,8 +80,8 @@ _rk4_inputs, _imex_inputs = _inputs(3), _inputs(6)
 
 
 @contracted
-def _noted(z: State, leak: Leak, t: float, account: Account, q: RigNumbers) -> Account:
-    """Return the account with an output more in it."""
+def _add_output(z: State, leak: Leak, t: float, account: Account, q: RigNumbers) -> Account:
+    """Add one output to the account of a run."""
     flow, opened, reach, least, diverged = account
     share = opening(leak, t)
     p_A, p_B, p_1, p_2 = pressures_of(z, q)
@@ -114,9 +114,10 @@ def advance(
     begin: int,
     account: np.ndarray,
 ) -> None:
-    """Advance groups first <= g < last of runs in place by n steps of h [s], the first of them step `start` of the run.
+    """Advance groups of runs in place by n steps of h [s], the first of them step `start` of a run.
 
-    By the implicit-explicit method where `implicit`, else by RK4.
+    Groups `groups[0]` to before `groups[1]` are advanced, by the implicit-explicit method where `implicit`, else by
+    RK4.
 
     `y`: (groups, 14, WIDTH); `shape`: (n, nodes) the command's shape at `nodes` [s] of each step, or (n, 2 nodes) with
     the load [N] of all runs behind; `drive`: (groups, 2, WIDTH) gain and offset [V]; `leaks`: (groups, LEAK_ROWS,
@@ -140,7 +141,7 @@ def advance(
                     store(pressures, out, vapour_floor(z[P_A], q))
                     store(pressures, out + 1, vapour_floor(z[P_B], q))
                     out += CHANNELS
-                    noted = _noted(z, leak, t + nodes[0], noted, q)
+                    noted = _add_output(z, leak, t + nodes[0], noted, q)
                 due -= 1
                 if len(implicit) > 0:
                     z = imex_step(z, h, *_imex_inputs(t, nodes, shape, step, gain, leak, q), q)  # type: ignore[call-arg]
@@ -154,11 +155,11 @@ def advance(
 
 @kernel
 def advance_lanes_rk4(*run: Any) -> None:
-    """`advance` by RK4, compiled for lanes."""
+    """Advance by RK4, compiled for lanes (`advance`)."""
     advance(EXPLICIT, *run)
 
 
 @kernel
 def advance_lanes_imex(*run: Any) -> None:
-    """`advance` for throttled rigs, by the implicit-explicit method, compiled for lanes."""
+    """Advance throttled rigs by the implicit-explicit method, compiled for lanes (`advance`)."""
     advance(IMPLICIT, *run)

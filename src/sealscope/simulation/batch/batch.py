@@ -21,7 +21,7 @@ from sealscope.signals.details import QUANTITIES
 from sealscope.simulation.batch.run import LaneSet, SetRun, sets_of, with_sizes
 from sealscope.simulation.experiment import LONGEST_STEP, PRESSURE_TOLERANCE, Experiment
 from sealscope.simulation.integrate import FINEST, FIRST_WINDOW, trajectory
-from sealscope.simulation.sizing import settled
+from sealscope.simulation.sizing import size_leaks
 from sealscope.units import LITRE_PER_MINUTE, parse_quantity
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ _SCOUTS, _SCOUTED = 4, 2.0 * FIRST_WINDOW
 
 @dataclass(frozen=True, repr=False)
 class Batch:
-    """Result of `simulate_batch`: RMS of the details in segments, and the leaks as they were.
+    """Result of `simulate_batch`: RMS of the details in segments, and the leaks of the runs.
 
     `rms`: (runs, 2, segments, 5), by chamber (`CHAMBERS`: p_A, p_B), segment and detail (`QUANTITIES`: d1, d2, d3, d4
     [Pa], d3d4 [Pa^2]); `bounds`: (segments + 1,) [s]; `mean_leak_lpm`: (runs,) mean abs(Q) while open [L/min];
@@ -57,12 +57,12 @@ class Batch:
 
     @checked_call
     def rms_of(self, channel: str, detail: str) -> Array:
-        """RMS of one detail of one channel in each segment, (runs, segments): ``batch.rms_of("p_A", "d3")``."""
+        """Return the RMS of one detail of one channel in each segment, (runs, segments)."""
         return np.asarray(self.rms[:, _place(channel, CHAMBERS, "channel"), :, _place(detail, QUANTITIES, "detail")])
 
     @checked_call
     def changes(self, channel: str, detail: str, *, before: int = 0, after: int = -1) -> Array:
-        """Change of an RMS from segment `before` to segment `after`, (runs,) [%]: the thesis's statistic.
+        """Compute the change of an RMS from segment `before` to segment `after`, (runs,) [%]: the thesis's statistic.
 
         Examples
         --------
@@ -75,7 +75,7 @@ class Batch:
         return np.asarray(100.0 * (rms[:, after] / rms[:, before] - 1.0))
 
     def to_pandas(self) -> pd.DataFrame:
-        """Return the batch as a table, one row for each run and segment.
+        """Convert the batch to a table, one row for each run and segment.
 
         Raises MissingExtra where pandas is not installed.
 
@@ -175,8 +175,8 @@ def simulate_batch(
             if progress is not None:
                 progress(min(1.0, begun + share * size / n))
 
-        own = part.experiment.error
-        _run(part, batch, error if own is None else own, threads or os.cpu_count() or 1, report)
+        stated_error = part.experiment.error
+        _run(part, batch, error if stated_error is None else stated_error, threads or os.cpu_count() or 1, report)
         done += len(part.members) / n
     return batch
 
@@ -189,7 +189,7 @@ def _run(part: LaneSet, batch: Batch, error: float, threads: int, progress: Call
         sizes = _sized(part, step, sizes, threads)
         step = part.experiment.step or min(step, chosen_step(part, sizes, error))
     run = SetRun(part, step, sizes, sizes, batch.bounds)
-    run.all(threads, progress)
+    run.run_all(threads, progress)
     batch.rms[places] = run.rms()
     batch.mean_leak_lpm[places] = run.mean_flow() / LITRE_PER_MINUTE
     batch.coefficients[places] = sizes
@@ -197,7 +197,7 @@ def _run(part: LaneSet, batch: Batch, error: float, threads: int, progress: Call
 
 
 def chosen_step(part: LaneSet, sizes: Array, error: float) -> float:
-    """Return the finest of the steps [s] that `trajectory` chooses for some members over their first seconds.
+    """Choose the finest of the steps [s] that `trajectory` takes for some members over their first seconds.
 
     It is no longer than all members' numbers and leaks allow.
     """
@@ -212,7 +212,7 @@ def chosen_step(part: LaneSet, sizes: Array, error: float) -> float:
 
 
 def allowed_step(part: LaneSet, sizes: Array) -> float:
-    """Return the longest step [s] that all members' numbers and leaks allow, down to the finest of `integrate`."""
+    """Compute the longest step [s] that all members' numbers and leaks allow, down to the finest of `integrate`."""
     from sealscope.physics.solvers.limits import longest_step
 
     limits = []
@@ -224,13 +224,13 @@ def allowed_step(part: LaneSet, sizes: Array) -> float:
 
 
 def _sized(part: LaneSet, step: float, sizes: Array, threads: int) -> Array:
-    """Return coefficients that give the leaks' means, for all members together."""
+    """Find coefficients that give the leaks' means, for all members together."""
     means = np.array([member.leak.mean or 0.0 for member in part.members])
 
     def measure(sizes: Array) -> tuple[Array, None]:
         measured = np.where(sizes > 0, sizes, 1.0)
         run = SetRun(part, part.experiment.step or min(step, allowed_step(part, sizes)), sizes, measured, None)
-        run.all(threads, None)
+        run.run_all(threads, None)
         units = run.mean_flow() / measured
         shut = np.flatnonzero((means > 0) & (units <= 0))
         if shut.size:
@@ -238,4 +238,4 @@ def _sized(part: LaneSet, step: float, sizes: Array, threads: int) -> Array:
             raise InputError(f"a leak with a mean flow must be open within the run (run {place})")
         return units, None
 
-    return settled([member.leak for member in part.members], sizes, measure)[0]
+    return size_leaks([member.leak for member in part.members], sizes, measure)[0]

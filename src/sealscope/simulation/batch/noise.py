@@ -28,13 +28,13 @@ def _constant(value: int) -> Any:
 
 
 def keys(seeds: list[int]) -> Array:
-    """Return a key for each run's noise, as the bits of doubles: (runs,)."""
+    """Compute a key for each run's noise, as the bits of doubles: (runs,)."""
     states = [np.random.SeedSequence(seed).generate_state(1, np.uint64) for seed in seeds]
     return np.concatenate(states).view(np.float64)
 
 
 def uniform(key: Any, place: int) -> Any:
-    """Numbers evenly spread over (0, 1], one a lane: those at `place` >= 0 of the keys' sequences."""
+    """Compute numbers evenly spread over (0, 1], one a lane: those at `place` >= 0 of the keys' sequences."""
 
 
 def _uniform(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
@@ -52,7 +52,7 @@ def _uniform(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
 
 
 def _exponent(x: Any) -> Any:
-    """Return the exponent of positive normal doubles, as doubles."""
+    """Compute the exponent of positive normal doubles, as doubles."""
 
 
 def _raised(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
@@ -61,7 +61,7 @@ def _raised(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
 
 
 def _fraction(x: Any) -> Any:
-    """Return the fraction of positive normal doubles, 1 <= m < 2."""
+    """Compute the fraction of positive normal doubles, 1 <= m < 2."""
 
 
 def _mantissa(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
@@ -75,7 +75,7 @@ for _function, _arity, _build in ((uniform, 2, _uniform), (_exponent, 1, _raised
 
 @contracted
 def logarithm(x: Any) -> Any:
-    """Return ln x for lanes of normal numbers x > 0, within 2e-15 (absolute near 1, relative elsewhere).
+    """Compute ln x for lanes of normal numbers x > 0, within 2e-15 (absolute near 1, relative elsewhere).
 
     ln x = e ln 2 + 2 artanh((m - 1)/(m + 1)), m in sqrt(1/2)..sqrt(2), by the artanh's series.
     """
@@ -92,7 +92,7 @@ def logarithm(x: Any) -> Any:
 
 @contracted
 def half_turn_sine(v: Any) -> Any:
-    """sin(pi v) for -1/2 <= v <= 1/2, within 5e-14: Taylor's polynomial to the 17th power."""
+    """Compute sin(pi v) for -1/2 <= v <= 1/2, within 5e-14: Taylor's polynomial to the 17th power."""
     x = v * math.pi
     s = x * x
     q = s * s
@@ -103,7 +103,7 @@ def half_turn_sine(v: Any) -> Any:
 
 @contracted
 def normals(key: Any, place: int) -> tuple[Any, Any]:
-    """Return two independent standard normal numbers a lane, from places 2 k and 2 k + 1 of the keys' sequences.
+    """Compute two independent standard normal numbers a lane, from places 2 k and 2 k + 1 of the keys' sequences.
 
     Source: Box and Muller, Annals of Mathematical Statistics 29 (1958) 610-611.
     """

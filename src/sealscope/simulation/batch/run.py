@@ -1,4 +1,4 @@
-"""Sets of experiments that can run side by side, and how a set runs from standstill, a few seconds at a time."""
+"""Sets of experiments that can run side by side, and the run of a set from standstill, a few seconds at a time."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Member:
 
 @dataclass(frozen=True)
 class LaneSet:
-    """Experiments of one kind under one shape of a command and one load, with one step or error asked for."""
+    """Experiments of one kind that share the shape of a command, the load, and the step or error."""
 
     members: tuple[Member, ...]
     shape: Command
@@ -94,7 +94,9 @@ def refuse(experiment: Experiment, place: int) -> None:
         missing.append("no leak while the oil's temperature changes")
     absent = ["daq.jitter"]
     absent += [
-        f"sensors.{name}.{own}" for name in CHAMBERS for own in ("stuck_rate", "drop_rate", "lag", "hum_harmonics")
+        f"sensors.{name}.{symbol}"
+        for name in CHAMBERS
+        for symbol in ("stuck_rate", "drop_rate", "lag", "hum_harmonics")
     ]
     missing += [f"{name} = 0, got {rig[name]}" for name in absent if rig[name] != 0]
     if missing:
@@ -102,7 +104,7 @@ def refuse(experiment: Experiment, place: int) -> None:
 
 
 def _shape(command: Command) -> tuple[str, Command, float, float]:
-    """Return a name of the shape of a command, the shape, and gain and offset that make the command of it."""
+    """Split a command into a name of its shape, the shape, and the gain and offset on it."""
     if isinstance(command, Sine):
         shape = Sine(1.0, command.omega, command.phase)
         return str(exact(shape)), shape, command.amplitude, command.offset
@@ -110,7 +112,7 @@ def _shape(command: Command) -> tuple[str, Command, float, float]:
 
 
 def sets_of(experiments: Sequence[Experiment]) -> list[LaneSet]:
-    """Return the experiments in sets.
+    """Group the experiments into sets that can run side by side.
 
     Raises InputError where one cannot be in a batch, or their records differ in length or rate.
     """
@@ -124,9 +126,9 @@ def sets_of(experiments: Sequence[Experiment]) -> list[LaneSet]:
     known: dict[Any, RigNumbers] = {}  # by rig and load: most batches have few of them
     for place, experiment in enumerate(experiments):
         for name in ("duration", "rate"):
-            own, common = getattr(experiment, name), getattr(first, name)
-            if own != common:
-                raise InputError(f"runs of a batch must have one {name}, got {common:g} and {own:g} (run {place})")
+            value, common = getattr(experiment, name), getattr(first, name)
+            if value != common:
+                raise InputError(f"runs of a batch must have one {name}, got {common:g} and {value:g} (run {place})")
         refuse(experiment, place)
         load = None if experiment.load is None else str(exact(experiment.load))
         if (id(experiment.rig), load) not in known:
@@ -147,20 +149,20 @@ def sets_of(experiments: Sequence[Experiment]) -> list[LaneSet]:
 
 
 def in_lanes(values: Array, width: int) -> Array:
-    """Values of runs (runs, ...) as (groups, ..., width); the last run fills the lanes that are over."""
+    """Arrange values of runs (runs, ...) as (groups, ..., width); the last run fills the spare lanes."""
     groups = -(-len(values) // width)
     filled = np.concatenate([values, np.repeat(values[-1:], groups * width - len(values), axis=0)])
     return np.ascontiguousarray(np.moveaxis(filled.reshape(groups, width, *values.shape[1:]), 1, -1))
 
 
 def out_of_lanes(lanes: Array, runs: int) -> Array:
-    """Return the inverse of `in_lanes`: (groups, ..., width) as (runs, ...)."""
+    """Arrange (groups, ..., width) as (runs, ...), the inverse of `in_lanes`."""
     moved = np.moveaxis(lanes, -1, 1)
     return moved.reshape(-1, *moved.shape[2:])[:runs]
 
 
 def leak_rows(members: Sequence[Member], sizes: Array, measured: Array) -> Array:
-    """Return (runs, LEAK_ROWS): leaks of the stated sizes, and the sizes of which the flow is accounted."""
+    """Build (runs, LEAK_ROWS): leaks of the stated sizes, and the sizes whose flow is accounted."""
     rows = []
     for member, size, accounted in zip(members, sizes, measured, strict=True):
         leak = member.leak
@@ -185,7 +187,7 @@ class Cells:
     values: Array
 
     def table(self, first: int, last: int, width: int) -> Array:
-        """Return (groups, cells, fields, width) of cells first .. last."""
+        """Build (groups, cells, fields, width) of cells first .. last."""
         table = np.repeat(self.base[:, None, :], last - first, axis=1)
         for k, field in enumerate(self.changing):
             table[:, :, field] = self.values[:, k, first:last]
@@ -193,11 +195,13 @@ class Cells:
 
 
 def cells_of(members: Sequence[Member], n_out: int, rate: float) -> Cells:
-    """Cells for a set at `rate` [Hz] of outputs: the blocks of all effects of its members (`changes.blocks_of`)."""
+    """Build the cells of a set at `rate` [Hz] of outputs: the blocks of all effects of its members."""
     from sealscope.physics.rig import NUMBERS
 
     numbers = {id(member.numbers): member.numbers for member in members}
-    rows = {key: [float(getattr(own, name)) for name in NUMBERS] for key, own in numbers.items()}
+    rows = {
+        key: [float(getattr(numbers_of_block, name)) for name in NUMBERS] for key, numbers_of_block in numbers.items()
+    }
     base = np.array([rows[id(member.numbers)] for member in members])
     effects = [effect for member in members for effect in member.effects]
     bounds = blocks_of(effects, n_out, rate)
@@ -211,27 +215,29 @@ def cells_of(members: Sequence[Member], n_out: int, rate: float) -> Cells:
 
 
 def with_sizes(experiment: Experiment, size: float) -> Experiment:
-    """Return the experiment with its leak's coefficient found."""
+    """Set the coefficient of an experiment's leak."""
     if not experiment.leaks:
         return experiment
     return replace(experiment, leaks=(replace(experiment.leaks[0], mean=None, coefficient=size),))
 
 
 def instrument_rows(members: Sequence[Member], first: int, last: int) -> Array:
-    """Return (runs, 2, INSTRUMENT_ROWS) of p_A and p_B for samples first .. last, even between these."""
+    """Build (runs, 2, INSTRUMENT_ROWS) of p_A and p_B for samples first .. last, linear between these."""
     from sealscope.simulation.batch.signals import HUM, HUM_PHASE
 
     ends = np.array([first, last]) / members[0].experiment.rate
     experiments = [member.experiment for member in members]
-    rows = np.array([_channels(own.rig, own.readings(), ends, last - first) for own in experiments])
-    for row, own in zip(rows, experiments, strict=True):
+    rows = np.array(
+        [_channels(experiment.rig, experiment.readings(), ends, last - first) for experiment in experiments]
+    )
+    for row, experiment in zip(rows, experiments, strict=True):
         if row[:, HUM].any():
-            row[:, HUM_PHASE] = np.random.default_rng([own.seed, 1]).random(len(CHAMBERS))
+            row[:, HUM_PHASE] = np.random.default_rng([experiment.seed, 1]).random(len(CHAMBERS))
     return rows
 
 
 def _channels(rig: Rig, readings: Readings, ends: Array, samples: int) -> Array:
-    """Return (2, INSTRUMENT_ROWS) of p_A and p_B, even between the two times `ends` [s], `samples` apart."""
+    """Build (2, INSTRUMENT_ROWS) of p_A and p_B, linear between the two times `ends` [s], `samples` apart."""
     from sealscope.simulation.batch import signals as at
 
     rows, daq = np.zeros((len(CHAMBERS), at.INSTRUMENT_ROWS)), rig.daq
@@ -295,7 +301,7 @@ class SetRun:
                     refuse_unresolved(numbers, self.h, self.method)
                     refuse_long(self.h, longest_step(numbers, G, C), f"the leak of run {member.place}")
         experiments = [member.experiment for member in members]
-        states = [state_under(own.rig, own.load, own.x_0) for own in experiments]
+        states = [state_under(experiment.rig, experiment.load, experiment.x_0) for experiment in experiments]
         self.state = in_lanes(np.array(states), self.width)
         self.groups = len(self.state)
         self.drive = in_lanes(np.array([[m.gain, m.offset] for m in members]), self.width)
@@ -308,18 +314,18 @@ class SetRun:
             self._prepare_statistics(bounds)
 
     def _prepare_filters(self, rate: float) -> None:
-        """Lay out the anti-alias filter of each lane: its taps are `before` .. `after` outputs from the sample's."""
+        """Lay out the anti-alias filter of each lane: tap k is of the output k - `before` steps from the sample."""
         sensors = [member.experiment.rig.sensors for member in self.part.members]
         delays = np.array([[getattr(group, name).delay * rate for name in CHAMBERS] for group in sensors])
         known = {delay: anti_alias_taps(self.factor, delay % 1.0) for delay in set(delays.ravel().tolist())}
         self.after = max(taps.size // 2 for taps in known.values())
         self.before = self.after + int(delays.max())
-        own = np.zeros((self.runs, self.channels, self.before + self.after + 1))
+        filters = np.zeros((self.runs, self.channels, self.before + self.after + 1))
         for place, delay in np.ndenumerate(delays):
             taps = known[float(delay)]
             start = self.before - int(delay) - taps.size // 2
-            own[place][start : start + taps.size] = taps
-        self.taps = in_lanes(own, self.width)
+            filters[place][start : start + taps.size] = taps
+        self.taps = in_lanes(filters, self.width)
 
     def _prepare_statistics(self, bounds: Array) -> None:
         from sealscope.signals.filters import reach
@@ -327,13 +333,13 @@ class SetRun:
         from sealscope.simulation.batch.signals import QUANTITIES
 
         before, after = reach()[-1]
-        at = np.round(bounds * self.part.experiment.rate).astype(np.int64)
-        self.segments = np.clip(at, before, self.samples - after)
+        samples = np.round(bounds * self.part.experiment.rate).astype(np.int64)
+        self.segments = np.clip(samples, before, self.samples - after)
         self.sums = np.zeros((self.groups, self.channels, self.segments.size - 1, QUANTITIES, self.width))
         self.keys = in_lanes(keys([m.experiment.seed for m in self.part.members]), self.width)
 
-    def all(self, threads: int, progress: Callable[[float], None] | None) -> None:
-        """Run all groups, shared out over `threads` (the compiled parts run beside each other)."""
+    def run_all(self, threads: int, progress: Callable[[float], None] | None) -> None:
+        """Run all groups, shared out over `threads` (the compiled parts run in parallel)."""
         cuts = np.unique(np.linspace(0, self.groups, min(threads, self.groups) + 1).round().astype(int)).tolist()
         lock, reached = threading.Lock(), 0.0
 
@@ -345,10 +351,10 @@ class SetRun:
                     progress(reached)
 
         with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(lambda part: self._some(part, tell), itertools.pairwise(cuts)))
+            list(pool.map(lambda part: self._run_groups(part, tell), itertools.pairwise(cuts)))
 
     def _chunks(self) -> list[tuple[int, int, int, int]]:
-        """Cells first .. last and outputs start .. stop of each chunk."""
+        """List the chunks: cells first .. last and outputs start .. stop of each."""
         most = max(1, CHUNK_STEPS // self.every)
         edges = self.cells.bounds
         chunks = []
@@ -363,12 +369,12 @@ class SetRun:
         return chunks
 
     def _due(self, stop: int) -> int:
-        """Return the sample before which all can be read once outputs up to `stop` are there."""
+        """Count the samples that can be read once the outputs up to `stop` are computed."""
         if stop == self.outputs:
             return self.samples
         return min(max(0, (stop - self.after - 1) // self.factor + 1), self.samples)
 
-    def _some(self, groups: tuple[int, int], tell: Callable[[float], None]) -> None:
+    def _run_groups(self, groups: tuple[int, int], tell: Callable[[float], None]) -> None:
         """Run the groups first <= g < last from standstill to the end."""
         from sealscope.physics.vector.runs import advance_lanes_imex, advance_lanes_rk4
         from sealscope.signals.streams import DetailStream
@@ -376,13 +382,13 @@ class SetRun:
 
         advance = advance_lanes_imex if self.method == "imex" else advance_lanes_rk4
         a, b = groups
-        own = (0, b - a)
+        part = (0, b - a)
         state, drive, leaks, account = self.state[a:b], self.drive[a:b], self.leaks[a:b], self.account[a:b]
         table, cells = np.empty((0, 0, 0, 0)), (-1, -1)
         chunks = self._chunks()
-        kept = self.before + self.after + self.factor  # outputs that later samples still need
+        history = self.before + self.after + self.factor  # outputs that later samples still need
         longest = max(stop - start for _, _, start, stop in chunks)
-        pressures = np.zeros((b - a, kept + longest, self.channels, self.width))
+        pressures = np.zeros((b - a, history + longest, self.channels, self.width))
         walks = np.zeros((b - a, self.channels, self.width))
         wavelet = DetailStream((self.channels, (b - a) * self.width))
         sampled = 0
@@ -391,40 +397,40 @@ class SetRun:
                 table, cells = self.cells.table(first, last, self.width)[a:b], (first, last)
             bounds = (np.clip(self.cells.bounds[first : last + 1], start, stop) - start) * self.every  # in steps
             advance(
-                own, state, self.h, start * self.every, self.nodes, self._shape(start, stop), drive, leaks, table,
-                bounds, self.numbers, self.every, pressures, kept, account,
+                part, state, self.h, start * self.every, self.nodes, self._shape(start, stop), drive, leaks, table,
+                bounds, self.numbers, self.every, pressures, history, account,
             )  # fmt: skip
             self._check(groups, stop)
             if self.bounds is not None:
                 if start == 0:
-                    pressures[:, :kept] = pressures[:, kept : kept + 1]  # at standstill before the beginning
+                    pressures[:, :history] = pressures[:, history : history + 1]  # at standstill before the beginning
                 until = self._due(stop)
                 if until > sampled:
-                    begin = sampled * self.factor - self.before - (start - kept)
+                    begin = sampled * self.factor - self.before - (start - history)
                     sense_lanes(
-                        own, pressures, begin, self.factor, self.taps[a:b], sampled, until,
+                        part, pressures, begin, self.factor, self.taps[a:b], sampled, until,
                         self._sensors(groups, sampled, until), self.keys[a:b], walks, wavelet.taps, wavelet.buffers,
                         self.segments, self.sums[a:b],
                     )  # fmt: skip
                     sampled = until
-                pressures[:, :kept] = pressures[:, stop - start : stop - start + kept].copy()
+                pressures[:, :history] = pressures[:, stop - start : stop - start + history].copy()
             tell((stop - start) / self.outputs * (b - a) / self.groups)
 
     def _shape(self, start: int, stop: int) -> Array:
-        """Return the command's shape at the nodes of the steps between two outputs, and a load's forces behind it."""
+        """Compute the command's shape at the nodes of the steps between two outputs, with a load's forces behind it."""
         t = np.arange(start * self.every, stop * self.every, dtype=np.float64) * self.h
-        at, load = t[:, None] + self.nodes, self.part.experiment.load
-        volts = self.part.shape.volts(at)
+        times, load = t[:, None] + self.nodes, self.part.experiment.load
+        volts = self.part.shape.volts(times)
         return np.ascontiguousarray(
-            volts if load is None else np.hstack([volts, np.broadcast_to(load.at(at), at.shape)])
+            volts if load is None else np.hstack([volts, np.broadcast_to(load.value_at(times), times.shape)])
         )
 
     def _sensors(self, groups: tuple[int, int], first: int, last: int) -> Array:
-        """Return the instruments of the groups for samples first .. last, (groups, 2, INSTRUMENT_ROWS, width)."""
+        """Build the instruments of the groups for samples first .. last, (groups, 2, INSTRUMENT_ROWS, width)."""
         if self._steady is not None:
             return self._steady[groups[0] : groups[1]]
-        own = self.part.members[groups[0] * self.width : groups[1] * self.width]
-        return in_lanes(instrument_rows(own, first, last), self.width)
+        members = self.part.members[groups[0] * self.width : groups[1] * self.width]
+        return in_lanes(instrument_rows(members, first, last), self.width)
 
     @cached_property
     def _steady(self) -> Array | None:
@@ -441,8 +447,8 @@ class SetRun:
         account = self.account[groups[0] : groups[1]]
         time = stop / (self.part.experiment.rate * self.factor)
         half = 0.5 * float(min(member.numbers.L for member in self.part.members))
-        settled = np.all(account[:, DIVERGED] == 0.0) and account[:, LEAST].min() >= VACUUM
-        if settled and account[:, REACH].max() <= half:
+        finite = np.all(account[:, DIVERGED] == 0.0) and account[:, LEAST].min() >= VACUUM
+        if finite and account[:, REACH].max() <= half:
             return
         accounts = out_of_lanes(account, account.shape[0] * self.width)
         for k, (reach, least, diverged) in enumerate(accounts[:, [REACH, LEAST, DIVERGED]]):

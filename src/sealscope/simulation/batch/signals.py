@@ -1,4 +1,4 @@
-"""What instruments and wavelets make of runs side by side, block by block: pressures in, sums of squares out.
+"""Instruments and wavelets of runs side by side, block by block: from pressures to sums of squares.
 
 The laws are those of `instruments.record` and `signals.details`, on lanes.
 """
@@ -28,40 +28,42 @@ INSTRUMENT_ROWS = 18
 
 
 @contracted
-def converted(pressure: Any, sensor: np.ndarray, at: int) -> Any:
-    """Pressure [Pa] as read back from the converter (`instruments.convert`)."""
-    least = load(sensor, at + LEAST)
-    held = min(max(pressure, least), load(sensor, at + LARGEST))
-    volts = load(sensor, at + VOLTS) + (held - least) * load(sensor, at + PER_PASCAL)
-    top = load(sensor, at + TOP)
-    codes = min(max(nearest_whole(volts / load(sensor, at + COUNT)), -top), top - 1.0)
-    return least + (codes * load(sensor, at + COUNT) - load(sensor, at + VOLTS)) / load(sensor, at + PER_PASCAL)
+def converted(pressure: Any, sensor: np.ndarray, row: int) -> Any:
+    """Compute the pressure [Pa] as read back from the converter (`instruments.convert`)."""
+    least = load(sensor, row + LEAST)
+    held = min(max(pressure, least), load(sensor, row + LARGEST))
+    volts = load(sensor, row + VOLTS) + (held - least) * load(sensor, row + PER_PASCAL)
+    top = load(sensor, row + TOP)
+    codes = min(max(nearest_whole(volts / load(sensor, row + COUNT)), -top), top - 1.0)
+    return least + (codes * load(sensor, row + COUNT) - load(sensor, row + VOLTS)) / load(sensor, row + PER_PASCAL)
 
 
 @contracted
-def _hum(sensor: np.ndarray, at: int, sample: int) -> Any:
-    turns = load(sensor, at + HUM_PHASE) + load(sensor, at + HUM_TURNS) * sample
+def _hum(sensor: np.ndarray, row: int, sample: int) -> Any:
+    turns = load(sensor, row + HUM_PHASE) + load(sensor, row + HUM_TURNS) * sample
     turns = turns - nearest_whole(turns)  # -1/2 .. 1/2 of a turn
     sine = half_turn_sine(turns)
     cosine = half_turn_sine(0.5 - abs(turns))  # cos(pi turns)
-    return load(sensor, at + HUM) * (2.0 * sine * cosine)
+    return load(sensor, row + HUM) * (2.0 * sine * cosine)
 
 
 @contracted
-def _read(true: Any, sensor: np.ndarray, at: int, own: Any, common: Any, walk: Any, sample: int, since: float) -> Any:
-    gain = load(sensor, at + GAIN) + since * load(sensor, at + GAIN_RISE)
-    offset = load(sensor, at + OFFSET) + since * load(sensor, at + OFFSET_RISE)
-    noise = load(sensor, at + NOISE) + since * load(sensor, at + NOISE_RISE)
-    shared = load(sensor, at + COMMON) + since * load(sensor, at + COMMON_RISE)
-    reading = gain * true + offset + walk + noise * own + shared * common
-    if anywhere(load(sensor, at + HUM) > 0.0):
-        reading = reading + _hum(sensor, at, sample)
-    return converted(reading, sensor, at)
+def _read(
+    true: Any, sensor: np.ndarray, row: int, noise_of_channel: Any, common: Any, walk: Any, sample: int, since: float
+) -> Any:
+    gain = load(sensor, row + GAIN) + since * load(sensor, row + GAIN_RISE)
+    offset = load(sensor, row + OFFSET) + since * load(sensor, row + OFFSET_RISE)
+    noise = load(sensor, row + NOISE) + since * load(sensor, row + NOISE_RISE)
+    shared = load(sensor, row + COMMON) + since * load(sensor, row + COMMON_RISE)
+    reading = gain * true + offset + walk + noise * noise_of_channel + shared * common
+    if anywhere(load(sensor, row + HUM) > 0.0):
+        reading = reading + _hum(sensor, row, sample)
+    return converted(reading, sensor, row)
 
 
 @contracted
 def _add_squares(details: np.ndarray, first: int, m: int, bounds: np.ndarray, sums: np.ndarray, to: int) -> None:
-    """Add the squares of m samples' details, from sample `first` on, to the segments between `bounds` that have them.
+    """Add the squares of m samples' details, from sample `first` on, to their segments between `bounds`.
 
     `details`: (LEVELS, CHUNK, WIDTH); `sums` rows to, to + QUANTITIES, .. are the segments'.
     """
@@ -114,10 +116,10 @@ def sense(
         start_A, start_B = A * LEVELS * capacity, B * LEVELS * capacity
         for start in range(first, last, CHUNK):
             m = min(CHUNK, last - start)
-            at = (g * pressures.shape[1] + begin) * CHANNELS + (start - first) * stride
+            source = (g * pressures.shape[1] + begin) * CHANNELS + (start - first) * stride
             a, b = start_A + history, start_B + history
-            filter_rows(pressures, at, stride, -CHANNELS, taps, A * count, count, buffers, a, m)
-            filter_rows(pressures, at + 1, stride, -CHANNELS, taps, B * count, count, buffers, b, m)
+            filter_rows(pressures, source, stride, -CHANNELS, taps, A * count, count, buffers, a, m)
+            filter_rows(pressures, source + 1, stride, -CHANNELS, taps, B * count, count, buffers, b, m)
             for i in range(m):
                 s, since = start + i, float(start - first + i)
                 own_A, own_B = normals(key, 3 * s)

@@ -1,4 +1,4 @@
-"""The bench: healthy machines drawn from a profile, each different and none constant, all from one seed."""
+"""The bench: healthy machines drawn from a profile by a seed; each differs, and each changes within its record."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ WANDER_TERMS = 6
 
 @dataclass(frozen=True)
 class BenchMachine:
-    """One machine on one day: a rig as designed, what differs from it, what drifts, and what the machine is asked for.
+    """One machine on one day: its designed rig, its departures from that, its drifts and its duty.
 
     `overrides`: values of parameters by dotted name, in SI, throttles among them (`closed`; open ones leave
     `line.orifices` as the rig has it); `duration` [s] of the record over which the drifts have their sizes. A target is
@@ -53,18 +53,18 @@ class BenchMachine:
         they are not among them.
         """
         built = self.rig.with_overrides(self.overrides, source=f"drawn from profile {self.profile}, seed {self.seed}")
-        own = {"seed": self.seed, "duration": self.duration, "command": self.command, "drifts": self.drifts}
-        given = {"load": self.load, **own, **arguments}
-        if isinstance(given["command"], str):
-            given["command"] = command_or_target(given["command"])
-        if isinstance(given["command"], Position):
-            given.setdefault("controller", controller_named(self.controller, self.rig))
-        given.setdefault("x_0", centred_start(built, given["command"], given["duration"]))
-        return Experiment.of(rig=built, **given)
+        machine_values = {"seed": self.seed, "duration": self.duration, "command": self.command, "drifts": self.drifts}
+        values = {"load": self.load, **machine_values, **arguments}
+        if isinstance(values["command"], str):
+            values["command"] = command_or_target(values["command"])
+        if isinstance(values["command"], Position):
+            values.setdefault("controller", controller_named(self.controller, self.rig))
+        values.setdefault("x_0", centred_start(built, values["command"], values["duration"]))
+        return Experiment.of(rig=built, **values)
 
 
 def centred_start(rig: Rig, command: Command | Position | str, duration: float) -> float:
-    """Start [m] from which the strokes of a command lie evenly about mid-stroke, as far as that is possible.
+    """Compute the start [m] from which the strokes of a command lie evenly about mid-stroke, as far as possible.
 
     That of a target is where the target begins.
 
@@ -76,7 +76,7 @@ def centred_start(rig: Rig, command: Command | Position | str, duration: float) 
     motor, cylinder = rig.motor, rig.cylinder
     dt, half = 0.05, 0.5 * cylinder.L
     if isinstance(command, Position):
-        return float(np.clip(command.at(np.zeros(())), -half, half))
+        return float(np.clip(command.value_at(np.zeros(())), -half, half))
     area = 0.5 * (cylinder.A_A + cylinder.A_B)
     if rig.valve.spool == "present":
         moved = dt * np.cumsum(command.volts(np.arange(0.0, duration + dt, dt))) * drive_of(rig).largest(1.0) / area
@@ -94,12 +94,12 @@ def centred_start(rig: Rig, command: Command | Position | str, duration: float) 
 
 
 def _random(seed: int, name: str) -> np.random.Generator:
-    """Return the stream of one nuisance: no other nuisance of the profile changes what it draws."""
+    """Make the random stream of one nuisance, which no other nuisance of the profile changes."""
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
 
 def _path(random: np.random.Generator, shapes: tuple[str, ...], duration: float, *, warms: bool = False) -> Wander:
-    """Return a path with a distance of 1 between its extremes: even, up or down, or wandering."""
+    """Draw a path with a distance of 1 between its extremes: linear, up or down, or wandering."""
     shape = shapes[int(random.integers(len(shapes)))]
     up = random.random() < 0.5 or warms
     weights = random.standard_normal(WANDER_TERMS) / (np.arange(WANDER_TERMS) + 0.5)
@@ -108,14 +108,14 @@ def _path(random: np.random.Generator, shapes: tuple[str, ...], duration: float,
     return Wander(tuple(map(float, weights)), duration).scaled(1.0)
 
 
-def _drift(random: np.random.Generator, wanted: DriftRange, oil: Wander) -> Wander:
-    own = _path(random, wanted.shapes, oil.duration)
-    both = oil.times(wanted.oil).plus(own.times((1.0 - wanted.oil**2) ** 0.5)) if wanted.oil else own
-    return both.scaled(float(random.uniform(*wanted.size)))
+def _drift(random: np.random.Generator, drift: DriftRange, oil: Wander) -> Wander:
+    path = _path(random, drift.shapes, oil.duration)
+    shape = oil.times(drift.oil).plus(path.times((1.0 - drift.oil**2) ** 0.5)) if drift.oil else path
+    return shape.scaled(float(random.uniform(*drift.size)))
 
 
-def _drawn(nuisance: Nuisance, seed: int, oil: Wander) -> tuple[dict[str, float], list[ParameterDrift]]:
-    """Values (or factors) and drifts of one nuisance."""
+def _draw_nuisance(nuisance: Nuisance, seed: int, oil: Wander) -> tuple[dict[str, float], list[ParameterDrift]]:
+    """Draw the values (or factors) and drifts of one nuisance."""
     values: dict[str, float] = {}
     drifts: list[ParameterDrift] = []
     for group in [(name,) for name in nuisance.parameters] if nuisance.each else [nuisance.parameters]:
@@ -136,7 +136,7 @@ def draw(
     duration: float = 180.0,
     family: str = "",
 ) -> BenchMachine:
-    """Return a healthy machine of a rig's kind, drawn from a profile (or its name, or its file).
+    """Draw a healthy machine of a rig's kind from a profile (or its name, or its file).
 
     One seed, one machine.
 
@@ -146,9 +146,9 @@ def draw(
     """
     from sealscope.parameters import load_rig
 
-    given = load_profile(profile) if isinstance(profile, str) else profile
-    warms = bool(family) and given.family(family).warms
-    given = given.of_family(family) if family else given
+    nuisances = load_profile(profile) if isinstance(profile, str) else profile
+    warms = bool(family) and nuisances.family(family).warms
+    nuisances = nuisances.of_family(family) if family else nuisances
     base = load_rig(rig)
     if seed < 0:
         raise InputError(f"seed must be >= 0, got {seed}")
@@ -159,15 +159,15 @@ def draw(
     )
     overrides: dict[str, float | str] = {}
     drifts: list[ParameterDrift] = []
-    for nuisance in given.nuisances:
+    for nuisance in nuisances.nuisances:
         if isinstance(nuisance, NuisanceChoice):
             value = nuisance.values[int(_random(seed, nuisance.name).integers(len(nuisance.values)))]
             overrides |= dict.fromkeys(nuisance.parameters, value)
             continue
-        values, drifting = _drawn(nuisance, seed, oil)
+        values, drifting = _draw_nuisance(nuisance, seed, oil)
         overrides |= {name: float(base[name]) * value for name, value in values.items()} if nuisance.scales else values
         drifts += drifting
-    random, duty = _random(seed, "duty"), given.duty
+    random, duty = _random(seed, "duty"), nuisances.duty
 
     def one_of(options: Sequence[T]) -> T:
         return options[int(random.integers(len(options)))]
@@ -181,4 +181,6 @@ def draw(
         command = replace(command, amplitude=command.amplitude * amplitude)  # type: ignore[type-var, union-attr]
     load = parse_force(one_of(duty.loads)) if duty.loads else None
     controller = one_of(duty.controllers) if duty.controllers else "pi"
-    return BenchMachine(given.name, seed, base, duration, overrides, tuple(drifts), command, closed, load, controller)
+    return BenchMachine(
+        nuisances.name, seed, base, duration, overrides, tuple(drifts), command, closed, load, controller
+    )

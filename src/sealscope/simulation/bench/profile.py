@@ -1,4 +1,4 @@
-"""Profiles of nuisances as files: how healthy machines differ, and how each changes within a record."""
+"""Profiles of nuisances as files: the differences between healthy machines, and the changes within a record."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class _NuisanceEntry(BaseModel):
 
 @dataclass(frozen=True)
 class DriftRange:
-    """How far a parameter drifts.
+    """The size, shape and cause of a parameter's drift.
 
     `size` low and high of the distance between its extremes (a share, or SI if `absolute`); forms it may take; weight
     `oil` of the oil's temperature in it, the rest wanders.
@@ -103,7 +103,7 @@ class NuisanceChoice:
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Duty:
-    """What the machines are asked for.
+    """The commands, targets, loads and controllers of the machines of a profile.
 
     One of `commands`, times a factor within `amplitude`, both throttles `closed` by one of these shares (in the file:
     per cent). Where commands are targets for the piston, one of `controllers` follows them (none: PI); one of `loads`
@@ -136,9 +136,9 @@ class Duty:
 AnyNuisance = Nuisance | NuisanceChoice
 
 
-def _nuisance(given: Any) -> AnyNuisance:
-    """Return the nuisance that an entry of a file states."""
-    entry = _NuisanceEntry.model_validate(given)
+def _nuisance(table: Any) -> AnyNuisance:
+    """Read the nuisance of a file's entry."""
+    entry = _NuisanceEntry.model_validate(table)
     try:
         return _in_si(entry)
     except InputError as error:
@@ -175,7 +175,7 @@ def _in_si(entry: _NuisanceEntry) -> AnyNuisance:
 
 
 def _values(entry: _NuisanceEntry, choices: tuple[str, ...], si_unit: str) -> tuple[float | str, ...]:
-    """Return the values of a `NuisanceChoice`: of a choice as they are, of a number in SI."""
+    """Read the values of a `NuisanceChoice`: of a choice unchanged, of a number in SI."""
     values = entry.values or ()
     for value in values:
         if choices and value not in choices:
@@ -202,7 +202,7 @@ def _drift(entry: _DriftEntry, parameters: tuple[str, ...], si_unit: str) -> Dri
 
 
 def _distinct(nuisances: tuple[AnyNuisance, ...]) -> tuple[AnyNuisance, ...]:
-    """Return nuisances of which no two share a parameter or a name."""
+    """Check that no two nuisances share a parameter or a name, and return them."""
     owner: dict[str, str] = {}
     for nuisance in nuisances:
         for parameter in nuisance.parameters:
@@ -252,7 +252,7 @@ class Profile:
     seeds: str = field(default="", repr=False)
 
     def family(self, name: str) -> Family:
-        """Return the family of that name; raise InputError where there is none."""
+        """Return the family of a name; raise InputError where there is none."""
         for family in self.families:
             if family.name == name:
                 return family
@@ -260,29 +260,31 @@ class Profile:
         raise InputError(f"a family of {self.name} must be one of its own ({known}), got {name!r} ({self.place})")
 
     def of_family(self, name: str) -> Profile:
-        """Return the profile of one family's machines: its nuisances, and the others of this one."""
+        """Build the profile of one family's machines: its nuisances in place of this profile's."""
         family = self.family(name)
-        nuisances = _in_place(self.nuisances, family.nuisances)
+        nuisances = _replace_nuisances(self.nuisances, family.nuisances)
         return replace(self, duty=family.duty or self.duty, nuisances=nuisances, families=())
 
 
-def _in_place(nuisances: tuple[AnyNuisance, ...], own: tuple[AnyNuisance, ...]) -> tuple[AnyNuisance, ...]:
-    """Return the nuisances with `own` in place of those for the same parameters."""
-    taken = {parameter for nuisance in own for parameter in nuisance.parameters}
-    kept: list[AnyNuisance] = []
+def _replace_nuisances(
+    nuisances: tuple[AnyNuisance, ...], replacing: tuple[AnyNuisance, ...]
+) -> tuple[AnyNuisance, ...]:
+    """Replace the nuisances that share a parameter with one of `replacing`."""
+    replaced = {parameter for nuisance in replacing for parameter in nuisance.parameters}
+    unchanged: list[AnyNuisance] = []
     for nuisance in nuisances:
-        left = tuple(parameter for parameter in nuisance.parameters if parameter not in taken)
-        kept += [replace(nuisance, parameters=left)] if left else []
-    return (*kept, *own)
+        rest = tuple(parameter for parameter in nuisance.parameters if parameter not in replaced)
+        unchanged += [replace(nuisance, parameters=rest)] if rest else []
+    return (*unchanged, *replacing)
 
 
 def profile_names() -> tuple[str, ...]:
-    """Names of the packaged profiles."""
+    """List the names of the packaged profiles."""
     return tuple(sorted(path.stem for path in _PACKAGED.glob("*.toml")))
 
 
 def load_profile(name_or_path: str | os.PathLike[str] = "bench") -> Profile:
-    """Return the profile of that name, or of a TOML file laid out like `profiles/bench.toml`.
+    """Read the profile of a name, or of a TOML file laid out like `profiles/bench.toml`.
 
     Raises InputError where the file cannot be read, a name or unit is unknown, a range is none or a reason is missing.
     """
@@ -321,5 +323,5 @@ def _profile(path: Path, place: str) -> Profile:
     duty = base.duty if base is not None and file.duty is None else file.duty
     if duty is None:
         raise InputError(f"a profile must have [duty], got none ({place})")
-    nuisances = _in_place(() if base is None else base.nuisances, file.nuisance)
+    nuisances = _replace_nuisances(() if base is None else base.nuisances, file.nuisance)
     return Profile(head.name, head.title, duty, nuisances, place, file.family, head.seeds)

@@ -79,7 +79,7 @@ def _at_half_time(experiment: Experiment) -> str:
     if experiment.leaks:
         return "leak opened"
     end = np.array(experiment.duration)
-    factors = [f"{drift.parameter} x {1.0 + float(drift.shape.at(end)):.3f}" for drift in experiment.drifts]
+    factors = [f"{drift.parameter} x {1.0 + float(drift.shape.value_at(end)):.3f}" for drift in experiment.drifts]
     return ", ".join(factors) or "nothing"
 
 

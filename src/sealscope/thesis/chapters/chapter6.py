@@ -97,7 +97,7 @@ class ControlledRig:
         size, controller = conductance(self.lpm, rig), None
         if self.controller:
             known = self.controller == "ideal"
-            controller = FaultTolerant.of(rig, known=size) if known else controller_named(self.controller, rig)
+            controller = FaultTolerant.from_rig(rig, known=size) if known else controller_named(self.controller, rig)
         experiment = Experiment.of(
             rig=rig,
             set={**OFF, "F_l": LOAD, **dict(self.values)},
