@@ -17,7 +17,7 @@ import numpy as np
 from sealscope.diagnosis.learnt import Healthy, Learnt
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.formats.columns import counted, listed
-from sealscope.recordings.gaps import MOST_BRIDGED, bridge, filled
+from sealscope.recordings.gaps import MOST_BRIDGED, bridge, filled, remove_dropouts
 from sealscope.recordings.hydraulics import lack_of_chambers, no_readings
 from sealscope.recordings.motion import runs_of
 from sealscope.recordings.quality import SHORTEST, Finding, Severity, inspect, uniform_segments
@@ -73,7 +73,7 @@ def inspected(recording: Recording, channels: Iterable[str] | None = None) -> In
 def _inspection(recording: Recording, names: Sequence[str]) -> Inspection:
     findings = list(inspect(recording.only(names)))
     chambers = chambers_of(recording)
-    part = recording
+    part = remove_dropouts(recording)
     if "u" in part and not np.any(np.isfinite(part["u"])):  # `inspect` reports it; the pressures can do without
         part = part.only(name for name in part.channels if name != "u")
     needed = (*chambers, "u") if "u" in part else chambers

@@ -1,6 +1,7 @@
 """Gaps in a recording: short ones are bridged and marked, so that what lies on both sides of them can be analysed.
 
-A gap is a run of rows without a value of a needed channel, or rows that a logger has lost (its time stamps show them).
+A gap is a run of rows without a value of a needed channel, or rows that a logger has lost: its time stamps show them,
+or both chamber pressures are zero (`remove_dropouts`, which a running machine's samples pass as well).
 How it is bridged depends on its length: up to `SPLINE` samples by a cubic spline; where the duty repeats, by the
 channel's own values whole cycles before or after, shifted evenly so that both ends meet; up to `LINE_SECONDS` by a
 straight line. A longer gap stays. What is bridged is no reading: `Recording.bridged` marks it, and a detector leaves
@@ -37,6 +38,21 @@ _END = 8
 _UNLIKE = 0.4
 #: Samples by which the cycle's length may be off.
 _SLACK = 2
+
+
+def remove_dropouts(recording: Recording) -> Recording:
+    """Mark the samples of all channels as missing where both chamber pressures are exactly zero.
+
+    A converter that is off writes zeros; two transducers with noise never read them at once. Returns the recording
+    itself where there are none.
+    """
+    chambers = chambers_of(recording)
+    if len(chambers) < 2:
+        return recording
+    lost = np.logical_not(recording["p_A"]) & np.logical_not(recording["p_B"])
+    if not lost.any():
+        return recording
+    return replace(recording, channels={name: np.where(lost, np.nan, own) for name, own in recording.channels.items()})
 
 
 def bridge(recording: Recording, needed: Sequence[str]) -> Recording:

@@ -21,6 +21,7 @@ from sealscope.diagnosis.live.sequential import RECENT, StepDetector, StepEstima
 from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.errors import InputError
+from sealscope.recordings.gaps import remove_dropouts
 from sealscope.recordings.recording import Recording
 from sealscope.storage.plain_state import part_of, recall, restored, saved
 from sealscope.units import LITRE_PER_MINUTE
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 #: Format of the saved state.
-STATE_VERSION = 11
+STATE_VERSION = 12
 _PRIORS = priors("live")["watch"]
 #: Blocks of one mean that is compared with the baseline, and of the mean that is the leak after an alarm.
 GROUP, _OF_NOW = _PRIORS["group"], _PRIORS["recent"]
@@ -179,7 +180,7 @@ class Watch:
         """Yield what `update` returns, each estimate with the leak as of that block; to be gone through to the end."""
         if not follows:
             self._samples.restart("restart")
-        for run in self._samples.runs(samples):
+        for run in self._samples.runs(remove_dropouts(samples)):
             if self._estimator is None or self._estimator.method != self.method:  # a position came later
                 self._estimator = self._estimator_by()
             with np.errstate(all="ignore"):  # a block whose sums overflow says nothing

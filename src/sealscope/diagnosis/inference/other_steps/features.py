@@ -37,7 +37,10 @@ def duty_tests(recording: Recording) -> list[StepTest]:
     sizes = []
     for names in (COMMANDS, MOTIONS):
         if name := next((own for own in names if own in recording), None):
-            low, high = np.nanpercentile(_blocks(recording, length)[name], [2.0, 98.0], axis=1)
+            values = _blocks(recording, length)[name]
+            if np.isnan(values).all(axis=1).any():  # not known in all blocks
+                return []
+            low, high = np.nanpercentile(values, [2.0, 98.0], axis=1)
             sizes.append(np.log(high - low))
     tests = [_test(recording, own, length) for own in sizes]
     return [test for test in tests if test is not None] if None not in tests else []
@@ -48,7 +51,10 @@ def sensor_tests(recording: Recording) -> list[tuple[str, StepTest]]:
     if not {"p_A", "p_B"} <= recording.channels.keys():
         return []
     length = len(recording) // BLOCKS
-    features = _features(_blocks(recording, length), recording.rate)
+    blocks = _blocks(recording, length)
+    if np.isnan(blocks["p_A"]).all(axis=1).any():  # not known in all blocks
+        return []
+    features = _features(blocks, recording.rate)
     return [(name, test) for name, own in features if (test := _test(recording, own, length)) is not None]
 
 
