@@ -38,6 +38,8 @@ GROUP, _OF_NOW = _PRIORS["group"], _PRIORS["recent"]
 #: those whose mean is not whole yet, with what all conductances are off by.
 _LAST = np.dtype([(name, float) for name in ("end", "g", "sd", "flow", "pressure", "motion")])
 _GROUP = np.dtype([(name, float) for name in ("end", "g", "sd", "offset")])
+#: A block whose numbers are larger says nothing: their products would overflow.
+_LARGEST = 1e100
 #: What a watched leak and the evidence of it call alike.
 _FIGURES = ("score", "threshold", "onset_s", "onset_interval_s", "leak_lpm", "leak_interval_lpm")
 #: Ways of watching, each a stream of conductances.
@@ -235,6 +237,10 @@ class Watch:
 
     def _judge(self, own: Estimator, block: BlockConductance) -> BlockEstimate:
         """Test a block by all that came before, and return its estimate."""
+        numbers = (block.g, block.total, block.offset, block.flow, *block.duty)
+        if not (all(abs(number) < _LARGEST for number in numbers) and self._detector.resolves(block.g, block.sd)):
+            self._samples.count("blocks: beyond floating point")
+            return BlockEstimate(self.blocks, block.end, "beyond floating point")
         if self.baseline is not None and not within(block.duty, self.baseline.duty_low, self.baseline.duty_high):
             self._samples.count("blocks: another duty")
             return BlockEstimate(self.blocks, block.end, "another duty")
