@@ -11,7 +11,7 @@ from pathlib import Path
 
 from sealscope.diagnosis.commissioned.machine import JUDGEMENTS, JudgedAlarm
 from sealscope.diagnosis.commissioned.machine_file import LARGEST, load_machine, write_machine
-from sealscope.errors import SealscopeError
+from sealscope.errors import SealscopeError, printable
 from sealscope.monitor.alarms import Alarm
 from sealscope.recordings.formats.timebase import counts_from_1970
 from sealscope.recordings.joining import join
@@ -31,18 +31,19 @@ def pass_on(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording]) -> 
     path = Path(rig)
     if mark not in JUDGEMENTS or path.suffix.lower() != ".toml":
         return ""
+    name, reason = printable(alarm.id), printable(alarm.reason)  # one line each, where the file is shown
     try:
         if "machine" not in read_toml(path, "a machine's file", rig, LARGEST):
             return ""
         with _writing:
             shift = 0.0 if counts_from_1970(alarm.onset_s) else time.time() - alarm.updated_s
             leak = None if mark == "invalid" else alarm.leak_lpm
-            said = JudgedAlarm(alarm.id, mark, time.time(), alarm.onset_s + shift, leak, alarm.reason)
+            said = JudgedAlarm(name, mark, time.time(), alarm.onset_s + shift, leak, reason)
             machine, done = load_machine(path), "written down"
             machine = replace(machine, alarms=(*machine.alarms, said))
             if mark == "invalid":
                 try:
-                    machine = machine.with_healthy(_recording(samples, shift), file=alarm.id)
+                    machine = machine.with_healthy(_recording(samples, shift), file=name)
                     done = "taught as healthy"
                 except SealscopeError as error:
                     done = f"not taught: {error}"
