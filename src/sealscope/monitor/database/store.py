@@ -82,7 +82,7 @@ class StoredRows:
         """Add what an actuator shows."""
         import orjson
 
-        self.summaries[actuator] = {"actuator": actuator, "summary": orjson.dumps(summary).decode()}
+        self.summaries[actuator] = {"actuator": actuator, "summary": orjson.dumps(summary, option=orjson.OPT_SERIALIZE_NUMPY).decode()}
 
 
 class MonitorStore:

@@ -50,6 +50,8 @@ _LARGE, _ATTEMPTS = 256_000, 2
 _NAME = "mqtt"
 #: How long the decoder is waited for at the end [s].
 _END_S = 2.0
+#: How often events are looked for [s].
+_LOOK_S = 0.05
 #: How often the states of the actuators are looked at [s].
 _STATES_S = 2.0
 #: What messages are counted under that find no room.
@@ -104,7 +106,7 @@ class _Connection:
         alarms = self._service.supervisor.part("MQTT alarms")
         self._link.open(clean_start=False, properties=properties)
         try:
-            while not self._service.stopping.wait(0.2):
+            while not self._service.stopping.wait(_LOOK_S):
                 self._link.check()
                 alarms.attempt(self._pass_on)
             self._states_due = 0.0
