@@ -41,7 +41,7 @@ from sealscope.monitor.waiting import Waiting
 
 _log = logging.getLogger(__name__)
 #: How long the broker keeps the session [s], messages in flight at most, and the largest one [bytes].
-_SESSION_S, _IN_FLIGHT, _LARGEST = 30 * 86_400, 64, 16_000_000
+_SESSION_S, _IN_FLIGHT, _LARGEST = 30 * 86_400, 256, 16_000_000
 #: Messages that wait to be decoded and their bytes, at most, as one more of QoS 0 is taken in, and as one of QoS 1 is.
 _ROOM, _ROOM_BYTES = 256, 64_000_000
 _ASSURED_ROOM, _ASSURED_BYTES = 2048, 192_000_000
