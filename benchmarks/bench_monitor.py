@@ -8,7 +8,7 @@ to the database in a temporary folder with full synchronisation, restored from a
 threads are fed as fast as they take; with `--paced N` N actuators then send a message each second for a minute, and the
 time from the instant when a message is due to its being stored is what an alarm waits. They begin to send one after
 another within three seconds, as machines do that nobody started at one instant; with `--in-phase` all begin together,
-and every third second or so all blocks of the detectors are complete at once. Where mosquitto is installed, JSON comes from
+and every third second or so all blocks of the detectors are complete at once. Where mosquitto is installed, JSON comes
 from a broker as well, which holds all messages at first, and alarms go out by it. The load of the machine is printed
 beside the times.
 """
