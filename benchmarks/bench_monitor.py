@@ -8,8 +8,9 @@ to the database in a temporary folder with full synchronisation, restored from a
 threads are fed as fast as they take; with `--paced N` N actuators then send a message each second for a minute, and the
 time from the instant when a message is due to its being stored is what an alarm waits. They begin to send one after
 another within three seconds, as machines do that nobody started at one instant; with `--in-phase` all begin together,
-and every third second or so all blocks of the detectors are complete at once. The load of the machine is printed beside
-the times.
+and every third second or so all blocks of the detectors are complete at once. Where mosquitto is installed, JSON comes
+from a broker as well, which holds all messages at first, and alarms go out by it. The load of the machine is printed
+beside the times.
 """
 
 from __future__ import annotations
@@ -18,14 +19,18 @@ import argparse
 import io
 import json
 import os
+import sys
 import tempfile
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
 
 import cbor2
 import numpy as np
-from sqlalchemy import select
+from paho.mqtt.client import Client
+from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
+from sqlalchemy import func, select
 
 import sealscope as ss
 from sealscope.monitor.actuators import WatchedActuators
@@ -33,6 +38,9 @@ from sealscope.monitor.database.store import MonitorStore
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import ActuatorSettings, MonitorSettings
 from sealscope.monitor.sources.source_block import decoded
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from tests.monitor.servers import MOSQUITTO, Broker
 
 CHANNELS = {"volumes": ("p_A", "p_B", "x", "theta"), "pressures": ("p_A", "p_B", "u")}
 LEARN_H = 100.0 / 3600.0
@@ -84,6 +92,14 @@ def main() -> None:
             end="; ",
         )
         print(f"{1.0 / spent:.0f} actuators a core; as fast as it takes {1.0 / took:.0f} messages/s", flush=True)
+    if MOSQUITTO is not None and chosen.by == "volumes":
+        whole = ss.simulate(command="3 sin(4t)", duration=chosen.seconds, seed=0, leak="0.05 L/min from 282 s")
+        leaking = whole.only(CHANNELS["volumes"])
+        parts = [leaking.samples(slice(k, k + 500)) for k in range(0, len(leaking), 500)]
+        texts, leaks = ([forms["JSON"](message(part)) for part in of] for of in (messages, parts))
+        rate, waits = by_mqtt(texts, leaks, chosen.actuators)
+        shown = ", ".join(f"{1e3 * wait:.0f}" for wait in waits)
+        print(f"service, JSON over MQTT: {rate:.0f} messages/s; publication to alarm {shown} ms", flush=True)
     if chosen.paced:
         phases = 1 if chosen.in_phase else PHASES
         spent, _, waits = served(payloads, chosen.paced, PACED_S, LEARNED[chosen.by], phases)
@@ -94,6 +110,64 @@ def main() -> None:
         )
         print(f"p99 {1e3 * rare:.0f} ms, most {max(waits):.2f} s; resident {resident() / 1e6:.0f} MB", end="; ")
         print(f"load of the machine {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+
+
+def by_mqtt(payloads: list[bytes], leaking: list[bytes], count: int) -> tuple[float, list[float]]:
+    """Return messages a second from a broker that holds them, and times from publication to the alarm [s].
+
+    `leaking`: messages of a machine that begins to leak; one is published each half second, to one actuator after the
+    other, and the alarm that is heard belongs to the last one. The broker is mosquitto.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        broker, names = Broker(Path(folder)), [f"press {k}" for k in range(count)]
+        learned = LEARNED["volumes"]
+        values = {
+            "database": str(Path(folder) / "monitor.db"),
+            "defaults": {"learn_hours": LEARN_H},
+            "mqtt": {"host": "127.0.0.1", "port": broker.port},
+            "actuator": [{"name": name, "topic": f"plant/{name}"} for name in names],
+        }
+        settings = MonitorSettings.model_validate(values)
+        learn(settings, payloads, learned, 1)
+        broker.open_session("sealscope-monitor", [f"plant/{name}" for name in names])
+        client = Client(CallbackAPIVersion.VERSION2, "plant", protocol=MQTTProtocolVersion.MQTTv5)
+        client.max_inflight_messages_set(1000)
+        heard, alarm = threading.Event(), threading.Event()
+        client.on_message = lambda *_: alarm.set()
+        client.on_subscribe = lambda *_: heard.set()
+        client.connect("127.0.0.1", broker.port)
+        client.subscribe("sealscope/+/alarm", qos=1)
+        client.loop_start()
+        heard.wait(60.0)
+        rest = payloads[learned : learned + 100]
+        for payload in rest:
+            last = [client.publish(f"plant/{name}", payload, qos=1) for name in names]
+        for each in last:
+            each.wait_for_publish(60.0)
+        service = Service(settings, stdout=io.StringIO())
+        thread = threading.Thread(target=service.run)
+        stored = select(func.count()).select_from(service.store.tables.blocks)
+        thread.start()
+        while not (before := service.store._value(stored)):
+            time.sleep(0.01)
+        began = time.perf_counter()
+        while (after := service.store._value(stored)) < len(rest) * count:
+            time.sleep(0.01)
+        rate, waits = (after - before) / (time.perf_counter() - began), list[float]()
+        for name in names[: min(count, 5)]:
+            alarm.clear()
+            for payload in leaking[learned + 100 :]:
+                published = time.perf_counter()
+                client.publish(f"plant/{name}", payload, qos=1)
+                if alarm.wait(0.5):
+                    waits.append(time.perf_counter() - published)
+                    break
+        service.stop()
+        thread.join()
+        service.store.engine.dispose()
+        client.loop_stop()
+        broker.stop()
+    return rate, waits
 
 
 def message(samples: ss.Recording) -> dict[str, object]:

@@ -49,6 +49,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from tests.diagnosis.balance_machine import machine, step
 from tests.monitor.plant import CHANNELS, message
 from tests.monitor.servers import Broker, free_port
+from tests.monitor.test_dropouts import dropped
+from tests.monitor.test_message_limits import HOSTILE as CBOR
+from tests.monitor.test_message_limits import colliding
 from tests.recordings.test_packed_files import rows, workbook
 
 RATE, BLOCK_S, ROUND_S, TOKEN = 50.0, 10.0, 60.0, "the page's token"
@@ -220,12 +223,13 @@ class Monitor:
 
 
 def plant(count: int, seconds: float, seed: int) -> tuple[list[str], list[Recording]]:
-    """Return names and recordings of actuators; every third begins to leak at some time."""
+    """Return names and recordings of actuators: one of three begins to leak, another gives zeros for 15 s."""
     names = [f"line {k // 10}/press {k}" for k in range(count)]
     chance, made = random.Random(seed), []
     for k in range(min(count, 4 * LEAKS)):
         leak = step(0.0, 3.0e-13, at=chance.uniform(0.2, 0.7) * seconds) if k % LEAKS == 1 else 0.0
-        made.append(machine(seed + k, G=leak, duration=seconds, rate=RATE).only(CHANNELS))
+        whole = machine(seed + k, G=leak, duration=seconds, rate=RATE).only(CHANNELS)
+        made.append(dropped(whole, 0.6 * seconds, 15.0) if k % LEAKS == 2 else whole)
     return names, [made[k % len(made)] for k in range(count)]
 
 
@@ -273,6 +277,32 @@ class Attacks:
             self.a_topic(),
             [b"", b"\x81" * 50_000, self.chance.randbytes(500), b'{"t": 0, "rate": 50, "x": [1e999]}'][kind],
         )
+
+    def hostile_cbor(self) -> None:
+        """Big numbers of one hash as keys, patterns, mail, depth, and lengths that are not there."""
+        self.publish(self.a_topic(), self.chance.choice([*CBOR.values(), colliding(100_000)]))
+
+    def twice_the_key(self) -> None:
+        keys = b", ".join(
+            self.chance.choice([b'"t": 1', b'"x": [1, 2]', b'"units": {"x": "m", "x": "mm"}']) for _ in "abc"
+        )
+        self.publish(self.a_topic(), b'{"t": 0, "rate": 50, "x": [' + b"9" * 5000 + b"], " + keys + b"}")
+
+    def forwarded_guesses(self) -> None:
+        """Guess the token, each time for another address; five are looked at."""
+        looked_at = 0
+        for k in range(20):
+            request = urllib.request.Request(f"http://127.0.0.1:{self.monitor.page}/metrics")
+            request.add_header("Authorization", f"Bearer guess {k}")
+            request.add_header("X-Forwarded-For", f"10.0.{self.chance.randrange(256)}.{k}")
+            try:
+                urllib.request.urlopen(request, timeout=10.0).close()
+            except urllib.error.HTTPError as error:
+                looked_at += error.code == 401
+            except OSError:
+                pass  # it is being killed, or its connections are held
+        if looked_at > 6:  # a pause may end meanwhile
+            self.deaf.append(f"{looked_at} guesses were looked at")
 
     def death_with_an_array(self) -> None:
         birth = (SparkplugMetric(BIRTH_SEQUENCE, 3, INT64), SparkplugMetric("p_A", 1.0, DOUBLE))
@@ -391,11 +421,13 @@ class Attacks:
 #: Those that cost the monitor a start are played more seldom.
 ATTACKS: tuple[tuple[str, Callable[[Attacks], None]], ...] = (
     *(3 * (("deep JSON", Attacks.deep_json), ("odd message", Attacks.odd_message))),
+    *(3 * (("hostile CBOR", Attacks.hostile_cbor), ("a key twice", Attacks.twice_the_key))),
     *(3 * (("NDEATH with an array", Attacks.death_with_an_array), ("webhook misbehaves", Attacks.hook_misbehaves))),
     *(3 * (("Latin-1 name", Attacks.latin_name), ("damaged file", Attacks.damaged_file))),
     *(3 * (("foreign link", Attacks.foreign_link), ("file of the future", Attacks.future_file))),
     *(3 * (("odd requests", Attacks.odd_requests), ("removed folder", Attacks.removed_folder))),
     *(2 * (("230 listeners", Attacks.many_listeners), ("600 silent connections", Attacks.silent_connections))),
+    ("forwarded guesses", Attacks.forwarded_guesses),
     ("corner workbook", Attacks.corner_workbook),
     ("bomb", Attacks.bomb),
     ("killed", Attacks.killed),

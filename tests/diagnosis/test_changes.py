@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sealscope.diagnosis.inference.other_steps.step import other_step
 
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.inference.changes.levels import level_tests, levels
-from sealscope.diagnosis.inference.other_steps.step import other_step
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.simulate import simulate
 

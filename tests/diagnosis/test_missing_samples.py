@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sealscope.diagnosis.inference.decision.recorded import RecordedBalance
 
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.inference.decision.recorded import RecordedBalance
 from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.inspection import inspected
 from sealscope.parameters import load_rig

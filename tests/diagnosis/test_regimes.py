@@ -6,9 +6,9 @@ from functools import cache
 
 import numpy as np
 import pytest
+from sealscope.diagnosis.inference.decision.recorded import RecordedBalance
 
 from sealscope.diagnosis.inference.balance import recorded_blocks
-from sealscope.diagnosis.inference.decision.recorded import RecordedBalance
 from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.inference.terms import find_rests
 from sealscope.parameters import load_rig

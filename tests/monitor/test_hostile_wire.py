@@ -5,13 +5,19 @@ from __future__ import annotations
 import json
 import tracemalloc
 import warnings
+from dataclasses import replace
 
 import cbor2
 import numpy as np
+import orjson
 import pytest
 
 import sealscope as ss
+from sealscope.diagnosis.live.balance import BlockConductance
 from sealscope.errors import InputError
+from sealscope.monitor.actuators import _Actuator
+from sealscope.monitor.alarms import AlarmJudge
+from sealscope.monitor.settings import ActuatorSettings
 from sealscope.monitor.sources.source_block import SourceBlock, decoded
 from sealscope.recordings.recording import Recording
 
@@ -120,6 +126,39 @@ def test_mutated_messages_are_blocks_or_refused(count: int):
     tracemalloc.stop()
     assert min(outcomes.values()) > count // 100
     assert after - before < 2_000_000
+
+
+@pytest.mark.parametrize("wrong", [{"sd": 1e200}, {"g": 1e200}, {"sd": 1e-200}, {"flow": 1e308}, {"total": np.nan}])
+def test_a_block_beyond_floating_point_says_nothing(wrong: dict[str, float]):
+    """The squares of such a block's numbers, in units of the first one, raised an OverflowError, or stayed as nan."""
+    watch = ss.watch("thesis", learn_hours=0.02)
+    watch.update(machine(1, duration=120.0, rate=50.0))
+    block = BlockConductance(120.0, 123.0, 3e-13, 1e-15, 3e-13, 1e-15, 1e9, (11.0, -11.0))
+    before = json.dumps(watch._detector.state())
+    estimate = watch.judged([replace(block, **wrong)])
+    assert (estimate.status, watch.counters["blocks: beyond floating point"]) == ("beyond floating point", 1)
+    assert json.dumps(watch._detector.state(), allow_nan=False) == before
+    assert watch.judged([block]).status in ("watched", "another duty")
+
+
+@pytest.mark.parametrize("factor", [0.0, 1e-308, 1e150, 1e200, 1e300])
+@pytest.mark.parametrize("names", [("p_A", "p_B", "x", "theta"), ("p_A", "p_B", "u")], ids=["volumes", "pressures"])
+def test_what_is_shown_of_any_samples_can_be_stored(factor: float, names: tuple[str, ...]):
+    """A pressure difference of zero was a number of numpy in the summary; a sense of nan stood in the state."""
+    whole = machine(1, duration=80.0, rate=200.0).only(names)
+    with np.errstate(all="ignore"):
+        p_B = whole["p_A"] if factor == 0.0 else whole["p_B"] * factor
+        p_A = whole["p_A"] if factor == 0.0 else whole["p_A"] * factor
+    odd = replace(whole, channels={**whole.channels, "p_A": p_A, "p_B": p_B})
+    for first, then in ((whole, odd), (odd, odd), (odd, whole)):
+        settings = ActuatorSettings(name="press 1", learn_hours=0.01)
+        actuator = _Actuator(settings, ss.watch("thesis", learn_hours=0.01), AlarmJudge("press 1"))
+        for start, part in ((0.0, first), (40.0, then)):
+            estimates, _ = actuator.judged(part.between(start, start + 40.0), True, settings)
+            for own in estimates:
+                orjson.dumps(vars(own))
+        orjson.dumps(actuator.summary())
+        json.dumps(actuator.state(), allow_nan=False)
 
 
 def test_no_samples_raise_or_warn():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,7 +12,9 @@ import pytest
 import sealscope as ss
 from sealscope.errors import InputError
 from sealscope.monitor.actuators import WatchedActuators
+from sealscope.monitor.database.machine_files import pass_on
 from sealscope.monitor.service import Service
+from sealscope.monitor.supervisor import LimitedLines
 
 from ..diagnosis.balance_machine import machine, step
 from .plant import lines_of, served, settings_in
@@ -135,3 +138,20 @@ def test_without_samples_or_a_file_it_says_so(tmp_path, commissioned):
     assert said_by(service.actuators).startswith(
         "press.toml: not written: machine.format must be 2, got 1: commission it anew"
     )
+
+
+def test_a_newline_in_the_name_of_an_alarm_makes_no_line(tmp_path, commissioned):
+    service = alarmed(tmp_path, commissioned[3.0e-13])
+    alarm = service.actuators._actuator(NAME).judge.alarm
+    lines = str(ss.load_machine(tmp_path / "press.toml")).splitlines()
+    forged = replace(alarm, id="press\n  alarm         valve-1 valid", reason="a\nb\x1b[31m\u2028c")
+    assert pass_on(str(tmp_path / "press.toml"), forged, "valid", []) == "press.toml: written down"
+    shown = str(ss.load_machine(tmp_path / "press.toml")).splitlines()
+    assert len(shown) == len(lines) + 1
+    assert all(line.isprintable() for line in shown)
+
+
+def test_a_newline_in_a_name_makes_no_line_of_the_log():
+    record = logging.LogRecord("sealscope", logging.WARNING, __file__, 1, "%s: begins anew", ("press\nforged",), None)
+    assert LimitedLines().filter(record)
+    assert record.getMessage() == "press\N{REPLACEMENT CHARACTER}forged: begins anew"

@@ -17,7 +17,7 @@ import numpy as np
 from sealscope.diagnosis.learnt import Healthy, Learnt
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.corrections.clock import even_clock
-from sealscope.recordings.corrections.gaps import bridge, filled, remove_impossible
+from sealscope.recordings.corrections.gaps import bridge, filled, remove_dropouts, remove_impossible
 from sealscope.recordings.corrections.spikes import without_spikes
 from sealscope.recordings.corrections.stale import without_stale_samples
 from sealscope.recordings.corrections.unsigned import with_signed_speed
@@ -77,7 +77,7 @@ def inspected(recording: Recording, channels: Iterable[str] | None = None) -> In
 def _inspection(recording: Recording, names: Sequence[str]) -> Inspection:
     findings = list(inspect(recording.only(names)))
     chambers = chambers_of(recording)
-    part = remove_impossible(recording)
+    part = remove_dropouts(remove_impossible(recording))
     known = [name for name in part.channels if name in chambers or np.any(np.isfinite(part[name]))]
     if len(known) < len(part.channels):  # `inspect` reports a channel without values; the others can do without
         part = part.only(known)

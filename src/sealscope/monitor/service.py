@@ -36,7 +36,7 @@ _log = logging.getLogger(__name__)
 #: Blocks that wait to be stored and their bytes, at most; a source that waits longer [s] is a line in the log.
 _WAITING, _WAITING_BYTES, _LONG_WAIT_S = 512, 256_000_000, 5.0
 #: How often outputs look for events [s], and how long what is under way at the end is waited for, all together.
-_LOOK_S, _END_S = 0.2, 2.5
+_LOOK_S, _END_S = 0.05, 2.5
 #: Blocks that are stored in one transaction, at most, and how long the first one waits for others [s].
 _TOGETHER, _GATHER_S = 256, 0.02
 #: Lines in the log about the same trouble before only each power of two gets one.

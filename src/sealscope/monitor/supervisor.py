@@ -16,6 +16,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from sealscope.errors import printable
+
 _log = logging.getLogger(__name__)
 #: Parts that can be away.
 DATABASE, BROKER, WEBHOOK, OPCUA = "database", "broker", "webhook", "OPC UA server"
@@ -173,7 +175,10 @@ class Supervisor:
 
 
 class LimitedLines(logging.Filter):
-    """Lets through so many lines a minute from one place in the code, and says how many it has left out."""
+    """Lets through so many lines a minute from one place in the code, and says how many it has left out.
+
+    Each message becomes one line that can be printed: names come from outside.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -191,6 +196,8 @@ class LimitedLines(logging.Filter):
         if len(self._places) >= _MOST_PLACES and place not in self._places:
             self._places.clear()
         self._places[place] = began, count + 1
+        if not (text := record.getMessage()).isprintable():
+            record.msg, record.args = printable(text), None
         return count < most
 
 

@@ -6,7 +6,8 @@ is a rail, a held value or a dead channel.
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,23 +35,43 @@ def moves(values: Array) -> bool:
     return values.size > 1 and bool(np.isfinite(values).all()) and not constant(values)
 
 
+class Holds(NamedTuple):
+    """Which samples of a pressure are held, and from which sample on its end leaves that open."""
+
+    flags: NDArray[np.bool_]
+    open: int
+
+
+def find_holds(values: Array, rate: float, before: float = math.nan) -> Holds:
+    """Find the samples (n,) of a pressure that stay the same to the last digit for longer than its noise allows.
+
+    That is longer than 1.5 s, and 64 samples; the first of them is a reading. `before`: value that was held up to the
+    first sample, NaN for none.
+    """
+    longest = max(round(_HOLD["seconds"] * rate), _HOLD["samples"])
+    ends = np.concatenate([[0], np.flatnonzero(values[1:] != values[:-1]) + 1, [len(values)]])
+    lengths = np.diff(ends)
+    held = lengths > longest
+    goes_on = bool(len(values)) and bool(values[0] == before)
+    held[0] |= goes_on
+    flags = np.repeat(held, lengths)
+    flags[ends[:-1][held][goes_on:]] = False
+    return Holds(flags, len(values) if held[-1] else min(int(ends[-2]) + 1, len(values)))
+
+
 def does_not_move(recording: Recording) -> str | None:
     """Say which chamber pressure of a recording without missing samples stays constant, and when; None for none.
 
-    A pressure is constant where it stays the same to the last digit for longer than 1.5 s (and 64 samples), or where it
-    is a straight line to within `ROUNDING` throughout. A recording too short to tell and a constant channel, which
-    `inspect` reports, give None.
+    A pressure is constant where it is held (`find_holds`), or where it is a straight line to within `ROUNDING`
+    throughout. A recording too short to tell and a constant channel, which `inspect` reports, give None.
     """
-    longest = max(round(_HOLD["seconds"] * recording.rate), _HOLD["samples"])
     for name in chambers_of(recording):
         values = recording[name]
-        if len(values) <= longest or constant(values):
+        if len(values) <= _HOLD["samples"] or constant(values):
             continue
-        ends = np.concatenate([[-1], np.flatnonzero(np.diff(values)), [len(values) - 1]])
-        holds = np.diff(ends)
-        first = int(np.argmax(holds))
-        if holds[first] > longest:
-            start, stop = (float(recording.t[k]) for k in (ends[first] + 1, ends[first + 1]))
+        if len(holds := runs_of(find_holds(values, recording.rate).flags)):
+            first, length = holds[np.argmax(holds[:, 1])]
+            start, stop = (float(recording.t[k]) for k in (first - 1, first + length - 1))
             return f"{name} does not move from {start:.4g} s to {stop:.4g} s"
         if np.abs(np.diff(values, 2)).max() <= ROUNDING * np.abs(values).max():
             return f"{name} does not move but along a straight line"

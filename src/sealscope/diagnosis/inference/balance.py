@@ -265,7 +265,7 @@ def _leaks(gram: Array, columns: Columns, count: int) -> float:
     along, lead, square = float(rest[0, 0]), float(rest[0, 1]), float(rest[1, 1])
     if not along > RIDGE * float(gram[columns.leak, columns.leak]) or count <= len(others) + 1:
         return 0.0
-    variance = OVERLAP * max(square - lead**2 / along, 0.0) / (count - len(others) - 1)
+    variance = OVERLAP * max(square - lead * lead / along, 0.0) / (count - len(others) - 1)
     return lead / max(float(np.sqrt(variance * along)), np.finfo(float).tiny)
 
 

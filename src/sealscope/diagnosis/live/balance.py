@@ -20,7 +20,7 @@ from sealscope.diagnosis.inference.blocks import Blocks, Columns
 from sealscope.diagnosis.inference.terms import Equation, equations
 from sealscope.diagnosis.inference.weak_form import stride_samples
 from sealscope.diagnosis.live.joining import SampleRun
-from sealscope.diagnosis.live.known import STANDSTILL, Known, add, begin, known_shapes, motion, says, take
+from sealscope.diagnosis.live.known import STANDSTILL, TINY, Known, add, begin, known_shapes, motion, says, take
 from sealscope.diagnosis.priors import priors
 from sealscope.errors import InputError
 from sealscope.storage.plain_state import array_of, part_of, recall, saved
@@ -188,7 +188,7 @@ class LiveBalance:
             return NotJudged(end, "at standstill", "blocks: at standstill")
         total = lead / precision
         offset = math.hypot(math.sqrt(leaning) / precision, self.size_error * lead / precision)
-        pressure, rate = (max(float(of[0]), np.finfo(float).tiny) for of in (block.driving(), block.flow))
+        pressure, rate = (max(float(of[0]), TINY) for of in (block.driving(), block.flow))
         duty = math.log(pressure), math.log(rate)
         g, sd = total - shift / precision, precision**-0.5
         return BlockConductance(begin, end, g, sd, total, offset, pressure / LITRE_PER_MINUTE, duty)

@@ -20,7 +20,7 @@ from sealscope.diagnosis.live.balance import BlockConductance, NotJudged, Shown
 from sealscope.diagnosis.live.joining import SampleRun
 from sealscope.diagnosis.priors import priors
 from sealscope.errors import InputError
-from sealscope.recordings.motion import moves
+from sealscope.recordings.motion import does_not_move, find_holds, moves
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
 from sealscope.storage.plain_state import part_of, recall, saved
 from sealscope.units import LITRE_PER_MINUTE
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 _PRIORS = priors("live")["response"]
 _SETTLING, _RESUMING, _PAUSE = _PRIORS["settling"], _PRIORS["resuming"], priors("live")["watch"]["pause"]
 _SLOWEST, _READ = PRIORS["blocks"]["slowest"], ("p_A", "p_B", "u")
+#: Rows of what is kept that are pressures, after the times.
+_PRESSURES = (1, 2)
 
 
 class PressureEstimator:
@@ -53,6 +55,7 @@ class PressureEstimator:
         self.litres = states_flow(rig) if litres is None else litres
         self._kept = np.empty((1 + len(_READ), 0))  # times and channels since the last whole block
         self._follower: Follower | None = None
+        self._held = np.full(len(_PRESSURES), math.nan)  # values that the pressures hold since the last block
         self._end = math.nan  # of the last block that was followed [s]
         self._settling, self._lost = _SETTLING, 0
 
@@ -64,17 +67,25 @@ class PressureEstimator:
     def take(self, run: SampleRun) -> list[Shown]:
         """Take the next samples; return what each block shows that they complete."""
         before = self._kept if run.follows else self._kept[:, :0]
+        if not run.follows:
+            self._held[:] = math.nan
         kept = np.hstack([before, [run.t, *(run.channels[name] for name in _READ)]])
         first, length = (round(seconds * run.rate) for seconds in (_PRIORS["begins"], self.block_seconds))
         shown: list[Shown] = []
         while self._follower is None and run.rate >= _SLOWEST and kept.shape[1] >= first:
             beginning = _recording(kept[:, :first], run.rate)
-            if reason := unusable(beginning, self._rig):
+            if reason := unusable(beginning, self._rig) or does_not_move(beginning):
                 kept = kept[:, first // 2 :]
                 shown.append(NotJudged(float(run.t[-1]), "", f"half minutes before the first block: {reason}"))
             else:
                 self._follower = Follower.begun(beginning, self._rig)
         while (self._follower is not None or run.rate < _SLOWEST) and kept.shape[1] >= length:
+            holds = [find_holds(kept[k], run.rate, self._held[k - 1]) for k in _PRESSURES]
+            if min(hold.open for hold in holds) < length:  # a hold may go on
+                break
+            for k, hold in zip(_PRESSURES, holds, strict=True):
+                self._held[k - 1] = kept[k, length - 1] if hold.flags[length - 1] else math.nan
+                kept[k, :length][hold.flags[:length]] = math.nan
             block, kept = _recording(kept[:, :length], run.rate), kept[:, length:]
             shown.append(self._shown(block))
         self._kept = kept.copy()
@@ -159,7 +170,7 @@ class PressureEstimator:
         recall(self._follower, _FOLLOWED, known)
 
 
-_SAVED = ("litres", "_kept", "_end", "_settling", "_lost")
+_SAVED = ("litres", "_kept", "_held", "_end", "_settling", "_lost")
 _FOLLOWED = ("theta", "covariance", "states", "variance", "last")
 
 

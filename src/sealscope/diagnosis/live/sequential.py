@@ -42,6 +42,10 @@ PARTS = np.array(_PRIORS["parts"])
 JUMP, MEMORY = priors("live")["coefficients"]["jump"], _PRIORS["memory"]
 #: Onsets are all kept for `RECENT` blocks, then `RECENT / 4` of every doubling of age, up to `HORIZON` blocks.
 RECENT, HORIZON = _PRIORS["recent"], _PRIORS["horizon"]
+#: A block's numbers lie within so many units of the first one, or say nothing.
+_FARTHEST = 1e60
+#: Least square of an innovation over its variance: samples that repeat leave none, and a noise of zero no logarithm.
+_LEAST_SQUARE = 1e-12
 #: What is kept of each onset and walk, and of each onset.
 _FIELDS = ("answer", "along", "square", "total", "lead")
 _PLACES = ("number", "born", "onset", "begin")
@@ -79,6 +83,11 @@ class StepDetector:
         self._onsets = np.zeros((len(_FIELDS), len(WALKS), 0))
         self._places = np.zeros((0, len(_PLACES)))
 
+    def resolves(self, g: float, deviation: float) -> bool:
+        """Return whether a block's numbers, in the unit of the first one, have squares that floats hold."""
+        unit = self._unit or deviation
+        return unit > 0.0 and abs(g) < _FARTHEST * unit and unit / _FARTHEST < deviation < _FARTHEST * unit
+
     def take(self, begin: float, end: float, g: float, deviation: float) -> None:
         """Take a block from `begin` to `end` [s]: its estimate and the deviation of this."""
         self._unit = self._unit or deviation
@@ -101,6 +110,7 @@ class StepDetector:
 
     def _learn(self, sigma: Array, own: Array) -> None:
         """Learn noise and walk from an innovation of square `own` over `sigma`."""
+        own = np.maximum(own, _LEAST_SQUARE)
         if self._known >= 4:
             own = np.minimum(own, JUMP**2 * self._total / self._known)
             weight = MEMORY * self._weight - 0.5 * np.log(sigma * self._total)

@@ -23,6 +23,7 @@ from sealscope.diagnosis.live.sequential import RECENT, StepDetector, StepEstima
 from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.evidence import NO_LEAK, Evidence
 from sealscope.errors import InputError
+from sealscope.recordings.corrections.gaps import remove_dropouts
 from sealscope.recordings.formats.timebase import clock_text
 from sealscope.recordings.recording import Recording
 from sealscope.storage.plain_state import part_of, recall, restored, saved
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 #: Format of the saved state.
-STATE_VERSION = 11
+STATE_VERSION = 12
 _PRIORS = priors("live")["watch"]
 #: Blocks of one mean that is compared with the baseline, and of the mean that is the leak after an alarm.
 GROUP, _OF_NOW = _PRIORS["group"], _PRIORS["recent"]
@@ -40,6 +41,8 @@ GROUP, _OF_NOW = _PRIORS["group"], _PRIORS["recent"]
 #: those whose mean is not whole yet, with what all conductances are off by.
 _LAST = np.dtype([(name, float) for name in ("end", "g", "sd", "flow", "pressure", "motion")])
 _GROUP = np.dtype([(name, float) for name in ("end", "g", "sd", "offset")])
+#: A block whose numbers are larger says nothing: their products would overflow.
+_LARGEST = 1e100
 #: What a watched leak and the evidence of it call alike.
 _FIGURES = ("score", "threshold", "onset_s", "onset_interval_s", "leak_lpm", "leak_interval_lpm")
 #: Ways of watching, each a stream of conductances.
@@ -182,7 +185,7 @@ class Watch:
         """Yield what `update` returns, each estimate with the leak as of that block; to be gone through to the end."""
         if not follows:
             self._samples.restart("restart")
-        for run in self._samples.runs(samples):
+        for run in self._samples.runs(remove_dropouts(samples)):
             if self._estimator is None or self._estimator.method != self.method:  # a position came later
                 self._estimator = self._estimator_by()
             with np.errstate(all="ignore"):  # a block whose sums overflow says nothing
@@ -237,6 +240,10 @@ class Watch:
 
     def _judge(self, own: Estimator, block: BlockConductance) -> BlockEstimate:
         """Test a block by all that came before, and return its estimate."""
+        numbers = (block.g, block.total, block.offset, block.flow, *block.duty)
+        if not (all(abs(number) < _LARGEST for number in numbers) and self._detector.resolves(block.g, block.sd)):
+            self._samples.count("blocks: beyond floating point")
+            return BlockEstimate(self.blocks, block.end, "beyond floating point")
         if self.baseline is not None and not within(block.duty, self.baseline.duty_low, self.baseline.duty_high):
             self._samples.count("blocks: another duty")
             return BlockEstimate(self.blocks, block.end, "another duty")

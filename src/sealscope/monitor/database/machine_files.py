@@ -10,7 +10,7 @@ from pathlib import Path
 
 from sealscope.diagnosis.commissioned.machine import JUDGEMENTS, CommissionedMachine, JudgedAlarm
 from sealscope.diagnosis.commissioned.machine_file import update_machine
-from sealscope.errors import SealscopeError
+from sealscope.errors import SealscopeError, printable
 from sealscope.monitor.alarms import Alarm
 from sealscope.recordings.formats.timebase import counts_from_1970
 from sealscope.recordings.joining import join
@@ -28,12 +28,13 @@ def pass_on(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording]) -> 
     path = Path(rig)
     if mark not in JUDGEMENTS or path.suffix.lower() != ".toml":
         return ""
+    name, reason = printable(alarm.id), printable(alarm.reason)  # one line each, where the file is shown
     try:
         if "machine" not in read_toml(path, "a machine's file", rig):
             return ""
         shift = 0.0 if counts_from_1970(alarm.onset_s) else time.time() - alarm.updated_s
         leak = None if mark == "invalid" else alarm.leak_lpm
-        judged = JudgedAlarm(alarm.id, mark, time.time(), alarm.onset_s + shift, leak, alarm.reason)
+        judged = JudgedAlarm(name, mark, time.time(), alarm.onset_s + shift, leak, reason)
         done = "written down"
 
         def add_mark(machine: CommissionedMachine) -> CommissionedMachine:
@@ -41,7 +42,7 @@ def pass_on(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording]) -> 
             machine = replace(machine, alarms=(*machine.alarms, judged))
             if mark == "invalid":
                 try:
-                    machine = machine.with_healthy(_recording(samples, shift), file=alarm.id)
+                    machine = machine.with_healthy(_recording(samples, shift), file=name)
                     done = "taught as healthy"
                 except SealscopeError as error:
                     done = f"not taught: {error}"

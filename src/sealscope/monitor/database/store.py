@@ -82,7 +82,10 @@ class StoredRows:
         """Add what an actuator shows."""
         import orjson
 
-        self.summaries[actuator] = {"actuator": actuator, "summary": orjson.dumps(summary).decode()}
+        self.summaries[actuator] = {
+            "actuator": actuator,
+            "summary": orjson.dumps(summary, option=orjson.OPT_SERIALIZE_NUMPY).decode(),
+        }
 
 
 class MonitorStore:
@@ -127,6 +130,24 @@ class MonitorStore:
         """Return a connection whose changes are kept together when the block ends well."""
         with self._writing_lock, self.engine.begin() as connection:
             yield connection
+
+    @contextmanager
+    def _noting(self) -> Iterator[sa.Connection]:
+        """Return a connection for changes that the death of this process leaves, a loss of power perhaps not."""
+        is_file = self.engine.dialect.name == "sqlite"
+        with self._writing_lock, self.engine.connect() as connection:
+            if is_file:
+                connection.exec_driver_sql("PRAGMA synchronous=NORMAL")
+                connection.commit()
+            try:
+                with connection.begin():
+                    if self.engine.dialect.name == "postgresql":
+                        connection.execute(sa.text("set local synchronous_commit to off"))
+                    yield connection
+            finally:
+                if is_file:
+                    connection.exec_driver_sql("PRAGMA synchronous=FULL")
+                    connection.commit()
 
     def _rows(self, query: Any) -> Sequence[sa.Row[Any]]:
         with self.engine.connect() as connection:
@@ -217,7 +238,7 @@ class MonitorStore:
         """Note that a reader begins to decode a message; return how often it began before and did not end."""
         table, of = tables.decodings, tables.decodings.c
         before = select(of.attempts).where(of.reader == reader, of.digest == digest)
-        with self.writing() as connection:
+        with self._noting() as connection:
             attempts = int(connection.execute(before).scalar() or 0)
             self.put(connection, table, [{"reader": reader, "digest": digest, "attempts": attempts + 1}])
         return attempts
@@ -225,7 +246,7 @@ class MonitorStore:
     def end_decoding(self, reader: str, digest: str) -> None:
         """Forget that a reader began to decode a message."""
         of = tables.decodings.c
-        with self.writing() as connection:
+        with self._noting() as connection:
             connection.execute(tables.decodings.delete().where(of.reader == reader, of.digest == digest))
 
     def last_number(self, table: sa.Table, actuator: str) -> int:

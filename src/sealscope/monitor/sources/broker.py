@@ -41,7 +41,7 @@ from sealscope.monitor.waiting import Waiting
 
 _log = logging.getLogger(__name__)
 #: How long the broker keeps the session [s], messages in flight at most, and the largest one [bytes].
-_SESSION_S, _IN_FLIGHT, _LARGEST = 30 * 86_400, 64, 16_000_000
+_SESSION_S, _IN_FLIGHT, _LARGEST = 30 * 86_400, 256, 16_000_000
 #: Messages that wait to be decoded and their bytes, at most, as one more of QoS 0 is taken in, and as one of QoS 1 is.
 _ROOM, _ROOM_BYTES = 256, 64_000_000
 _ASSURED_ROOM, _ASSURED_BYTES = 2048, 192_000_000
@@ -50,6 +50,8 @@ _LARGE, _ATTEMPTS = 256_000, 2
 _NAME = "mqtt"
 #: How long the decoder is waited for at the end [s].
 _END_S = 2.0
+#: How often events are looked for [s].
+_LOOK_S = 0.05
 #: How often the states of the actuators are looked at [s].
 _STATES_S = 2.0
 #: What messages are counted under that find no room.
@@ -103,7 +105,7 @@ class _Connection:
         alarms = self._service.supervisor.part("MQTT alarms")
         self._link.open(clean_start=False, properties=properties)
         try:
-            while not self._service.stopping.wait(0.2):
+            while not self._service.stopping.wait(_LOOK_S):
                 self._link.check()
                 alarms.attempt(self._pass_on)
             self._states_due = 0.0

@@ -217,9 +217,9 @@ def _mapping(payload: bytes) -> Mapping[str, Any]:
         if payload.lstrip()[:1] == b"{":
             import orjson
 
-            check_json(payload)
+            colons = check_json(payload)
             values = orjson.loads(payload)
-            check_json_keys(values, payload)
+            check_json_keys(values, payload, colons)
         else:
             import cbor2
 

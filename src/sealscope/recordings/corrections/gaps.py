@@ -1,10 +1,11 @@
 """Gaps in a recording: short ones are bridged and marked, so that what lies on both sides of them can be analysed.
 
-A gap is a run of rows without a value of a needed channel, or rows that a logger has lost (`corrections.clock`). How it
-is bridged depends on its length: up to `SPLINE` samples by a cubic spline; where the duty repeats, by the channel's own
-values whole cycles before or after, shifted evenly so that both ends meet; else by a straight line. What is bridged is
-no reading: `Recording.bridged` marks it. The balance gives less weight to what a hole touches (`holes`); other
-detectors leave out the blocks that are `touched`.
+A gap is a run of rows without a value of a needed channel, or rows that a logger has lost: its clock shows them
+(`corrections.clock`), or both chamber pressures are zero (`remove_dropouts`, which a running machine's samples pass as
+well). How it is bridged depends on its length: up to `SPLINE` samples by a cubic spline; where the duty repeats, by the
+channel's own values whole cycles before or after, shifted evenly so that both ends meet; else by a straight line. What
+is bridged is no reading: `Recording.bridged` marks it. The balance gives less weight to what a hole touches (`holes`);
+other detectors leave out the blocks that are `touched`.
 """
 
 from __future__ import annotations
@@ -38,6 +39,22 @@ _END = 8
 _UNLIKE = 0.4
 #: Samples by which the cycle's length may be off.
 _SLACK = 2
+
+
+def remove_dropouts(recording: Recording) -> Recording:
+    """Mark the samples of all channels as missing where both chamber pressures are exactly zero.
+
+    A converter that is off writes zeros; two transducers with noise never read them at once. Returns the recording
+    itself where there are none.
+    """
+    chambers = chambers_of(recording)
+    if len(chambers) < 2:
+        return recording
+    lost = np.logical_not(recording["p_A"]) & np.logical_not(recording["p_B"])
+    if not lost.any():
+        return recording
+    channels = {name: np.where(lost, np.nan, values) for name, values in recording.channels.items()}
+    return replace(recording, channels=channels)
 
 
 def remove_impossible(recording: Recording) -> Recording:

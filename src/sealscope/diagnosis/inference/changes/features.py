@@ -51,7 +51,10 @@ def sensor_tests(recording: Recording) -> list[tuple[str, StepTest]]:
     if not {"p_A", "p_B"} <= recording.channels.keys():
         return []
     length = len(recording) // BLOCKS
-    features = _features(_blocks(recording, length), recording.rate)
+    blocks = _blocks(recording, length)
+    if np.isnan(blocks["p_A"]).all(axis=1).any():  # not known in all blocks
+        return []
+    features = _features(blocks, recording.rate)
     return [(name, test) for name, own in features if (test := _test(recording, own, length)) is not None]
 
 

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 PRIORS = priors("inference.pressures")
+#: No reading is larger, in SI: squares of sums of what is would overflow.
+_LARGEST = 1e100
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +126,8 @@ def unusable(recording: Recording, rig: Rig) -> str | None:
     for name in ("u", "p_A", "p_B"):
         if not np.all(np.isfinite(recording[name])) or not np.ptp(recording[name]) > 0.0:
             return f"{name} is constant or has missing samples"
+        if not np.max(np.abs(recording[name])) < _LARGEST:
+            return f"{name} is no reading: it exceeds {_LARGEST:g} {recording.units[name]}"
         if name != "u" and mostly_clipped(recording[name]):
             return f"{name} is mostly cut off at an end of its range"
     return None

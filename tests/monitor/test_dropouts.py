@@ -1,0 +1,112 @@
+"""A converter that is off writes zeros, or its last values: a recording and a stream miss the same samples."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sealscope.recordings.gaps import remove_dropouts
+
+import sealscope as ss
+from sealscope.diagnosis.inspection import inspected
+from sealscope.recordings.motion import find_holds
+from sealscope.recordings.recording import Recording
+
+from ..diagnosis.balance_machine import machine
+
+VOLUMES, PRESSURES = ("p_A", "p_B", "x", "theta"), ("p_A", "p_B", "u")
+
+
+def dropped(recording: Recording, begin: float, seconds: float, value: float | None = 0.0) -> Recording:
+    """A recording of whose channels all have one value for a while; None: the last one before."""
+    rows = np.flatnonzero((recording.t >= begin) & (recording.t < begin + seconds))
+    channels = {}
+    for name, values in recording.channels.items():
+        channels[name] = values.copy()
+        channels[name][rows] = values[rows[0] - 1] if value is None else value
+    return replace(recording, channels=channels)
+
+
+def watched(recording: Recording, size: int = 10**9) -> tuple[ss.Watch, list[object]]:
+    watch, estimates = ss.watch("thesis", learn_hours=0.02), list[object]()
+    for start in range(0, len(recording), size):
+        estimates += watch.update(recording.samples(slice(start, start + size)))
+    return watch, estimates
+
+
+@pytest.mark.parametrize("seed", [2, 3, *(pytest.param(k, marks=pytest.mark.slow) for k in (0, 1, 4, 5, 6, 7))])
+@pytest.mark.parametrize("seconds", [0.1, 15.0])
+def test_zeros_in_all_channels_are_no_leak(seed: int, seconds: float):
+    recording = machine(seed, duration=240.0, rate=200.0).only(VOLUMES)
+    watch, _ = watched(dropped(recording, 150.0 + 0.37 * seed, seconds))
+    assert watch.leak is None
+    assert watch.counters.keys() <= {"blocks: missing values"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("names", [VOLUMES, PRESSURES], ids=["volumes", "pressures"])
+@pytest.mark.parametrize("value", [0.0, None], ids=["zeros", "last values"])
+def test_fifteen_seconds_of_a_simulated_machine_are_no_leak(names: tuple[str, ...], value: float | None):
+    for seed in range(8):
+        recording = ss.simulate(command="3 sin(4t)", duration="5 min", seed=seed).only(names)
+        lost = dropped(recording, 150.0 + 0.37 * seed, 15.0, value)
+        assert watched(lost)[0].leak is None
+        assert ss.diagnose(lost).verdict != "leak"
+
+
+def test_a_recording_and_a_stream_miss_the_same_samples():
+    recording = dropped(machine(3, duration=240.0, rate=200.0).only(VOLUMES), 100.0, 40.0)
+    missing = np.isnan(remove_dropouts(recording)["p_A"])
+    np.testing.assert_array_equal(missing, (recording.t >= 100.0) & (recording.t < 140.0))
+    part = inspected(recording).part  # too much to be bridged: the longer side
+    assert (part.t[0], len(part)) == (0.0, 20_000)
+    diagnosis = ss.diagnose(recording)
+    assert diagnosis.verdict == "cannot tell"
+    assert "this rests on 41.7 % of the recording" in diagnosis.reason
+    watch, estimates = watched(recording)
+    lost = [each.t for each in estimates if each.status == "missing values"]  # type: ignore[attr-defined]
+    assert 103.0 < lost[0] < 107.0 and 136.0 < lost[-1] < 144.0
+    assert watch.counters == {"blocks: missing values": len(lost)}
+    for size in (33, 500, 7001):
+        again, others = watched(recording, size)
+        assert others == estimates
+        assert again.state() == watch.state()
+
+
+def test_one_chamber_at_zero_is_a_reading():
+    recording = machine(3, duration=20.0, rate=200.0)
+    one = replace(recording, channels={**recording.channels, "p_B": np.zeros(len(recording))})
+    assert remove_dropouts(one) is one
+    assert remove_dropouts(recording.only(("p_A", "x"))) is not None
+
+
+def test_a_hold_is_the_same_for_any_cuts():
+    random = np.random.default_rng(1)
+    values = random.standard_normal(4000)
+    for begin, count in ((100, 70), (500, 750), (501, 751), (1500, 752), (2600, 900), (3800, 200)):
+        values[begin : begin + count] = values[begin]
+    whole = find_holds(values, 500.0)
+    held = np.zeros(len(values), dtype=bool)
+    for first, count in ((1500, 752), (2600, 900)):
+        held[first + 1 : first + count] = True
+    held[501 : 501 + 751] = True  # the second of two that overlap is longer than 1.5 s
+    np.testing.assert_array_equal(whole.flags, held)
+    assert whole.open == 3801
+    cut = find_holds(values[3000:], 500.0, before=values[2999])
+    np.testing.assert_array_equal(cut.flags, held[3000:])
+    for empty in (np.empty(0), np.full(3, np.nan)):
+        assert not find_holds(empty, 500.0).flags.any()
+
+
+@pytest.mark.slow
+def test_held_pressures_are_missing_for_any_cuts():
+    recording = ss.simulate(command="3 sin(4t)", duration="4 min", seed=4).only(PRESSURES)
+    lost = dropped(recording, 151.0, 3.0, None)
+    watch, estimates = watched(lost)
+    assert watch.leak is None
+    assert "blocks: missing values" in watch.counters
+    for size in (77, 500, 4001):
+        again, others = watched(lost, size)
+        assert others == estimates
+        assert again.state() == watch.state()
