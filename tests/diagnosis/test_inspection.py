@@ -101,7 +101,7 @@ def test_of_a_baseline_with_a_long_gap_the_longest_stretch_is_used(healthy: list
 
 
 class Failing:
-    """Raises `error` where it examines."""
+    """Raises `error` where it observes."""
 
     name = "pressure response"
     error: Exception
@@ -112,7 +112,7 @@ class Failing:
     def usable(self, recording: Recording) -> None:
         return None
 
-    def examine(self, recording: Recording, baseline: object, probability: float) -> None:
+    def observe(self, recording: Recording, baseline: object = ()) -> None:
         raise self.error
 
 
