@@ -65,10 +65,10 @@ def test_noise_of_any_size_drops_out() -> None:
 
 
 def test_a_change_of_the_duty_is_no_step_of_the_machine() -> None:
-    """Details that step with the command, by a power of 2, are explained; the same step beside an even command not."""
+    """Details that fall with the command, by a power of 2, are explained; the same fall beside an even command not."""
     random = np.random.default_rng(0)
     duty = np.zeros((70, 4))
-    duty[:, 0] = 0.2 * (np.arange(70) >= 35)
+    duty[:, 0] = -0.2 * (np.arange(70) >= 35)
     scatter = np.hstack([SCATTER[[0, 1, 2, 3, 3]] * random.standard_normal((70, 5)) for _ in range(2)])
     moved = scatter + np.tile(np.r_[0.0, np.full(4, 2.0)] * duty[:, :1], 2) + np.tile([-3.0, 0.0, 0.0, 0.0, 0.0], 2)
     assert judge_blocks(blocks_of(moved, duty=duty), 0.01).verdict == "no leak"
