@@ -52,6 +52,7 @@ def known_names() -> frozenset[str]:
     """Collect what providers report, as "data: name"."""
     names = {f"volumes: {name}" for name in volume_names()} | {f"response: {name}" for name in PARAMETERS}
     names |= {f"levels: {name}" for name, _ in PATTERNS} | {"levels: what feeds both chambers"}
+    names.add("motion: motion")
     names |= {f"levels: scale of {chamber}" for chamber in ("p_A", "p_B")}
     names |= {f"hum: hum of {hertz:g} Hz" for hertz in priors("inference.changes")["features"]["mains"]}
     for way, quantity, chamber in product(("rise", "fall"), QUANTITIES, ("p_A", "p_B")):
