@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sealscope.campaigns.cases.machines import sized_once
-from sealscope.diagnosis.inference.pressures.detector import PressureResponse
+from sealscope.diagnosis.diagnose import Examination
 from sealscope.diagnosis.inference.pressures.evidence import PRIORS
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording
@@ -45,7 +45,7 @@ class Answer(NamedTuple):
 
 
 def answer(recording: Recording, rig: Rig, false_alarm: float) -> Answer:
-    evidence = PressureResponse(rig).examine(recording, [], false_alarm)
+    evidence = Examination(recording, false_alarm_probability=false_alarm, rig=rig).evidence("pressure response")
     if evidence.verdict != "leak":
         return Answer(False, words=evidence.summary)
     return Answer(True, evidence.leak_lpm, evidence.leak_interval_lpm, evidence.onset_s, evidence.summary)

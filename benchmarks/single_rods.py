@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.diagnosis.inference.detector import VolumeBalance
+from sealscope.diagnosis.diagnose import Examination
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.evaluation.binomial import clopper_pearson
 from sealscope.parameters import Rig, load_rig
@@ -126,13 +126,13 @@ def row(family: str, count: int, seed: int) -> tuple[str, np.ndarray]:
     counts = np.zeros(6, dtype=int)
     ratios = []
     for number, drawn in enumerate(machines(family, count, seed)):
-        balance = VolumeBalance(drawn.rig)
         for law in (LAWS[number % 2], None):
             try:
                 simulated = simulate_experiment(drawn.experiment(law))
             except (InputError, SimulationFailed):
                 continue
-            evidence = balance.examine(simulated.recording, [], P)
+            examination = Examination(simulated.recording, false_alarm_probability=P, rig=drawn.rig)
+            evidence = examination.evidence("volume balance")
             if law is None:
                 counts[4:] += 1, evidence.verdict == "leak"
                 continue

@@ -22,7 +22,7 @@ from real_eha import AREAS, DISPLACEMENT, MAP, leaking
 
 import sealscope as ss
 from sealscope.campaigns.smallest import PlannedDuty, experiment_of, findable
-from sealscope.diagnosis.inference.detector import VolumeBalance
+from sealscope.diagnosis.diagnose import Examination
 from sealscope.parameters import load_rig
 from sealscope.simulation.leaks import Leak, from_time
 from sealscope.simulation.simulate import simulate_experiment
@@ -93,7 +93,8 @@ def main() -> None:
             for seed in range(given.seeds):
                 experiment = replace(experiment_of(rig, duty, given.duration, 1000 + seed), leaks=(leak,))
                 recording = simulate_experiment(experiment).recording
-                detected += VolumeBalance(rig).examine(recording, [], 0.01).verdict == "leak"
+                examination = Examination(recording, false_alarm_probability=0.01, rig=rig)
+                detected += examination.evidence("volume balance").verdict == "leak"
             counts.append(f"{detected} of {given.seeds}")
         size = predicted.conductance * predicted.pressure / LITRE_PER_MINUTE
         print(f"| {name}, {command} | {size:.2g} | " + " | ".join(counts) + " |", flush=True)

@@ -21,6 +21,8 @@ from sealscope.campaigns.plans.detectors import ALL_CHANNELS, check_detector, pl
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.campaigns.results import simulated_result, write_result
 from sealscope.diagnosis import registry
+from sealscope.diagnosis.decision.decide import decide
+from sealscope.diagnosis.detector import make_observable
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.verdict.evidence import Cause, Evidence
 from sealscope.errors import InputError
@@ -62,7 +64,7 @@ examined: list[tuple[str, ...]] = []
 
 
 class Watcher:
-    """Says of a record what its channels and the assumed rig are, as numbers."""
+    """Reports which channels a record has, how its pressure changes, and the rig that it was made for."""
 
     name = "watcher"
 
@@ -72,14 +74,23 @@ class Watcher:
     def usable(self, recording):
         return None
 
-    def examine(self, recording, baseline, p):
+    def observe(self, recording, baseline=()):
         examined.append(tuple(recording.channels))
         moved = float(recording["p_A"][len(recording) // 2 :].std() / recording["p_A"][: len(recording) // 2].std())
-        leak = "leak" if "x" in recording else "no leak"
-        return Evidence(
-            leak, f"at {p}", 2.0 + abs(math.log(moved)), 2.0, 13.0, (11.0, 15.0), self.rig.pump.q_b, (0.0, 1.0),
-            cause=None if "x" in recording else "friction change",
-        )  # fmt: skip
+        name = "all channels" if "x" in recording else "few channels"
+        return make_observable(name, math.exp(-1.0 - abs(math.log(moved))), size=self.rig.pump.q_b)
+
+
+def decide_for_watcher(report, reports, null, context):
+    """Decide as always, but state figures for the watcher that campaigns have to keep."""
+    if report.provider != "watcher":
+        return decide(report, reports, null, context)
+    (change,) = report.observables
+    is_whole = change.name == "all channels"
+    return Evidence(
+        "leak" if is_whole else "no leak", f"at {context.false_alarm_probability}", change.score, 2.0, 13.0,
+        (11.0, 15.0), change.size, (0.0, 1.0), cause=None if is_whole else "friction change", detector="watcher",
+    )  # fmt: skip
 
 
 @pytest.fixture
@@ -87,6 +98,7 @@ def plan(tmp_path, monkeypatch):
     quick = {name: registry.DETECTORS[name] for name in ("volume balance", "rms change")}
     monkeypatch.setattr(registry, "DETECTORS", {**quick, "watcher": Watcher})
     monkeypatch.setattr(registry, "entry_points", lambda group: ())
+    monkeypatch.setattr("sealscope.diagnosis.diagnose.decide", decide_for_watcher)
     registry.plug_ins.cache_clear()
     plan_detector.cache_clear()
     examined.clear()

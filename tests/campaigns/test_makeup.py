@@ -9,8 +9,7 @@ import pytest
 from sealscope.campaigns.cases.case import cases_of
 from sealscope.campaigns.cases.machines import experiment_of
 from sealscope.campaigns.plans.reader import load_plan
-from sealscope.diagnosis.inference.detector import VolumeBalance
-from sealscope.parameters import load_rig
+from sealscope.diagnosis.diagnose import Examination
 from sealscope.simulation.simulate import simulate_experiment
 
 
@@ -21,8 +20,7 @@ def test_a_circuit_that_fills_at_the_start_hides_no_small_leak() -> None:
     leaking = (case for case in cases_of(plan) if case.leak_lpm == 0.0002)
     (case,) = itertools.islice(leaking, 1, 2)
     recording = simulate_experiment(experiment_of(plan, case)).recording
-    detector = VolumeBalance(load_rig("thesis"))
-    evidence = detector.examine(recording, [], 0.01)
+    evidence = Examination(recording, false_alarm_probability=0.01, rig="thesis").evidence("volume balance")
     assert evidence.verdict == "leak"
     assert evidence.onset_interval_s is not None
     assert evidence.onset_interval_s[0] - 1.0 <= 90.0 <= evidence.onset_interval_s[1] + 1.0

@@ -10,7 +10,7 @@ import pytest
 
 from sealscope.campaigns import smallest
 from sealscope.campaigns.smallest import Findable, PlannedDuty, RecordingPlan, experiment_of, findable, plan_recording
-from sealscope.diagnosis.inference.detector import VolumeBalance
+from sealscope.diagnosis.diagnose import Examination
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
 from sealscope.simulation.leaks import Leak, from_time
@@ -37,7 +37,8 @@ def test_what_is_planned_is_found(rig: Rig, minute: Findable) -> None:
         leak = Leak("laminar", coefficient=factor * minute.conductance, opening=from_time(30.0))
         runs = [replace(experiment_of(rig, DUTY, 60.0, seed), leaks=(leak,)) for seed in range(10, 14)]
         records = [simulate_experiment(run).recording for run in runs]
-        result.append(sum(VolumeBalance(rig).examine(own, [], 0.01).verdict == "leak" for own in records))
+        cases = [Examination(recording, false_alarm_probability=0.01, rig=rig) for recording in records]
+        result.append(sum(case.evidence("volume balance").verdict == "leak" for case in cases))
     assert result[0] >= 3 and result[1] == 0
 
 

@@ -21,6 +21,7 @@ from sealscope.reporting.messages import how_bad, how_much, next_steps, rests_on
 from sealscope.simulation.simulate import simulate
 
 from .balance_machine import AREA, machine, step
+from .judging import judge
 
 LPM = 6.0e4
 LEAK = 3.0e-13
@@ -88,13 +89,13 @@ def test_pressures_alone_state_no_flow_without_a_rig() -> None:
     own = simulate(command="3 sin(4t)", leak="0.02 L/min from 20 s", duration="40 s", seed=1)
     pressures = own.only(["u", "p_A", "p_B"])
     foreign = diagnose(replace(pressures, provenance={}))
-    known = PressureResponse(assumed_rig(None, pressures)[0]).examine(pressures, [], 0.01)
+    known = judge(PressureResponse(assumed_rig(None, pressures)[0]), pressures)
     assert known.leak_lpm == pytest.approx(0.02, rel=0.5)
     assert (known.verdict, known.score) == (foreign.verdict, foreign.score)
     assert foreign.leak_lpm is None and foreign.severity is None
     assert "no rig was stated" in foreign.reason and "L/min," not in foreign.reason
     assert all(own.leak_lpm is None and own.course is None for own in foreign.parts)
-    area_alone = PressureResponse(stated(area=f"{AREA} m^2")).examine(pressures, [], 0.01)
+    area_alone = judge(PressureResponse(stated(area=f"{AREA} m^2")), pressures)
     assert area_alone.leak_lpm is None  # the ringing needs the moving mass, too
 
 

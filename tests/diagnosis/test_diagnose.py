@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis import registry
+from sealscope.diagnosis.detector import make_observable
 from sealscope.diagnosis.diagnose import Examination
-from sealscope.diagnosis.verdict.evidence import Evidence
+from sealscope.diagnosis.inference.observable import Observable, Observed, Ringing
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording
 
@@ -26,10 +27,10 @@ class Looker:
     def usable(self, recording: Recording) -> str | None:
         return None if "p_A" in recording else "needs p_A"
 
-    def examine(self, recording: Recording, baseline: object, probability: float) -> Evidence:
+    def observe(self, recording: Recording, baseline: object = ()) -> Observed | Observable:
         observed.append((tuple(recording.channels), len(list(baseline))))  # type: ignore[call-overload]
         assert np.isinf(np.array([1.0]) / 0.0).all()
-        return Evidence("no leak", "looked", probability, 1.0)
+        return make_observable("what it looks at", 0.25)
 
 
 @pytest.fixture
@@ -43,7 +44,7 @@ def recording(monkeypatch: pytest.MonkeyPatch) -> Recording:
 def test_once_for_each_set_of_channels(recording: Recording) -> None:
     whole = Examination(recording, false_alarm_probability=0.05)
     for _ in range(3):
-        assert whole.evidence("looker").score == 0.05
+        assert whole.evidence("looker").chance == 0.25
     assert len(observed) == 1
     few = whole.through(["u", "p_A", "p_B", "omega"])
     assert few.evidence("looker") == few.evidence("looker")
@@ -84,11 +85,14 @@ def test_what_stands_in_for_a_judge_is_not_asked(recording: Recording, monkeypat
     class Volumes(Looker):
         name = "volume balance"
 
-    class Abstains(Volumes):
-        def examine(self, recording: Recording, baseline: object, probability: float) -> Evidence:
-            return Evidence("cannot tell", "too little")
+        def observe(self, recording: Recording, baseline: object = ()) -> Observed:
+            return Observed(self.name, ringing=Ringing(0.01, 500.0, 0, True))
 
-    class Pressures(Looker):
+    class Abstains(Volumes):
+        def observe(self, recording: Recording, baseline: object = ()) -> Observed:
+            return Observed(self.name, lack="too little")
+
+    class Pressures(Volumes):
         name = "pressure response"
 
     for volumes, asked in (

@@ -103,7 +103,7 @@ def test_of_a_baseline_with_a_long_gap_both_sides_are_used(healthy: list[Recordi
 
 
 class Failing:
-    """Raises `error` where it examines."""
+    """Raises `error` where it observes."""
 
     name = "pressure response"
     error: Exception
@@ -114,7 +114,7 @@ class Failing:
     def usable(self, recording: Recording) -> None:
         return None
 
-    def examine(self, recording: Recording, baseline: object, probability: float) -> None:
+    def observe(self, recording: Recording, baseline: object = ()) -> None:
         raise self.error
 
 

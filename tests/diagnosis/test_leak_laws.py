@@ -10,6 +10,8 @@ from sealscope.parameters import load_rig
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_experiment
 
+from .judging import judge
+
 ONSET = 36.3
 
 
@@ -25,7 +27,7 @@ def test_mean_flow_and_onset(law: str, lpm: float, command: str) -> None:
     """
     leak = f"{lpm} L/min {'orifice ' if law == 'orifice' else ''}from {ONSET} s"
     result = simulate_experiment(Experiment.of(command=command, duration=75.0, leak=leak, seed=7))
-    evidence = VolumeBalance(load_rig("thesis")).examine(result.recording, [], 0.01)
+    evidence = judge(VolumeBalance(load_rig("thesis")), result.recording)
     true = result.truth.mean_leak_lpm
     assert evidence.verdict == "leak"
     assert evidence.leak_lpm == pytest.approx(true, rel=0.06)
@@ -56,7 +58,7 @@ def test_half_of_the_blocks_leak_much(command: str, lpm: float, law: str) -> Non
         command=command, duration=60.0, leak=f"{lpm} L/min {law}from 30 s", set=throttles, seed=3
     )
     result = simulate_experiment(experiment)
-    evidence = VolumeBalance(load_rig("thesis")).examine(result.recording, [], 0.01)
+    evidence = judge(VolumeBalance(load_rig("thesis")), result.recording)
     true = result.truth.mean_leak_lpm
     assert evidence.verdict == "leak"
     assert evidence.leak_lpm == pytest.approx(true, rel=0.06)
@@ -72,7 +74,7 @@ def test_zero_errors_of_the_transducers_do_not_bend_the_law(laws: tuple[str, ...
     offsets |= {"sensors.p_B.offset": "-12[kPa]", "sensors.p_2.offset": "-12[kPa]"}
     leak = [f"{lpm / len(laws)} L/min {'orifice ' if law == 'orifice' else ''}from {ONSET} s" for law in laws]
     result = simulate_experiment(Experiment.of(command="5 sin(2t)", duration=75.0, leak=leak, set=offsets, seed=7))
-    evidence = VolumeBalance(load_rig("thesis")).examine(result.recording, [], 0.01)
+    evidence = judge(VolumeBalance(load_rig("thesis")), result.recording)
     true = result.truth.mean_leak_lpm
     assert evidence.leak_lpm == pytest.approx(true, rel=0.06)
     assert evidence.leak_interval_lpm is not None
@@ -85,7 +87,7 @@ def test_mean_flow_from_pressures_and_command(law: str) -> None:
     leak = f"0.015 L/min {'orifice ' if law == 'orifice' else ''}from {ONSET} s"
     result = simulate_experiment(Experiment.of(command="3 sin(4t)", duration=75.0, leak=leak, seed=7))
     recording = result.recording.only(("u", "p_A", "p_B"))
-    evidence = PressureResponse(load_rig("thesis")).examine(recording, [], 0.01)
+    evidence = judge(PressureResponse(load_rig("thesis")), recording)
     assert evidence.verdict == "leak"
     assert evidence.leak_interval_lpm is not None
     assert evidence.leak_interval_lpm[0] <= result.truth.mean_leak_lpm <= evidence.leak_interval_lpm[1]
@@ -98,6 +100,6 @@ def test_pressures_that_hardly_vary_leave_the_size_as_it_is() -> None:
     result = simulate_experiment(
         Experiment.of(rig="single-rod-eha", command="2 sin(6t)", load="0 N", duration=60.0, leak=leak, seed=1)
     )
-    evidence = VolumeBalance(load_rig("single-rod-eha")).examine(result.recording, [], 0.01)
+    evidence = judge(VolumeBalance(load_rig("single-rod-eha")), result.recording)
     assert evidence.verdict == "leak"
     assert evidence.leak_lpm == pytest.approx(0.1, rel=0.03)

@@ -36,25 +36,26 @@ def check(result: Diagnosis) -> None:
 
 
 @pytest.mark.usefixtures("rms_change_alone")
-def test_contract_of_a_leak_by_the_change_of_rms(leaky: Recording) -> None:
+def test_contract_of_ringing_that_fell(leaky: Recording) -> None:
+    """Friction, duty and filters make it fall as well: alone it is an alarm that is not explained."""
     result = diagnose(leaky, file="rig.csv")
-    assert (result.verdict, result.file) == ("leak", "rig.csv")
+    assert (result.verdict, result.file) == ("cannot tell", "rig.csv")
     check(result)
     tree = result.as_dict()
     assert tree["leak_lpm"] is None
     assert tree["leak_interval_lpm"] is None
     assert tree["false_alarm_probability"] == 0.01
-    assert tree["methods"][0] == {
-        "name": "rms change",
-        "score": tree["score"],
-        "threshold": tree["threshold"],
-        "verdict": "leak",
-        "reason": tree["reason"],
-        "chance": tree["chance"],
-        "odds": tree["odds"],
-    }
-    assert [one["name"] for one in tree["methods"][1:]] == [
-        f"RMS of {quantity} of {chamber}" for chamber in ("p_A", "p_B") for quantity in ("d1", "d2", "d3", "d4", "d3d4")
+    assert tree["score"] > tree["threshold"]
+    assert tree["methods"] == [
+        {
+            "name": "rms change",
+            "score": tree["score"],
+            "threshold": tree["threshold"],
+            "verdict": "cannot tell",
+            "reason": tree["reason"],
+            "chance": tree["chance"],
+            "odds": tree["odds"],
+        }
     ]
 
 

@@ -12,18 +12,27 @@ from pathlib import Path
 import pytest
 
 from sealscope.diagnosis import detector, registry
-from sealscope.diagnosis.diagnose import diagnose
+from sealscope.diagnosis.diagnose import Examination, diagnose
 from sealscope.diagnosis.registry import DETECTORS, detectors
 from sealscope.recordings.recording import Recording
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "ringing-energy"
 GOOD = """
-from sealscope.diagnosis.verdict.evidence import Evidence
+from sealscope.diagnosis.inference.observable import Observed
 class Good:
     name = "good"
     def __init__(self, rig): self.rig = rig.name
     def usable(self, recording): return None
-    def examine(self, recording, baseline, p): return Evidence("no leak", f"assumed {self.rig}", 0.0, 1.0)
+    def observe(self, recording, baseline=()): return Observed("good", lack=f"assumed {self.rig}")
+"""
+#: A detector that reports one change alone.
+ONE_CHANGE = """
+from sealscope.diagnosis.detector import make_observable
+class Good:
+    name = "good"
+    def __init__(self, rig): pass
+    def usable(self, recording): return None
+    def observe(self, recording, baseline=()): return make_observable("stroke time", CHANCE, onset=(9.0, 8.0, 10.0))
 """
 Install = Callable[..., None]
 
@@ -76,7 +85,19 @@ def test_the_documented_example_is_found_and_heard(install: Install, leaky: Reco
     assert own.score is not None
     assert own.threshold is not None
     assert own.score > own.threshold
-    assert {"ringing of p_A", "ringing of p_B"} <= set(result)
+
+
+@pytest.mark.parametrize(
+    ("chance", "verdict"), [(1e-9, "leak"), (0.3, "cannot tell"), (0.0, "leak"), (1.0, "cannot tell")]
+)
+def test_one_change_with_its_chance_is_a_report(
+    install: Install, short: Recording, chance: float, verdict: str
+) -> None:
+    install("fine", ONE_CHANGE.replace("CHANCE", repr(chance)), {"good": "fine:Good"})
+    evidence = Examination(short, false_alarm_probability=0.01).evidence("good")
+    assert evidence.verdict == verdict
+    assert (evidence.score > evidence.threshold) == (verdict == "leak")
+    assert evidence.onset_s == (9.0 if verdict == "leak" else None)
 
 
 def test_it_is_made_for_the_rig_that_is_assumed(install: Install, short: Recording) -> None:
@@ -98,18 +119,23 @@ BROKEN = {
     "a reserved word": (GOOD, {"diagnose": "broken:Good"}, "taken by Sealscope"),
     "cannot be made": ("def Bad(rig): raise OSError('no licence')", {"bad": "broken:Bad"}, "no licence"),
     "another name": (GOOD, {"bad": "broken:Good"}, "must be that of its entry point, 'bad', got 'good'"),
-    "examines badly": (
-        GOOD.replace('return Evidence("no leak"', 'raise ZeroDivisionError("so\\nit is"); return Evidence("no leak"'),
+    "observes badly": (
+        GOOD.replace("return Observed(", 'raise ZeroDivisionError("so\\nit is"); return Observed('),
         {"good": "broken:Good"},
         "so it is",
     ),
-    "no evidence": (
-        re.sub(r"return Evidence\(.*", 'return "no leak"', GOOD),
+    "no report": (
+        re.sub(r"return Observed\(.*", 'return "no leak"', GOOD),
         {"good": "broken:Good"},
-        "must give Evidence, got str",
+        "must give Observed, got str",
     ),
-    "a verdict of its own": (GOOD.replace('"no leak"', '"perhaps"'), {"good": "broken:Good"}, "got 'perhaps'"),
-    "a verdict without a score": (GOOD.replace(", 0.0, 1.0", ""), {"good": "broken:Good"}, "score and threshold"),
+    "a chance that is none": (ONE_CHANGE.replace("CHANCE", "1.5"), {"good": "broken:Good"}, "0 to 1, got 1.5"),
+    "a chance without a value": (ONE_CHANGE.replace("CHANCE", "float('nan')"), {"good": "broken:Good"}, "got nan"),
+    "a lack of two lines": (
+        GOOD.replace('f"assumed {self.rig}"', '"no\\nno"'),
+        {"good": "broken:Good"},
+        "must be one line",
+    ),
     "usable that fails": (GOOD.replace("return None", "return 1 / 0"), {"good": "broken:Good"}, "ZeroDivisionError"),
 }
 

@@ -11,11 +11,13 @@ from sealscope.diagnosis.inference.pressures.detector import PressureResponse
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.parameters import load_rig
 
+from .judging import judge
+
 DETECTOR = PressureResponse(load_rig("thesis"))
 
 
 def examined(*baseline: ss.Recording, seed: int = 6, **values: object) -> Evidence:
-    return DETECTOR.examine(recorded(seed=seed, **values), baseline, 0.01)
+    return judge(DETECTOR, recorded(seed=seed, **values), baseline)
 
 
 def recorded(**values: object) -> ss.Recording:

@@ -18,6 +18,8 @@ from sealscope.recordings.cycle import cycle_of
 from sealscope.recordings.recording import Array, Recording, remembered
 from sealscope.simulation.simulate import simulate
 
+from .judging import judge
+
 
 def _recording() -> Recording:
     return Recording(np.arange(4.0), {"p_A": np.zeros(4)}, {"p_A": "Pa"}, 1.0)
@@ -106,9 +108,9 @@ def test_a_baseline_is_followed_once_for_many_files(monkeypatch: pytest.MonkeyPa
         followed.append(recording)
         return plain(recording, rig)
 
-    fresh = PressureResponse(rig).examine(files[0], [replace_of(b) for b in baseline], 0.01)
+    fresh = judge(PressureResponse(rig), files[0], [replace_of(b) for b in baseline])
     monkeypatch.setattr(Follower, "begun", begun)
-    again = [PressureResponse(rig).examine(own, baseline, 0.01) for own in files]
+    again = [judge(PressureResponse(rig), own, baseline) for own in files]
     assert fresh.score is not None, fresh.reason
     assert again[0].score == fresh.score
     assert sum(own is b for own in followed for b in baseline) == 2

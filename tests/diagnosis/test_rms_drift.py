@@ -9,16 +9,22 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
+from sealscope.diagnosis.decision.case import Context
+from sealscope.diagnosis.decision.decide import decide
+from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.rms_change.blocks import DUTY, RmsBlocks
-from sealscope.diagnosis.rms_change.detector import RmsChange, within
+from sealscope.diagnosis.rms_change.detector import RmsChange, observe_within
 from sealscope.diagnosis.rms_change.ringing import beyond_noise, rises
+from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.signals.details import QUANTITIES
 from sealscope.simulation.bench.machines import draw
 from sealscope.simulation.commands import parse_command
 from sealscope.simulation.courses import parse_force
 from sealscope.simulation.simulate import simulate, simulate_experiment
+
+from .judging import judge
 
 BLOCK = 1.5
 #: Deviation of a block's log RMS of d1..d4 where it is white noise at 500 Hz.
@@ -39,6 +45,12 @@ def blocks_of(values: np.ndarray, cycle: float | None = 1.5, duty: np.ndarray | 
     return RmsBlocks(np.arange(n + 1) * BLOCK, values, duty, ("p_A", "p_B")[: values.shape[1] // 5], 1, cycle)
 
 
+def judge_blocks(blocks: RmsBlocks, probability: float) -> Evidence:
+    """Decide by the change of RMS within blocks at 500 Hz, by its own rule."""
+    context = Context(false_alarm_probability=probability, is_weighed=False)
+    return decide(observe_within(blocks, 500.0), (), HealthyNull(), context)
+
+
 def test_noise_of_any_size_drops_out() -> None:
     """Noise eight times as loud from the middle on moves d1 alone; a level's own part, wider by 1 %, moves by w."""
     one, all_levels = np.ones(30), np.ones((30, 4))
@@ -53,14 +65,14 @@ def test_noise_of_any_size_drops_out() -> None:
 
 
 def test_a_change_of_the_duty_is_no_step_of_the_machine() -> None:
-    """Details that step with the command, by a power of 2, are explained; the same step beside an even command not."""
+    """Details that fall with the command, by a power of 2, are explained; the same fall beside an even command not."""
     random = np.random.default_rng(0)
     duty = np.zeros((70, 4))
-    duty[:, 0] = 0.2 * (np.arange(70) >= 35)
+    duty[:, 0] = -0.2 * (np.arange(70) >= 35)
     scatter = np.hstack([SCATTER[[0, 1, 2, 3, 3]] * random.standard_normal((70, 5)) for _ in range(2)])
     moved = scatter + np.tile(np.r_[0.0, np.full(4, 2.0)] * duty[:, :1], 2) + np.tile([-3.0, 0.0, 0.0, 0.0, 0.0], 2)
-    assert within(blocks_of(moved, duty=duty), 0.01).verdict == "no leak"
-    assert within(blocks_of(moved), 0.01).verdict == "leak"
+    assert judge_blocks(blocks_of(moved, duty=duty), 0.01).verdict == "no leak"
+    assert judge_blocks(blocks_of(moved), 0.01).verdict == "leak"
 
 
 @pytest.mark.parametrize(
@@ -141,13 +153,13 @@ def drifting(random: np.random.Generator, n: int = 75, leak: float = 0.0) -> Rms
 
 def test_a_machine_that_drifts_and_does_not_leak_is_not_called_leaky() -> None:
     random = np.random.default_rng(5)
-    verdicts = [within(drifting(random), 0.1).verdict for _ in range(16)]
+    verdicts = [judge_blocks(drifting(random), 0.1).verdict for _ in range(16)]
     assert verdicts.count("leak") <= 5  # of 16 at 10 %: more has a probability of 0.3 %
 
 
 def test_a_leak_is_found_beside_that_drift() -> None:
     random = np.random.default_rng(6)
-    verdicts = [within(drifting(random, leak=0.5), 0.1).verdict for _ in range(6)]
+    verdicts = [judge_blocks(drifting(random, leak=0.5), 0.1).verdict for _ in range(6)]
     assert verdicts.count("leak") >= 5
 
 
@@ -157,7 +169,7 @@ def test_what_noise_drowns_is_not_called_healthy() -> None:
     drowned = drifting(random)
     louder = np.tile(np.log(30.0), (len(drowned.log_rms), 10))
     noise = SCATTER[[0, 1, 2, 3, 3]] * random.standard_normal((2, len(louder), 5))
-    evidence = within(replace(drowned, log_rms=louder + np.hstack(list(noise))), 0.01)
+    evidence = judge_blocks(replace(drowned, log_rms=louder + np.hstack(list(noise))), 0.01)
     assert evidence.verdict == "cannot tell"
     assert "would not show" in evidence.reason
 
@@ -177,4 +189,4 @@ def test_a_rate_that_does_not_show_the_ringing_shows_no_absence_of_a_leak(rate: 
     record = {"command": "8 sin(t)", "rate": rate, "duration": "60 s", "seed": 1}
     for leak in ("0.5 L/min from 30 s", ()):
         recording = simulate(**record, leak=leak).only(["u", "p_A", "p_B"])
-        assert RmsChange().examine(recording, [], 0.01).verdict != "no leak"
+        assert judge(RmsChange(), recording).verdict != "no leak"

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import binom, kstest, norm
 
 from sealscope.diagnosis.inference.blocks import Blocks, Columns
-from sealscope.diagnosis.inference.scatter import Population, RecordingSums, Rise, rise
+from sealscope.diagnosis.inference.scatter import Mixture, Population, RecordingSums, Rise, rise
 from sealscope.diagnosis.inference.terms import LEAK, Equation, Term
 from sealscope.diagnosis.priors import priors
 
@@ -269,3 +269,16 @@ def test_a_rise_below_zero_bounds_a_leak_no_closer_than_none() -> None:
     low, none, high = (Rise(value, 2.0, 5.0) for value in (-20.0, 0.0, 3.0))
     assert low.bound() == none.bound() == pytest.approx(2.0 * 2.015, rel=1e-3)  # Student's t, 5 degrees, 95 %
     assert high.bound() == pytest.approx(3.0 + none.bound())
+
+
+def test_the_ratio_of_densities_is_that_of_the_law() -> None:
+    """The law of a rise is not centred where few recordings were compared: its density has the same centres."""
+    stated = Rise(3.0, 2.0, np.inf, Mixture(np.array([0.3, 0.7]), np.array([1.0, 3.0]), np.array([-1.5, 4.0])))
+
+    def density(value: float) -> float:
+        step = 1e-4
+        above = [stated._replace(value=value + side).chance for side in (-step, step)]
+        return (above[0] - above[1]) / (2.0 * step)
+
+    for leak in (0.5, 2.0, 5.0):
+        assert stated.log_ratio(leak) == pytest.approx(np.log(density(3.0 - leak) / density(3.0)), abs=1e-5)

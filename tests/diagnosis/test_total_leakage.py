@@ -15,8 +15,8 @@ from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_experiment
 
 from .balance_machine import machine, step
+from .judging import judge
 
-P = 0.01
 LPM = 6.0e4
 #: Leaks from the start [m^3/(s Pa)] beside those of the pump of 2.4e-13.
 PUMP, WORN = 2.4e-13, 1.0e-12
@@ -44,7 +44,7 @@ def test_a_leak_from_the_first_sample_is_stated(law: str) -> None:
         worn = machine(1, C=C)
         dp = np.abs(worn["p_A"] - worn["p_B"])
         lost = C * float(np.mean(np.sqrt(dp)) / np.mean(dp))
-    evidence = VolumeBalance(rig(None)).examine(worn, [], P)
+    evidence = judge(VolumeBalance(rig(None)), worn)
     assert evidence.verdict == "no leak"
     total_leakage = evidence.total_leakage
     assert total_leakage is not None
@@ -66,23 +66,23 @@ def test_a_leak_from_the_first_sample_is_stated(law: str) -> None:
 def test_the_smallest_step_is_found_and_half_of_it_is_not() -> None:
     detector = VolumeBalance(rig(None))
     for seed in (1, 2, 3):
-        smallest = detector.examine(machine(seed), [], P).total_leakage
+        smallest = judge(detector, machine(seed)).total_leakage
         assert smallest is not None
         assert smallest.findable_lpm is not None
         G = smallest.findable_lpm / LPM / smallest.pressure
-        assert detector.examine(machine(seed, G=step(0.0, 1.3 * G)), [], P).verdict == "leak"
-        assert detector.examine(machine(seed, G=step(0.0, 0.4 * G)), [], P).verdict == "no leak"
+        assert judge(detector, machine(seed, G=step(0.0, 1.3 * G))).verdict == "leak"
+        assert judge(detector, machine(seed, G=step(0.0, 0.4 * G))).verdict == "no leak"
 
 
 def test_against_what_a_healthy_machine_passes() -> None:
     unworn, worn = machine(1), machine(1, G=WORN)
     known = VolumeBalance(rig(2.0 * PUMP))
-    evidence = known.examine(worn, [], P)
+    evidence = judge(known, worn)
     assert evidence.verdict == "leak"
     assert evidence.onset_s is None
     assert evidence.leak_lpm == pytest.approx(flow(worn, WORN + PUMP), rel=0.1)
-    assert known.examine(worn, [], P).total_leakage.lpm == pytest.approx(flow(worn, WORN + PUMP), rel=0.05)
-    assert known.examine(unworn, [], P).verdict == "no leak"
+    assert judge(known, worn).total_leakage.lpm == pytest.approx(flow(worn, WORN + PUMP), rel=0.05)
+    assert judge(known, unworn).verdict == "no leak"
 
 
 def test_only_what_is_known_to_be_healthy_becomes_a_baseline() -> None:
@@ -104,7 +104,7 @@ def test_only_what_is_known_to_be_healthy_becomes_a_baseline() -> None:
 def test_no_leak_only_where_one_worth_finding_would_have_shown() -> None:
     """Pressures so noisy that a fiftieth of the pump's flow would not show."""
     noisy = machine(4, p_noise=2.0e6, x_step=2.0e-3)
-    evidence = VolumeBalance(rig(None)).examine(noisy, [], P)
+    evidence = judge(VolumeBalance(rig(None)), noisy)
     assert evidence.verdict == "cannot tell"
 
 

@@ -16,8 +16,8 @@ from sealscope.simulation.bench.machines import draw
 from sealscope.simulation.simulate import simulate_experiment
 
 from .balance_machine import irregular, machine, step
+from .judging import judge
 
-P = 0.01
 LPM = 6.0e4
 Records = Callable[..., Recording]
 
@@ -48,7 +48,7 @@ def flow_of(recording: Recording, G: float, start: float = 60.0) -> float:
 
 
 def test_finds_a_leak_its_onset_and_its_size(detector: VolumeBalance, worn: Recording) -> None:
-    result = detector.examine(worn, [], P)
+    result = judge(detector, worn)
     assert result.verdict == "leak"
     assert result.score is not None and result.threshold is not None and result.score > result.threshold
     assert result.onset_s == pytest.approx(60.0, abs=1.5)
@@ -65,7 +65,7 @@ def test_finds_a_leak_its_onset_and_its_size(detector: VolumeBalance, worn: Reco
 
 
 def test_a_sound_machine_is_sound(detector: VolumeBalance, tight: Recording) -> None:
-    result = detector.examine(tight, [], P)
+    result = judge(detector, tight)
     assert result.verdict == "no leak"
     assert result.leak_lpm is None and result.onset_s is None
     assert result.bound_lpm is not None and result.bound_lpm < 3e-4
@@ -82,7 +82,7 @@ SIGNS: dict[str, Callable[[Recording], Recording]] = {
 
 @pytest.mark.parametrize("turned", SIGNS)
 def test_no_sign_convention_is_assumed(detector: VolumeBalance, worn: Recording, turned: str) -> None:
-    plain, other = detector.examine(worn, [], P), detector.examine(SIGNS[turned](worn), [], P)
+    plain, other = judge(detector, worn), judge(detector, SIGNS[turned](worn))
     assert other.verdict == "leak"
     assert other.score == pytest.approx(plain.score, rel=0.2)
     assert other.leak_lpm == pytest.approx(plain.leak_lpm, rel=0.02)
@@ -97,13 +97,13 @@ def test_duties_that_do_not_repeat_and_loads(detector: VolumeBalance) -> None:
             machine(seed, G=step(0.0, 3.0e-13), speed=irregular(seed), load=push, p_noise=noise, bias=bias)
             for noise, bias in ((8000.0, 10e3), (0.0, 0.0))
         )
-        result = detector.examine(worn, [], P)
+        result = judge(detector, worn)
         assert result.verdict == "leak"
         assert result.onset_s == pytest.approx(60.0, abs=4.0)
         assert result.leak_interval_lpm is not None
         # noise and zero errors of the pressures make their difference look larger or smaller than what leaks
         assert result.leak_interval_lpm[0] <= flow_of(quiet, 3.0e-13) <= result.leak_interval_lpm[1]
-        assert detector.examine(machine(seed, speed=irregular(seed), load=push), [], P).verdict == "no leak"
+        assert judge(detector, machine(seed, speed=irregular(seed), load=push)).verdict == "no leak"
 
 
 def test_a_duty_that_changes_is_no_leak(detector: VolumeBalance) -> None:
@@ -114,13 +114,13 @@ def test_a_duty_that_changes_is_no_leak(detector: VolumeBalance) -> None:
         return np.where(t < 60.0, 0.0, 5.0e4)
 
     for seed in range(4):
-        assert detector.examine(machine(seed, speed=speed, load=load, ratio=1.002), [], P).verdict == "no leak"
+        assert judge(detector, machine(seed, speed=speed, load=load, ratio=1.002)).verdict == "no leak"
 
 
 def test_a_pump_that_warms_up_is_no_leak(detector: VolumeBalance) -> None:
     for seed, tau in enumerate((10.0, 40.0, 100.0)):
         warm = machine(seed, G_pump=lambda t, tau=tau: 2.4e-13 * (1.0 - 0.3 * np.exp(-t / tau)))
-        assert detector.examine(warm, [], P).verdict == "no leak"
+        assert judge(detector, warm).verdict == "no leak"
 
 
 @pytest.mark.parametrize("omega", [0.3, 2.0])
@@ -129,7 +129,7 @@ def test_a_leak_worth_finding_is_two_percent_of_the_pumps_flow_however_long_the_
 ) -> None:
     """Blocks shorter than a cycle of 21 s hold a part of its flow: far less would have shown, and 2 % was denied."""
     loaded = machine(3, speed=lambda t: 12.0 * np.sin(omega * t), load=3e5, G_pump=lambda t: 2.4e-13 * (1 + t / 1200))
-    evidence = detector.examine(loaded, (), P)
+    evidence = judge(detector, loaded)
     assert evidence.total_leakage is not None
     assert 1e-4 < (evidence.total_leakage.findable_share or 1.0) < 0.005
     assert evidence.verdict == "no leak"
@@ -139,7 +139,7 @@ def test_under_a_weight_that_is_held_a_leak_inside_is_none_to_the_outside() -> N
     """What swings alone showed a steady flow of 0.02 L/min to the outside beside it: `no leak` for 14 of 96 leaks."""
     drawn = draw("load", 100, rig="thesis-closed-loop", duration=120.0, family="resting, loop closed")
     leaks = simulate_experiment(drawn.experiment(seed=100, leak="0.0015 L/min from 60 s"))
-    result = VolumeBalance(load_rig("thesis-closed-loop")).examine(leaks.recording, [], P)
+    result = judge(VolumeBalance(load_rig("thesis-closed-loop")), leaks.recording)
     assert result.verdict == "leak" and result.cause in ("piston leak", "piston or pump leak"), result.reason
     assert result.leak_interval_lpm is not None
     assert result.leak_interval_lpm[0] <= leaks.truth.mean_leak_lpm <= result.leak_interval_lpm[1]
@@ -149,7 +149,7 @@ def test_an_encoder_that_slips_is_no_leak(detector: VolumeBalance) -> None:
     healthy = machine(7)
     for factor in (1.01, 0.99):
         move = np.diff(healthy["theta"], prepend=0.0) * np.where(healthy.t < 60.0, 1.0, factor)
-        result = detector.examine(with_channels(healthy, theta=np.cumsum(move)), [], P)
+        result = judge(detector, with_channels(healthy, theta=np.cumsum(move)))
         assert result.verdict != "leak"
         if result.score is not None and result.threshold is not None and result.score > result.threshold:
             assert result.cause == "sensor fault"
@@ -160,7 +160,7 @@ def test_oil_lost_to_the_outside_is_no_piston_leak(detector: VolumeBalance, chan
     """A side loses what its pressure drives out; half of that is a motion that no pressure difference explains."""
     healthy = machine(8)
     lost = np.cumsum(np.where(healthy.t < 60.0, 0.0, 4.0e-13 * healthy[channel])) / healthy.rate
-    result = detector.examine(with_channels(healthy, x=healthy["x"] + 0.5 * towards * lost / 633e-6), [], P)
+    result = judge(detector, with_channels(healthy, x=healthy["x"] + 0.5 * towards * lost / 633e-6))
     assert result.cause == "external leak"
     assert result.verdict != "leak"
 
@@ -179,45 +179,45 @@ MENDED: dict[str, Callable[[Recording], Recording]] = {
 
 @pytest.mark.parametrize("trouble", MENDED)
 def test_lives_with_what_a_rig_does(detector: VolumeBalance, worn: Recording, tight: Recording, trouble: str) -> None:
-    result = detector.examine(MENDED[trouble](worn), [], P)
+    result = judge(detector, MENDED[trouble](worn))
     assert result.verdict == "leak"
     assert result.onset_s == pytest.approx(60.0, abs=2.0)
     assert result.leak_lpm == pytest.approx(flow_of(worn, 3.0e-13), rel=0.15)
-    assert detector.examine(MENDED[trouble](tight), [], P).verdict == "no leak"
+    assert judge(detector, MENDED[trouble](tight)).verdict == "no leak"
 
 
 @pytest.mark.parametrize("factor, offset", [(3.0, 0.0), (1.0, 1.0e5), (1.0 / 6894.757, -50.0)])
 def test_neither_unit_nor_zero_of_the_pressures_matters(
     detector: VolumeBalance, worn: Recording, factor: float, offset: float
 ) -> None:
-    plain = detector.examine(worn, [], P)
+    plain = judge(detector, worn)
     for names in (("p_A", "p_B"), ("p_A", "p_B", "p_1", "p_2")):
         scaled = with_channels(worn, **{name: factor * worn[name] + offset for name in names})
-        other = detector.examine(scaled, [], P)
+        other = judge(detector, scaled)
         assert other.verdict == plain.verdict
         assert other.onset_s == pytest.approx(plain.onset_s, abs=1.5)
         assert other.leak_lpm == pytest.approx(plain.leak_lpm, rel=0.02)
 
 
 def test_deterministic_and_on_the_recordings_own_clock(detector: VolumeBalance, worn: Recording) -> None:
-    one, again = detector.examine(worn, [], P), detector.examine(worn, [], P)
+    one, again = judge(detector, worn), judge(detector, worn)
     assert (one.score, one.threshold, one.onset_s, one.leak_lpm) == (
         again.score,
         again.threshold,
         again.onset_s,
         again.leak_lpm,
     )
-    later = detector.examine(replace(worn, t=worn.t + 1000.0), [], P)
+    later = judge(detector, replace(worn, t=worn.t + 1000.0))
     assert later.onset_s == pytest.approx(one.onset_s + 1000.0, abs=1e-6)
     assert later.score == pytest.approx(one.score, rel=1e-9)
 
 
 def test_on_the_simulated_rig(detector: VolumeBalance, leaky: Recording, healthy: Recording) -> None:
-    result = detector.examine(leaky, [], P)
+    result = judge(detector, leaky)
     assert result.verdict == "leak"
     assert result.onset_s == pytest.approx(60.0, abs=1.5)
     assert result.leak_lpm == pytest.approx(0.0042, rel=0.05)
-    assert detector.examine(healthy, [], P).verdict == "no leak"
+    assert judge(detector, healthy).verdict == "no leak"
 
 
 def test_what_a_pump_loses_over_speed_is_no_leak_and_hides_none() -> None:

@@ -19,7 +19,9 @@ from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import Run, simulate_experiment
 from sealscope.units import LITRE_PER_MINUTE
 
-RATE, SECONDS, P = 200.0, 120.0, 0.01
+from .judging import judge
+
+RATE, SECONDS = 200.0, 120.0
 RIG = load_rig("thesis-closed-loop")
 D = RIG.pump.q_b / (2.0 * math.pi)
 DOUBLE, SINGLE = "thesis-closed-loop", "single-rod-eha"
@@ -46,7 +48,7 @@ def balanced(
 def examined(recording: Recording, rig: str = "thesis-closed-loop") -> Evidence:
     detector = VolumeBalance(load_rig(rig))
     assert detector.usable(recording) is None
-    return detector.examine(recording, [], P)
+    return judge(detector, recording)
 
 
 @settings(max_examples=10, deadline=None)
@@ -164,7 +166,7 @@ def test_what_a_held_load_loses_shows_by_how_it_gives_way(G: float) -> None:
     assert balance is not None
     assert balance.level.low <= G <= balance.level.high
     assert (balance.level.high - balance.level.low) * 5e6 < 0.005 * LITRE_PER_MINUTE
-    assert detector.examine(recording, [], P).verdict != "leak"
+    assert judge(detector, recording).verdict != "leak"
 
 
 def test_a_valve_that_may_feed_a_held_load_tells_nothing() -> None:

@@ -2,16 +2,17 @@
 
 After each reversal the oil columns ring; a leak damps them, so the energy of their band changes. The record is cut into
 blocks, and the blocks of its second half (or of all of it, where leak-free recordings are given) are compared with the
-leak-free ones by Student's t.
+leak-free ones by Student's t. It reports the chance of the difference; Sealscope decides what that means.
 """
 
 import math
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import stdtrit
+from scipy.special import stdtr
 
-from sealscope.diagnosis.verdict.evidence import Evidence
+from sealscope.diagnosis.detector import make_observable
+from sealscope.diagnosis.inference.observable import Observed
 from sealscope.parameters import Rig
 from sealscope.recordings import Recording
 from sealscope.signals.details import details
@@ -59,22 +60,18 @@ class RingingEnergy:
                 return f"{name} is constant"
         return None
 
-    def examine(self, recording: Recording, baseline: Sequence[Recording], false_alarm_probability: float) -> Evidence:
+    def observe(self, recording: Recording, baseline: Sequence[Recording] = ()) -> Observed:
         chambers = [name for name in CHAMBERS if name in recording]
-        parts = []
+        changes = []
         for chamber in chambers:
             energy = log_energy(recording, chamber)
-            known = [log_energy(one, chamber) for one in baseline if chamber in one]
+            healthy = [log_energy(other, chamber) for other in baseline if chamber in other]
             half = energy.size // 2
-            before, after = (np.concatenate(known), energy) if known else (energy[:half], energy[half:])
+            before, after = (np.concatenate(healthy), energy) if healthy else (energy[:half], energy[half:])
             if not np.isfinite(energy).all() or not np.isfinite(before).all():
-                return Evidence("cannot tell", f"{chamber} does not move all the time")
-            # both chambers may raise the alarm, each gets its share of the probability
-            tail = false_alarm_probability / (2 * len(chambers))
-            score, threshold = abs(student_t(before, after)), float(stdtrit(before.size + after.size - 2, 1 - tail))
-            change = 100 * math.expm1(after.mean() - before.mean())
-            reason = f"the energy of the ringing of {chamber} changed by {change:+.1f} %"
-            verdict = "leak" if score > threshold else "no leak"
-            parts.append(Evidence(verdict, reason, score, threshold, detector=f"ringing of {chamber}"))
-        strongest = max(parts, key=lambda part: part.score / part.threshold)
-        return Evidence(strongest.verdict, strongest.reason, strongest.score, strongest.threshold, parts=tuple(parts))
+                return Observed(self.name, lack=f"{chamber} does not move all the time")
+            tail = stdtr(before.size + after.size - 2, -abs(student_t(before, after)))
+            # a rise or a fall, in either chamber: as many tests, of which the rarest counts
+            chance = min(1.0, 2 * len(chambers) * float(tail))
+            changes.append(make_observable(f"ringing of {chamber}", chance, size=after.mean() - before.mean()))
+        return Observed(self.name, tuple(changes))

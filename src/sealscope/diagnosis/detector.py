@@ -11,12 +11,15 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from sealscope.diagnosis.inference.observable import Observable, Observed
+from sealscope.diagnosis.inference.onset import Interval
 from sealscope.recordings.recording import Recording
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 _log = logging.getLogger(__name__)
+#: Data of a user's own detector (`decision/events.toml`).
+PLUG_IN = "plug-in"
 
 
 class Detector(Protocol):
@@ -56,6 +59,27 @@ def unusable(detector: Detector, recording: Recording) -> str | None:
     if not isinstance(reason, str):
         raise TypeError(f"usable must give None or a reason, got {reason!r}")
     return " ".join(reason.split()) or "the recording cannot be used"
+
+
+def make_observable(
+    name: str, chance: float, *, size: float = 0.0, onset: tuple[float, float, float] | None = None
+) -> Observable:
+    """Make the observable of a user's own detector, which a piston leak moves, from its chance alone.
+
+    Parameters
+    ----------
+    name : str
+        What changed, in plain words.
+    chance : float
+        Probability that a healthy recording shows as much; of several tests the rarest one's, times their number.
+    size : float
+        The change, in the detector's own unit; negative for a fall.
+    onset : tuple of float, optional
+        When it changed, with its 95 % interval [s]: (value, low, high).
+    """
+    score = -2.0 * float(np.log(max(chance, np.finfo(float).tiny)))
+    when = None if onset is None else Interval(*onset)
+    return Observable(name=name, data=PLUG_IN, score=score, chance=float(chance), onset=when, size=float(size))
 
 
 def checked(report: Any, name: str) -> Observed:

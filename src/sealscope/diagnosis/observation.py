@@ -9,14 +9,14 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from sealscope.diagnosis.decision.case import step_key
+from sealscope.diagnosis.decision.combination import ORDER
 from sealscope.diagnosis.decision.null import HealthyNull, key_of
 from sealscope.diagnosis.detector import Detector, checked, failure, unusable
 from sealscope.diagnosis.inference.changes.signals import observe_signals
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.learnt import Healthy, Learnt, lessons_of
-from sealscope.diagnosis.registry import DETECTORS, detectors
+from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.rms_change.detector import RmsChange, compare_lessons
-from sealscope.diagnosis.verdict.evidence import RMS_CHANGE
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.motion import does_not_move
 from sealscope.recordings.recording import Recording, remembered
@@ -77,13 +77,15 @@ def _unusable(detector: Detector, healthy: Healthy) -> str | None:
 
 def rarities_of(recording: Recording, rig: Rig | str | os.PathLike[str]) -> Mapping[str, float]:
     """Compute how rare each change within a healthy recording is, by the key of its observable."""
-    return remembered(recording, (RARITIES, str(rig) if not isinstance(rig, Rig) else rig), lambda own: _rarities(own, rig))
+    return remembered(
+        recording, (RARITIES, str(rig) if not isinstance(rig, Rig) else rig), lambda own: _rarities(own, rig)
+    )
 
 
 def _rarities(recording: Recording, rig: Rig | str | os.PathLike[str]) -> Mapping[str, float]:
     reports = [observe_signals(recording)]
-    for name in DETECTORS:
-        if name != RMS_CHANGE and (name == "volume balance" or not reports[-1].leak):
+    for name in ORDER:
+        if name in detectors() and not reports[-1].leak:
             reports.append(run_detector(name, recording, (), rig))
     rarities: dict[str, float] = {}
     for report in reports:
@@ -111,7 +113,8 @@ def null_of(baseline: Sequence[Healthy], rig: Rig | str | os.PathLike[str]) -> H
 
 def compare_healthy(baseline: Sequence[Healthy]) -> Iterator[Sequence[Observable]]:
     """Yield what each healthy recording's ringing shows against all others."""
-    lessons = lessons_of(RmsChange(), baseline)
+    detector = RmsChange()
+    lessons = lessons_of(detector, [healthy for healthy in baseline if _unusable(detector, healthy) is None])
     alike = [own for own in lessons if own["chambers"] == lessons[0]["chambers"] and own["rate"] == lessons[0]["rate"]]
     for k, lesson in enumerate(alike if len(alike) > FEWEST else ()):
         yield compare_lessons(lesson, alike[:k] + alike[k + 1 :], lesson["chambers"])[0]

@@ -99,7 +99,7 @@ class Rise(NamedTuple):
             return float(-0.5 * (self.freedom + 1.0) * np.log1p(z * z / self.freedom))
         weights, deviations, centres = self.parts
         parts = np.log(np.maximum(weights, np.finfo(float).tiny)) - np.log(deviations)
-        return float(np.logaddexp.reduce(parts - 0.5 * ((value + centres) / deviations) ** 2))
+        return float(np.logaddexp.reduce(parts - 0.5 * ((value - centres) / deviations) ** 2))
 
     def bound(self, probability: float = 0.95) -> float:
         """Return the upper bound that holds with a probability; a rise below zero does not make it smaller."""

@@ -1,0 +1,101 @@
+"""The table of events is complete, and speaks of observables that some provider makes."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator
+from dataclasses import replace
+from fnmatch import fnmatchcase
+from functools import cache
+from importlib.resources import files
+from itertools import product
+from typing import get_args
+
+import numpy as np
+import pytest
+
+import sealscope as ss
+from sealscope.diagnosis.detector import make_observable
+from sealscope.diagnosis.inference.changes.levels import PATTERNS
+from sealscope.diagnosis.inference.changes.signals import observe_signals
+from sealscope.diagnosis.inference.changes.volumes import OUTSIDE, SCALE
+from sealscope.diagnosis.inference.pressures.response import PARAMETERS
+from sealscope.diagnosis.inference.terms import BIAS, circulation, equations, locked
+from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.rms_change.blocks import JUDGED
+from sealscope.diagnosis.verdict.evidence import Cause
+from sealscope.parameters import load_rig
+from sealscope.parameters.load import rig_names
+from sealscope.signals.details import QUANTITIES
+
+ROWS = tomllib.loads((files("sealscope.diagnosis.decision") / "events.toml").read_text("utf-8"))
+KEYS = {"cause", "probability", "moves", "words"}
+CHANNELS = frozenset({"u", "theta", "omega", "q_pump", "x", "p_1", "p_2", "p_A", "p_B"})
+#: Channels of which a recording may have one only, to find what each balance follows.
+SOURCES = ({"theta"}, {"omega"}, {"q_pump"}, {"u"}, set())
+
+
+def volume_names() -> Iterator[str]:
+    """Yield what the balances of all packaged rigs follow."""
+    yield from (SCALE, OUTSIDE, "zero of the flow")
+    for name, source, rest in product(rig_names(), SOURCES, ({"x", "p_1", "p_2"}, {"x"}, set())):
+        channels = frozenset({"p_A", "p_B", "u"} | source | rest)
+        rig = load_rig(name)
+        balances = [*equations(rig, channels), circulation(rig, channels), locked(rig, channels)]
+        for term in (term for balance in balances if balance for term in balance.terms):
+            if term.name != BIAS and not term.compared and not term.name.startswith("motion"):
+                yield term.name
+
+
+@cache
+def known_names() -> frozenset[str]:
+    """Collect what providers report, as "data: name"."""
+    names = {f"volumes: {name}" for name in volume_names()} | {f"response: {name}" for name in PARAMETERS}
+    names |= {f"levels: {name}" for name, _ in PATTERNS} | {"levels: what feeds both chambers"}
+    names.add("motion: motion")
+    names |= {f"levels: scale of {chamber}" for chamber in ("p_A", "p_B")}
+    names |= {f"hum: hum of {hertz:g} Hz" for hertz in priors("inference.changes")["features"]["mains"]}
+    for way, quantity, chamber in product(("rise", "fall"), QUANTITIES, ("p_A", "p_B")):
+        data = "details" if quantity in JUDGED else "noise of details"
+        names.add(f"{data}: {way} of {quantity} of {chamber}")
+    change = make_observable("stroke time", 0.5)
+    names.add(f"{change.data}: {change.name}")
+    recording = ss.simulate(command="3 sin(4t)", duration="40 s", seed=1)
+    late = recording.t > 20.0
+    larger = {name: np.where(late, 1.3, 1.0) * recording[name] for name in ("u", "x")}
+    swapped = {
+        name: np.where(late, recording[other], recording[name]) for name, other in (("p_A", "p_B"), ("p_B", "p_A"))
+    }
+    for changed in (larger, swapped):
+        report = observe_signals(replace(recording, channels={**recording.channels, **changed}))
+        names |= {f"{observable.data}: {observable.name}" for observable in report.observables}
+    return frozenset(names)
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_every_row_is_complete(name: str) -> None:
+    row = ROWS[name]
+    assert KEYS <= set(row) <= KEYS | {"disturbs"}
+    assert row["cause"] in (*get_args(Cause), "")
+    assert row["moves"] and row["words"]
+    assert set(row["probability"]) == {"value", "unit", "source"}
+    assert 0.0 < row["probability"]["value"] < 1.0
+    assert row["probability"]["unit"] == "1" and row["probability"]["source"]
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_every_pattern_matches_what_some_provider_makes(name: str) -> None:
+    patterns = ROWS[name]["moves"] + ROWS[name].get("disturbs", [])
+    dead = [pattern for pattern in patterns if not any(fnmatchcase(known, pattern) for known in known_names())]
+    assert dead == []
+
+
+def test_whatever_a_provider_makes_shows_some_event() -> None:
+    """That every coefficient may change in a pause does not count."""
+    patterns = [pattern for name, row in ROWS.items() if name != "regime" for pattern in row["moves"]]
+    unexplained = [key for key in known_names() if not any(fnmatchcase(key, pattern) for pattern in patterns)]
+    assert sorted(unexplained) == []
+
+
+def test_what_may_happen_in_a_recording_is_less_than_certain() -> None:
+    assert sum(row["probability"]["value"] for row in ROWS.values()) < 1.0

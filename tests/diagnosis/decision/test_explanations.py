@@ -1,0 +1,132 @@
+"""Probabilities of sets of events: by closed forms, and what neither adds to nor takes from a leak."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import t as student
+
+from sealscope.diagnosis.decision.events import load_events
+from sealscope.diagnosis.decision.explanations import (
+    LEAK_EVENTS,
+    LeakRise,
+    explain,
+    log_bayes_factor,
+    probability_of,
+)
+from sealscope.diagnosis.inference.scatter import Rise
+from sealscope.diagnosis.priors import priors
+
+from .cases import observable
+
+EVENTS = {event.name: event for event in load_events()}
+LEAK = observable("volumes: leak", 1e-12)
+NOISE = observable("noise: noise of the pressures", 1e-30)
+
+
+def leak_probability(*observables: object) -> float:
+    return probability_of(explain(observables), *LEAK_EVENTS, data="volumes")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("chance", [1e-2, 1e-6, 1e-40])
+def test_a_chance_is_worth_the_bound_of_sellke_within_the_misfit(chance: float) -> None:
+    bound = -math.log(-math.e * chance * math.log(chance))
+    misfit = priors("decision")["explanation"]["misfit"]
+    assert log_bayes_factor(chance) == pytest.approx(bound / (1.0 + 2.0 * misfit * bound))
+    assert bound > 0.0
+
+
+def test_what_is_not_rare_is_worth_nothing() -> None:
+    assert log_bayes_factor(0.4) == log_bayes_factor(1.0) == 0.0
+    chances = np.geomspace(1e-300, 1.0, 200)
+    assert np.all(np.diff([log_bayes_factor(chance) for chance in chances]) <= 0.0)
+
+
+def test_one_observable_by_hand() -> None:
+    """Events that move it earn its Bayes factor, all others their probability, and pairs of the former both."""
+    factor = math.exp(log_bayes_factor(LEAK.chance))
+    moving = [event.probability for event in EVENTS.values() if event.does_move(LEAK)]
+    silent = sum(event.probability for event in EVENTS.values() if not event.does_move(LEAK))
+    pairs = 0.5 * (sum(moving) ** 2 - sum(p * p for p in moving))
+    triples = (sum(moving) ** 3 - 3 * sum(moving) * sum(p * p for p in moving) + 2 * sum(p**3 for p in moving)) / 6
+    total = factor * (sum(moving) + pairs + triples) + silent
+    explained = explain([LEAK])
+    alone = next(row for row in explained if [event.name for event in row.events] == ["piston leak"])
+    assert alone.probability == pytest.approx(factor * EVENTS["piston leak"].probability / total, rel=1e-9)
+    assert sum(row.probability for row in explained) == pytest.approx(1.0)
+
+
+def test_a_noise_step_beside_a_leak_leaves_the_leak() -> None:
+    alone, beside = leak_probability(LEAK), leak_probability(LEAK, NOISE)
+    assert beside == pytest.approx(alone, abs=0.02)
+    best = explain([LEAK, NOISE])[0]
+    assert {event.name for event in best.events} == {"piston leak", "noise of a pressure"}
+
+
+def test_data_that_no_event_moves_earn_nothing() -> None:
+    before, after = explain([LEAK]), explain([LEAK, observable("weather: rain", 1e-200)])
+    assert [row.probability for row in after] == pytest.approx([row.probability for row in before])
+
+
+def test_three_things_that_happen_are_three_events() -> None:
+    happened = [LEAK, NOISE, observable("duty: size of the duty", 1e-30, onset=20.0)]
+    names = {event.name for event in explain(happened)[0].events}
+    assert names == {"piston leak", "noise of a pressure", "duty"}
+    assert leak_probability(*happened) > 0.5
+
+
+def test_what_an_event_disturbs_speaks_for_it_only_where_it_shows_itself() -> None:
+    ringing = observable("details: rise of d3 of p_A", 1e-9)
+    friction = observable("levels: friction", 1e-9)
+    assert probability_of(explain([ringing]), "friction") < 2.0 * EVENTS["friction"].probability
+    assert probability_of(explain([ringing, friction]), "friction") > 0.5
+    later = observable("details: rise of d3 of p_A", 1e-9, onset=90.0)
+    together, apart = (
+        next(row for row in explain([friction, own]) if [event.name for event in row.events] == ["friction"])
+        for own in (ringing, later)
+    )
+    assert together.data == {"levels", "details"}
+    assert together.probability > 100.0 * apart.probability
+
+
+def test_rivals_of_the_same_data_are_not_added_up() -> None:
+    """Two descriptions of one residual are one: a second one as good adds nothing to the first."""
+    twice = [LEAK, observable("volumes: leak through an orifice", LEAK.chance)]
+    assert leak_probability(*twice) == pytest.approx(leak_probability(LEAK))
+
+
+def test_the_likelier_of_two_rivals_is_the_more_probable() -> None:
+    for data, first, second in (
+        ("volumes", "leak", "pump leak"),
+        ("levels", "zero of p_A", "zero of p_B"),
+        ("levels", "zero of p_A", "friction"),
+    ):
+        ratios = []
+        for chance in (1e-9, 1e-12, 1e-15):
+            explained = explain([observable(f"{data}: {first}", chance), observable(f"{data}: {second}", 1e-9)])
+            ratios.append(
+                probability_of(explained, *(e for e in EVENTS if EVENTS[e].does_move(explained_by(data, first))))
+            )
+        assert ratios == sorted(ratios)
+
+
+def explained_by(data: str, name: str) -> object:
+    return observable(f"{data}: {name}", 0.5)
+
+
+def test_a_leak_within_and_one_against_healthy_recordings_are_one() -> None:
+    """A rise as large as the step makes is the same leak; none at all speaks against a step of that size."""
+    rises = [Rise(value, 1.0, 30.0) for value in (6.0, 0.0)]
+    with_rise, without = (
+        probability_of(explain([LEAK], rise=LeakRise(rise, 6.0)), *LEAK_EVENTS, data="volumes") for rise in rises
+    )
+    assert with_rise > leak_probability(LEAK) > without
+    ratio = rises[0].log_ratio(6.0)
+    assert ratio == pytest.approx(float(student.logpdf(0.0, 30) - student.logpdf(6.0, 30)))
+
+
+def test_a_leak_from_the_start_shows_by_its_rise_alone() -> None:
+    explained = explain([], rise=LeakRise(Rise(12.0, 1.0, 30.0), 0.0))
+    assert probability_of(explained, *LEAK_EVENTS) > 0.95
