@@ -15,6 +15,7 @@ from sealscope.diagnosis.decision.case import Context
 from sealscope.diagnosis.decision.combination import ORDER, combine, is_decided, rank
 from sealscope.diagnosis.decision.decide import decide
 from sealscope.diagnosis.decision.null import HealthyNull
+from sealscope.diagnosis.inference.balance_leak import BalanceLeak
 from sealscope.diagnosis.inference.changes.signals import SIGNALS, observe_signals
 from sealscope.diagnosis.inference.observable import Observed
 from sealscope.diagnosis.inspection import comparable, inspected
@@ -88,7 +89,8 @@ class Examination:
     @cached_property
     def null(self) -> HealthyNull:
         """What the healthy recordings show of every observable."""
-        return null_of(self.baseline, self.rig)
+        leak = self.report(ORDER[0]).leak
+        return null_of(self.baseline, self.rig, shut=isinstance(leak, BalanceLeak) and leak.balance.shut)
 
     def evidence(self, name: str) -> Evidence:
         """Decide by one detector alone; the change of RMS by its own rule, whatever else changed."""

@@ -9,10 +9,10 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from sealscope.diagnosis.decision.case import step_key
-from sealscope.diagnosis.decision.combination import ORDER
 from sealscope.diagnosis.decision.null import HealthyNull, key_of
 from sealscope.diagnosis.detector import Detector, checked, failure, unusable
 from sealscope.diagnosis.inference.changes.signals import observe_signals
+from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.learnt import Healthy, Learnt, lessons_of
 from sealscope.diagnosis.registry import detectors
@@ -23,6 +23,8 @@ from sealscope.recordings.recording import Recording, remembered
 
 #: The lesson that holds how rare a healthy recording's own observables are, by their keys.
 RARITIES = "rarities"
+#: What the keys of a balance begin with whose pump is cut off at rest.
+SHUT = "shut, "
 #: Fewest healthy recordings of which each can be compared with the others.
 FEWEST = 2
 #: Detectors that need no motion: what leaks may show at standstill.
@@ -76,17 +78,30 @@ def _unusable(detector: Detector, healthy: Healthy) -> str | None:
 
 
 def rarities_of(recording: Recording, rig: Rig | str | os.PathLike[str]) -> Mapping[str, float]:
-    """Compute how rare each change within a healthy recording is, by the key of its observable."""
-    return remembered(
-        recording, (RARITIES, str(rig) if not isinstance(rig, Rig) else rig), lambda own: _rarities(own, rig)
-    )
+    """Compute how rare each change within a healthy recording is, by the key of its observable.
+
+    Those of a balance whose pump is cut off at rest begin with `SHUT`.
+    """
+    key = (RARITIES, rig if isinstance(rig, Rig) else str(rig))
+    return remembered(recording, key, lambda whole: _rarities(whole, rig))
 
 
 def _rarities(recording: Recording, rig: Rig | str | os.PathLike[str]) -> Mapping[str, float]:
-    reports = [observe_signals(recording)]
-    for name in ORDER:
-        if name in detectors() and not reports[-1].leak:
-            reports.append(run_detector(name, recording, (), rig))
+    rarities = _rarities_in([observe_signals(recording)])
+    balance, response = VolumeBalance(load_rig(rig)), "pressure response"
+    reports: Mapping[bool, Observed] = {}
+    if unusable(balance, recording) is None:
+        try:
+            with np.errstate(all="ignore"):
+                reports = balance.observe_regimes(recording)
+        except Exception as error:
+            failure(balance.name, None, error)
+    for shut, report in reports.items():
+        rarities |= {f"{SHUT if shut else ''}{key}": rarity for key, rarity in _rarities_in([report]).items()}
+    return rarities if reports else rarities | _rarities_in([run_detector(response, recording, (), rig)])
+
+
+def _rarities_in(reports: Sequence[Observed]) -> dict[str, float]:
     rarities: dict[str, float] = {}
     for report in reports:
         for observable in report.observables:
@@ -97,12 +112,15 @@ def _rarities(recording: Recording, rig: Rig | str | os.PathLike[str]) -> Mappin
     return rarities
 
 
-def null_of(baseline: Sequence[Healthy], rig: Rig | str | os.PathLike[str]) -> HealthyNull:
-    """Collect what healthy recordings show of every observable."""
+def null_of(baseline: Sequence[Healthy], rig: Rig | str | os.PathLike[str], *, shut: bool = False) -> HealthyNull:
+    """Collect what healthy recordings show of every observable; `shut`: by a balance whose pump is cut off at rest."""
     known = defaultdict[str, list[float]](list)
     for healthy in baseline:
         rarities = healthy.lessons.get(RARITIES) if isinstance(healthy, Learnt) else rarities_of(healthy, rig)
-        for key, rarity in (rarities or {}).items():
+        rarities = rarities or {}
+        if shut:
+            rarities = {**rarities, **{key.removeprefix(SHUT): value for key, value in rarities.items() if SHUT in key}}
+        for key, rarity in rarities.items():
             known[key].append(float(rarity))
     for observables in compare_healthy(baseline):
         for data in {observable.data for observable in observables}:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -155,7 +155,18 @@ class VolumeBalance:
         if balance is None:
             return Observed(self.name, lack=_NO_BALANCE["x" in recording].format(recording.duration))
         names = [name for name in balance.columns[0].names if name != TURNING]
-        healthy = [_sums_of(lesson, balance.shut) for lesson in lessons if lesson["terms"] == names]
+        return self._report(balance, [_sums_of(own, balance.shut) for own in lessons if own["terms"] == names])
+
+    def observe_regimes(self, recording: Recording) -> Mapping[bool, Observed]:
+        """Return what a recording shows by itself, with the pump in the circuit at rest (False) or cut off (True)."""
+        recorded = self._recorded(recording) if equations(self.rig, frozenset(recording.channels)) else None
+        regimes = [] if recorded is None else [recorded.open, recorded.shut]
+        balances = [self._balance(recording, regime) for regime in regimes if regime is not None]
+        if recorded is None:
+            balances = [balance for balance in (self.balance(recording),) if balance is not None]
+        return {balance.shut: self._report(balance, ()) for balance in balances}
+
+    def _report(self, balance: RecordedBalance, healthy: Sequence[RecordingSums]) -> Observed:
         leak, rows = BalanceLeak(self.name, balance, healthy), balance.blocks.rows
         if leak.step is None and leak.rise is None:
             why = "p_A and p_B hardly differ, or too few samples are whole: no leak would show"
