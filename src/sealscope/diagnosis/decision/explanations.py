@@ -6,8 +6,9 @@ beside a leak is two events, and never takes the leak away. The Bayes factor of 
 at most 1 / (-e p log p), 1 for p > 1/e (Sellke, Bayarri and Berger); p is the predictive chance that healthy
 recordings calibrate (`null`).
 
-A term describes a change to within a few per cent only: a logarithm B of a Bayes factor counts as B / (1 + 2 m B), with
-m the misfit (`priors.toml`), so that rivals of the same data are told apart no better than the terms are known.
+A term describes a change to within a few per cent only: logarithms of Bayes factors of the same data are divided by
+1 + 2 m B, with B the largest and m the misfit (`priors.toml`), so that rivals are told apart no better than the terms
+are known.
 
 Source: T. Sellke, M. J. Bayarri, J. O. Berger, The American Statistician 55 (2001) 62.
 """
@@ -81,7 +82,12 @@ def explain(
         The most probable first; their probabilities add up to one.
     """
     events = load_events()
-    weighted = [(own, log_bayes_factor(chance(own))) for own in observables]
+    factors = [(own, log_bayes_factor(chance(own))) for own in observables]
+    misfit: float = 2.0 * priors("decision")["explanation"]["misfit"]
+    largest: dict[str, float] = {}
+    for observable, factor in factors:
+        largest[observable.data] = max(factor, largest.get(observable.data, 0.0))
+    weighted = [(own, factor / (1.0 + misfit * largest[own.data])) for own, factor in factors]
     ways = {event.name: _ways_of(event, weighted, rise) for event in events}
     telling = [event for event in events if max(sum(gains.values()) for gains in ways[event.name]) > LEAST]
     groups = [(event,) for event in events]
@@ -130,12 +136,11 @@ def _ways_of(event: Event, weighted: Sequence[tuple[Observable, float]], rise: L
 
 
 def log_bayes_factor(chance: float) -> float:
-    """Compute the logarithm of the Bayes factor of a change of a chance, for terms that fit to within the misfit."""
+    """Compute the logarithm of the largest Bayes factor that a chance under the null allows."""
     if chance >= np.exp(-1.0):
         return 0.0
     chance = max(chance, np.finfo(float).tiny)
-    logarithm = -float(np.log(-np.e * chance * np.log(chance)))
-    return logarithm / (1.0 + 2.0 * priors("decision")["explanation"]["misfit"] * logarithm)
+    return -float(np.log(-np.e * chance * np.log(chance)))
 
 
 def _coincide(observable: Observable, anchor: Observable) -> bool:
