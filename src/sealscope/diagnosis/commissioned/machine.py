@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 import numpy as np
 
 from sealscope.calls import checked_call
+from sealscope.diagnosis.commissioned.lessons_file import check_lesson
 from sealscope.diagnosis.detector import failure, unusable
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY, diagnose
 from sealscope.diagnosis.inspection import inspected
@@ -271,7 +272,9 @@ def learn(recording: Recording, rig: Rig, file: str, checksum: str = "") -> Lear
                 detector = factory(rig)
                 if hasattr(detector, "learn") and unusable(detector, part) is None:
                     lesson = detector.learn(part)
-                    lessons |= {} if lesson is None else {name: lesson}
+                    if lesson is not None:
+                        check_lesson(name, lesson)
+                        lessons[name] = lesson
             except Exception as error:  # as in a diagnosis, a method that fails is left out
                 failure(name, getattr(factory, "distribution", None), error)
     if not lessons:
