@@ -170,7 +170,7 @@ def _unpack(value: Any, name: str) -> Any:
     return value
 
 
-_BY_METHOD = Annotated[make_table("allow", **_LESSONS), BeforeValidator(lambda value: _unpack(value, ""))]
+_BY_METHOD: Any = Annotated[make_table("allow", **_LESSONS), BeforeValidator(lambda value: _unpack(value, ""))]
 _LESSON = make_table(
     digest=Annotated[str, Field(min_length=1, max_length=200)],
     units=table_of(str),
