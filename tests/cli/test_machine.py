@@ -90,3 +90,22 @@ def test_a_link_is_written_through(call, healthy, tmp_path):
     link.unlink()
     link.symlink_to(link)
     assert "must be readable, got" in call("commission", new, "-o", link, "--add").refused()
+
+
+def test_damaged_lessons_are_one_line_of_every_command(call, healthy, tmp_path):
+    """And no verdict: what is not compared with them is not `no leak`."""
+    file = tmp_path / "m.toml"
+    call("commission", healthy, "-o", file, "--rig", "thesis")
+    lessons = tmp_path / "m.lessons"
+    lessons.write_bytes(lessons.read_bytes().replace(b'"rate":500.0', b'"rate":5000.0', 1))
+    run = healthy / "run1.nc"
+    for words in (
+        ("diagnose", run, "--machine", file),
+        ("commission", run, "-o", file, "--add"),
+        ("trend", healthy, "--machine", file),
+        ("report", healthy, "--machine", file, "-o", tmp_path / "page.html"),
+        ("plan", "--machine", file, "--find", "0.01 L/min"),
+    ):
+        refused = call(*words).refused()
+        assert "the lesson of run1.nc must have the SHA-256" in refused
+        assert "commission it anew" in refused

@@ -21,7 +21,7 @@ from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.motion import does_not_move
 from sealscope.recordings.recording import Recording, remembered
 
-#: The lesson that holds how rare a healthy recording's own observables are, by their keys.
+#: Under this key a recording remembers how rare its own observables are.
 RARITIES = "rarities"
 #: What the keys of a balance begin with whose pump is cut off at rest.
 SHUT = "shut, "
@@ -116,8 +116,7 @@ def null_of(baseline: Sequence[Healthy], rig: Rig | str | os.PathLike[str], *, s
     """Collect what healthy recordings show of every observable; `shut`: by a balance whose pump is cut off at rest."""
     known = defaultdict[str, list[float]](list)
     for healthy in baseline:
-        rarities = healthy.lessons.get(RARITIES) if isinstance(healthy, Learnt) else rarities_of(healthy, rig)
-        rarities = rarities or {}
+        rarities = healthy.statistics if isinstance(healthy, Learnt) else rarities_of(healthy, rig)
         if shut:
             rarities = {**rarities, **{key.removeprefix(SHUT): value for key, value in rarities.items() if SHUT in key}}
         for key, rarity in rarities.items():

@@ -13,6 +13,7 @@ import pytest
 
 import sealscope as ss
 from sealscope.diagnosis.commissioned.lessons_file import SUFFIX, Line, format_lesson, parse_lesson, read_lines
+from sealscope.diagnosis.rms_change.detector import RmsChange
 from sealscope.errors import InputError
 from sealscope.storage.plain_state import plain_array
 
@@ -215,6 +216,7 @@ HOSTILE = {
     "lessons/volume balance/flow": (-1.0, "flow"),
     "lessons/volume balance/start_s": (1e18, "start_s"),
     "lessons/rms change/duty": (packed([1.0, 2.0]), "levels and duty must be of the shapes (10,) and (4,)"),
+    "lessons/rms change/duty ": (packed([1.0, 2.0, 3.0, 1e9]), "must be logarithms"),
     "about/noise": ({"p_A": "x"}, "noise: p_A"),
     "lessons/volume balance/terms": (["a"], "sums must be of the shape"),
     "lessons/volume balance/pressure": (None, "pressure"),
@@ -271,3 +273,12 @@ def test_a_main_method_that_cannot_run_is_never_no_leak(machine, monkeypatch):
     assert diagnosis.verdict == "cannot tell"
     assert "volume balance cannot be computed on this recording: singular matrix" in diagnosis.reason
     assert ss.diagnose(judged).verdict == "cannot tell"
+
+
+def test_what_could_not_be_read_again_is_not_learnt(folder, tmp_path, monkeypatch):
+    """The other methods' lessons are kept, and the machine is written."""
+    learn = RmsChange.learn
+    monkeypatch.setattr(RmsChange, "learn", lambda *words: {**learn(*words), "levels": np.full(10, -np.inf)})
+    machine = ss.commission(folder / "run1.nc", rig="thesis")
+    assert "rms change" not in machine.healthy[0].lessons
+    assert len(ss.load_machine(ss.write_machine(machine, tmp_path / "m.toml")).healthy) == 1

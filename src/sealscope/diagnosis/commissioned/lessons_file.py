@@ -38,6 +38,8 @@ LARGEST, _LONGEST, _MOST = 50_000_000, 5_000_000, 5000
 _MARKS, _SHARE = 40, 0.1
 #: Largest size of a number: products of two do not overflow. Times are within the years that calendars have [s].
 _SIZE, _FIRST, _LAST = 1e100, -6.2e10, 2.5e11
+#: Largest size of the logarithm of a number that is neither zero nor infinite.
+_LOGARITHM = 750.0
 #: Length of a checksum in hexadecimal digits.
 _DIGITS = 64
 
@@ -109,6 +111,8 @@ def _check_levels(lesson: Any) -> Any:
     if not chambers or lesson.levels.shape != expected or lesson.duty.shape != (len(DUTY),):
         shapes = f"{lesson.levels.shape} and {lesson.duty.shape}"
         raise ValueError(f"levels and duty must be of the shapes {expected} and ({len(DUTY)},), got {shapes}")
+    if not max(np.abs(lesson.levels).max(), np.abs(lesson.duty).max()) < _LOGARITHM:
+        raise ValueError(f"levels and duty must be logarithms, of a size below {_LOGARITHM:g}")
     return lesson
 
 
@@ -166,6 +170,7 @@ def _unpack(value: Any, name: str) -> Any:
     return value
 
 
+_BY_METHOD: Any = Annotated[make_table("allow", **_LESSONS), BeforeValidator(lambda value: _unpack(value, ""))]
 _LESSON = make_table(
     digest=Annotated[str, Field(min_length=1, max_length=200)],
     units=table_of(str),
@@ -173,7 +178,7 @@ _LESSON = make_table(
     seconds=_Positive,
     start_s=(_Time, None),
     about=(make_table("allow", **{name: (kind, None) for name, kind in _ABOUT.items()}), None),
-    lessons=Annotated[make_table("allow", **_LESSONS), BeforeValidator(lambda value: _unpack(value, ""))],
+    lessons=_BY_METHOD,
     statistics=(Annotated[table_of(_Statistic), BeforeValidator(lambda value: _unpack(value, ""))], None),
 )
 
@@ -194,6 +199,16 @@ def _pack(value: Any) -> Any:
     if isinstance(value, list | tuple | np.ndarray):
         return [_pack(inner) for inner in (value.tolist() if isinstance(value, np.ndarray) else value)]
     return value
+
+
+def check_lesson(method: str, lesson: Mapping[str, Any]) -> None:
+    """Raise ArithmeticError where what a method has learnt could not be read again, as with infinite numbers."""
+    try:
+        packed = _pack(lesson)
+        json.dumps(packed, allow_nan=False)
+        as_type(_BY_METHOD, {method: packed})
+    except ValueError as error:
+        raise ArithmeticError(f"no lesson: {error}") from None
 
 
 def format_lesson(learnt: Learnt) -> Line:

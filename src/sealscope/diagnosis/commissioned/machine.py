@@ -15,11 +15,12 @@ import numpy as np
 
 from sealscope.calls import checked_call
 from sealscope.diagnosis.commissioned.cross_check import find_outliers, with_remarks, without_leaks
+from sealscope.diagnosis.commissioned.lessons_file import check_lesson
 from sealscope.diagnosis.detector import failure, unusable
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY, diagnose
 from sealscope.diagnosis.inspection import inspected
 from sealscope.diagnosis.learnt import Learnt, Lesson
-from sealscope.diagnosis.observation import RARITIES, rarities_of
+from sealscope.diagnosis.observation import rarities_of
 from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LEAK
@@ -277,16 +278,18 @@ def learn(recording: Recording, rig: Rig, file: str, checksum: str = "") -> Lear
                 detector = factory(rig)
                 if hasattr(detector, "learn") and unusable(detector, part) is None:
                     lesson = detector.learn(part)
-                    lessons |= {} if lesson is None else {name: lesson}
+                    if lesson is not None:
+                        check_lesson(name, lesson)
+                        lessons[name] = lesson
             except Exception as error:  # as in a diagnosis, a method that fails is left out
                 failure(name, getattr(factory, "distribution", None), error)
     if not lessons:
         raise InputError(f"a healthy recording must hold channels that a method reads, got none such ({file})")
-    lessons[RARITIES] = rarities_of(part, rig)
     units = {name: part.units[name] for name in part.channels}
     about = {"sha256": checksum, **about_recording(recording, inspection)}
     start = start_seconds(recording, file)
-    return Learnt(file, inspection.digest, units, part.rate, recording.duration, start, lessons, about)
+    rarities = dict(rarities_of(part, rig))
+    return Learnt(file, inspection.digest, units, part.rate, recording.duration, start, lessons, about, rarities)
 
 
 @checked_call

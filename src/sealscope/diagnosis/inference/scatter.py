@@ -79,14 +79,17 @@ class Rise(NamedTuple):
         return float(weights @ ndtr((centres - score * self.deviation) / deviations))
 
     def threshold(self, chance: float) -> float:
-        """Return the score that a healthy recording exceeds with a probability."""
+        """Return the score that a healthy recording exceeds with a probability; ArithmeticError where there is none."""
         from scipy.optimize import brentq
         from scipy.special import ndtri, stdtrit
 
         if self.parts is None:
             return float(stdtrit(self.freedom, 1.0 - chance))
         ends = np.sort((self.parts.centres - ndtri(chance) * self.parts.deviations) / self.deviation)
-        return float(brentq(lambda score: self._beyond(score) - chance, ends[0], ends[-1]))
+        try:
+            return float(brentq(lambda score: self._beyond(score) - chance, ends[0], ends[-1]))
+        except ValueError:  # no number lies between the ends
+            raise ArithmeticError("no threshold of such a scatter") from None
 
     def log_ratio(self, rise: float) -> float:
         """Return the logarithm of the likelihood of a true rise over that of none."""

@@ -60,10 +60,11 @@ def remove_dropouts(recording: Recording) -> Recording:
 def remove_impossible(recording: Recording) -> Recording:
     """Mark samples as missing that are beyond what any sensor reads (`quality.flag_impossible`).
 
-    Returns the recording itself where there are none.
+    Where a channel has many of them its unit is wrong: it stays. Returns the recording itself where there are none.
     """
-    wrong = {name: flag_impossible(values, recording.units[name]) for name, values in recording.channels.items()}
-    if not any(flags.any() for flags in wrong.values()):
+    flags = {name: flag_impossible(values, recording.units[name]) for name, values in recording.channels.items()}
+    wrong = {name: own & (np.mean(own) <= LONGEST_SHARE) for name, own in flags.items() if len(own)}
+    if not any(own.any() for own in wrong.values()):
         return recording
     channels = {name: np.where(wrong[name], np.nan, values) for name, values in recording.channels.items()}
     return replace(recording, channels=channels)
