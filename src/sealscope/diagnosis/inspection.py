@@ -7,7 +7,7 @@ samples of another recording, are left out for all detectors alike.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import sha256
 from typing import NamedTuple
@@ -19,7 +19,7 @@ from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.corrections.clock import even_clock
 from sealscope.recordings.corrections.gaps import bridge, filled
 from sealscope.recordings.corrections.spikes import without_spikes
-from sealscope.recordings.corrections.stale import without_stale_samples
+from sealscope.recordings.corrections.stale import MOST_STUCK, stuck_rows, without_stale_samples
 from sealscope.recordings.corrections.unsigned import with_signed_speed
 from sealscope.recordings.formats.columns import counted, listed
 from sealscope.recordings.hydraulics import lack_of_chambers, no_readings
@@ -81,6 +81,10 @@ def _inspection(recording: Recording, names: Sequence[str]) -> Inspection:
     if "u" in part and not np.any(np.isfinite(part["u"])):  # `inspect` reports it; the pressures can do without
         part = part.only(name for name in part.channels if name != "u")
     needed = (*chambers, "u") if "u" in part else chambers
+    stuck = {name: rows for name in chambers if (rows := stuck_rows(part, name)).any()}
+    held = [name for name, rows in stuck.items() if np.mean(rows) > MOST_STUCK]
+    missing = {name: np.where(rows, np.nan, part[name]) for name, rows in stuck.items() if name not in held}
+    part = replace(part, channels={**part.channels, **missing}) if missing else part
     for correct in (without_spikes, without_stale_samples):
         part, found = correct(part)
         findings += found
@@ -104,7 +108,8 @@ def _inspection(recording: Recording, names: Sequence[str]) -> Inspection:
         if known.size:
             text = f"analysed from {part.t[0]:.4g} s to {part.t[-1]:.4g} s: {len(part)} of {count} samples"
             findings.append(Finding("part_analysed", "warning", None, count - len(part), float(part.t[0]), text))
-    wrong = [own for own in findings if own.channel in chambers and own.code in ("constant", "stuck")]
+    wrong = [own for own in findings if own.channel in chambers and own.code == "constant"]
+    wrong += [own for own in findings if own.channel in held and own.code == "stuck"]
     lost = [own for own in findings if own.channel in chambers and own.code == "clipped" and own.count > len(part) / 2]
     wrong += lost if len(lost) == len(chambers) else []  # else the other one says what it says
     distrust = f"the pressures cannot be trusted: {wrong[0].text}" if wrong else None
