@@ -216,3 +216,20 @@ def test_a_pressure_that_rests_with_the_machine_is_not_stuck() -> None:
     assert any(own.code == "stuck" for own in inspected(recording).findings)
     assert inspected(recording).distrust is None
     assert inspected(recording).part.bridged is None
+
+
+def test_a_folder_is_watched_by_the_samples_that_a_recording_is_judged_by(polled_leak: Recording) -> None:
+    """A poll of 10 to 20 ms ended in a gap every few seconds and a rate that changed."""
+    from sealscope.diagnosis.live.watch import watch
+    from sealscope.monitor.sources.folder import _on_the_clock
+
+    samples = _on_the_clock(polled_leak, 1.7e9)
+    part = inspected(polled_leak).part
+    assert len(samples) == len(part)
+    known = np.isfinite(samples["p_A"])
+    assert np.array_equal(samples["p_A"][known], part["p_A"][known])
+    assert np.mean(known) > 0.94
+    own = watch("thesis")
+    estimates = own.update(samples)
+    assert "gap" not in own.counters
+    assert sum(estimate.total_lpm is not None for estimate in estimates) > 10
