@@ -74,7 +74,7 @@ def test_a_baseline_with_a_fault_is_left_out_for_every_detector(fault: str, heal
     recording, leak_free, other = healthy
     p_A, p_B = np.array(other["p_A"]), np.array(other["p_B"])
     if fault == "stuck":
-        p_A[20000:20400] = p_A[20000]
+        p_A[20000:28000] = p_A[20000]
     elif fault == "clipped":
         p_A, p_B = (np.minimum(p, np.quantile(p, 0.4)) for p in (p_A, p_B))
     elif fault == "constant":

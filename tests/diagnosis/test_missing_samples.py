@@ -190,3 +190,46 @@ def test_without_a_position_the_command_gives_the_sign(late_leak: Recording) -> 
     unsigned = replace(unsigned, channels={**unsigned.channels, "omega": np.abs(unsigned["omega"])})
     part = inspected(unsigned).part
     assert np.mean(np.sign(part["omega"]) == np.sign(late_leak["omega"])) > 0.95
+
+
+def test_a_pressure_that_is_stuck_for_a_moment_is_missing_there(late_leak: Recording) -> None:
+    """The whole recording was refused."""
+    p_A = np.array(late_leak["p_A"])
+    p_A[20_000:20_400] = p_A[20_000]
+    part = inspected(replace(late_leak, channels={**late_leak.channels, "p_A": p_A}))
+    assert part.distrust is None
+    assert part.part.bridged is not None
+    assert np.flatnonzero(part.part.bridged)[[0, -1]] == pytest.approx([20_000, 20_399], abs=2)
+
+
+def test_a_pressure_that_rests_with_the_machine_is_not_stuck() -> None:
+    """A clamp at rest: a quiet sensor of 0.1 bar steps reads one value, and jumps as the clamp moves."""
+    t = np.arange(12_000) / 100.0
+    moving = np.sin(2 * np.pi * t / 20.0) > 0.0
+    random = np.random.default_rng(0)
+    p_A = np.where(moving, 4e6 + 1e6 * np.sin(3 * t) + 3e4 * random.standard_normal(t.size), 2e5)
+    p_B = np.where(moving, 1e6 + 3e4 * random.standard_normal(t.size), 1e5)
+    p_A[:100] = 1e5  # another value is the least
+    x = 0.1 * np.cumsum(moving * np.sin(3 * t)) / 100.0
+    channels = {"p_A": np.round(p_A, -4), "p_B": np.round(p_B, -4), "x": x}
+    recording = Recording(t, channels, {"p_A": "Pa", "p_B": "Pa", "x": "m"}, 100.0)
+    assert any(own.code == "stuck" for own in inspected(recording).findings)
+    assert inspected(recording).distrust is None
+    assert inspected(recording).part.bridged is None
+
+
+def test_a_folder_is_watched_by_the_samples_that_a_recording_is_judged_by(polled_leak: Recording) -> None:
+    """A poll of 10 to 20 ms ended in a gap every few seconds and a rate that changed."""
+    from sealscope.diagnosis.live.watch import watch
+    from sealscope.monitor.sources.folder import _on_the_clock
+
+    samples = _on_the_clock(polled_leak, 1.7e9)
+    part = inspected(polled_leak).part
+    assert len(samples) == len(part)
+    known = np.isfinite(samples["p_A"])
+    assert np.array_equal(samples["p_A"][known], part["p_A"][known])
+    assert np.mean(known) > 0.94
+    own = watch("thesis")
+    estimates = own.update(samples)
+    assert "gap" not in own.counters
+    assert sum(estimate.total_lpm is not None for estimate in estimates) > 10

@@ -12,18 +12,11 @@ from functools import cached_property
 from hashlib import sha256
 from typing import NamedTuple
 
-import numpy as np
-
 from sealscope.diagnosis.learnt import Healthy, Learnt
 from sealscope.recordings.chambers import chambers_of
-from sealscope.recordings.corrections.clock import even_clock
-from sealscope.recordings.corrections.gaps import bridge, filled, remove_dropouts, remove_impossible
-from sealscope.recordings.corrections.spikes import without_spikes
-from sealscope.recordings.corrections.stale import without_stale_samples
-from sealscope.recordings.corrections.unsigned import with_signed_speed
-from sealscope.recordings.formats.columns import counted, listed
+from sealscope.recordings.corrections.samples import correct_samples
+from sealscope.recordings.formats.columns import listed
 from sealscope.recordings.hydraulics import lack_of_chambers, no_readings
-from sealscope.recordings.motion import runs_of
 from sealscope.recordings.quality import SHORTEST, Finding, Severity, inspect
 from sealscope.recordings.recording import Recording, remembered
 
@@ -77,41 +70,16 @@ def inspected(recording: Recording, channels: Iterable[str] | None = None) -> In
 def _inspection(recording: Recording, names: Sequence[str]) -> Inspection:
     findings = list(inspect(recording.only(names)))
     chambers = chambers_of(recording)
-    part = remove_dropouts(remove_impossible(recording))
-    known = [name for name in part.channels if name in chambers or np.any(np.isfinite(part[name]))]
-    if len(known) < len(part.channels):  # `inspect` reports a channel without values; the others can do without
-        part = part.only(known)
-    needed = (*chambers, "u") if "u" in part else chambers
-    for correct in (without_spikes, without_stale_samples):
-        part, found = correct(part)
-        findings += found
-    count = len(part)
-    part = even_clock(part)
-    dropped = max(0, count - len(part))
-    part, found = with_signed_speed(part)
+    part, found, stuck, share = correct_samples(recording)
     findings += found
-    part = filled(bridge(part, needed), needed)
-    if part.bridged is not None:
-        rows = np.flatnonzero(part.bridged)
-        text = (
-            f"{counted(rows.size, 'missing sample')} in {counted(len(runs_of(part.bridged)), 'gap')} bridged: what a "
-            "long one touches counts less"
-        )
-        findings.append(Finding("gaps_bridged", "note", None, rows.size, float(part.t[rows[0]]), text))
-    known = np.flatnonzero(np.all([np.isfinite(part[name]) for name in needed], axis=0)) if needed else np.empty(0)
-    count = len(part) + dropped
-    if known.size < len(part) or dropped:
-        part = part.samples(slice(int(known[0]), int(known[-1]) + 1) if known.size else slice(0, 0))
-        if known.size:
-            text = f"analysed from {part.t[0]:.4g} s to {part.t[-1]:.4g} s: {len(part)} of {count} samples"
-            findings.append(Finding("part_analysed", "warning", None, count - len(part), float(part.t[0]), text))
-    wrong = [own for own in findings if own.channel in chambers and own.code in ("constant", "stuck")]
+    wrong = [own for own in findings if own.channel in chambers and own.code == "constant"]
+    wrong += [own for own in findings if own.channel in stuck and own.code == "stuck"]
     lost = [own for own in findings if own.channel in chambers and own.code == "clipped" and own.count > len(part) / 2]
     wrong += lost if len(lost) == len(chambers) else []  # else the other one says what it says
     distrust = f"the pressures cannot be trusted: {wrong[0].text}" if wrong else None
     if distrust is None and len(part) >= SHORTEST and (reason := no_readings(part)):
         distrust = f"this is no recording of a hydraulic machine: {reason}"
-    return Inspection(part, tuple(findings), distrust, len(part) / max(count, 1))
+    return Inspection(part, tuple(findings), distrust, share)
 
 
 class Baselines(NamedTuple):

@@ -18,6 +18,7 @@ from sealscope.monitor.sources.source_block import UNREADABLE_FILE, BlockReceive
 from sealscope.monitor.supervisor import DATABASE, PartAway, place_of
 from sealscope.parameters import load_rig
 from sealscope.recordings import Recording, read
+from sealscope.recordings.corrections.samples import correct_samples, without_holes
 from sealscope.recordings.oil import oil_temperature
 
 _log = logging.getLogger(__name__)
@@ -134,8 +135,10 @@ def _shown(name: str) -> str:
 def _on_the_clock(recording: Recording, written: float) -> Recording:
     """Return a recording whose last sample was taken at the clock `written` [s].
 
-    The oil's temperature that the file states beside its samples becomes a channel.
+    Its samples are corrected as for `diagnose`. The oil's temperature that the file states beside them becomes a
+    channel.
     """
+    recording = without_holes(correct_samples(recording).recording)
     last = recording.t[np.isfinite(recording.t)]
     shift = written - float(last[-1]) if last.size else 0.0
     channels, units = dict(recording.channels), dict(recording.units)

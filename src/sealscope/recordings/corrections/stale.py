@@ -12,13 +12,16 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.channels import SLOW, Array
-from sealscope.recordings.motion import spacing
+from sealscope.recordings.motion import spacing, stuck
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
 from sealscope.storage.toml_file import priors_of
 
 _PRIORS = priors_of("sealscope.recordings")["stale"]
+#: Largest share of a recording in which a pressure may be stuck, and is taken as missing there.
+MOST_STUCK: float = _PRIORS["stuck"]
 #: A jump of fewer quantisation steps may be a slow change.
 _JUMP = 1.5
 #: Longest run of repeated rows.
@@ -51,6 +54,26 @@ def without_stale_samples(recording: Recording) -> tuple[Recording, list[Finding
             fresh = np.isfinite(values) & ~stale
             channels[name] = np.where(stale, np.interp(recording.t, recording.t[fresh], values[fresh]), values)
     return (replace(recording, channels=channels) if findings else recording), findings
+
+
+def stuck_rows(recording: Recording, name: str) -> NDArray[np.bool_]:
+    """Return the rows (n,) in which a pressure stays the same while something else moves; one at rest is no defect."""
+    values, rows = recording[name], np.zeros(len(recording), dtype=bool)
+    known = np.flatnonzero(np.isfinite(values))
+    others = [recording[other] for other in (*CHAMBERS, "x", "theta") if other != name and other in recording]
+    for first, length in stuck(values[known]).tolist():
+        held = known[first : first + length]
+        at_an_end = values[held[0]] in (np.nanmin(values), np.nanmax(values))  # there it is cut off
+        if not at_an_end and (not others or any(_moves_in(other, held) for other in others)):
+            rows[held] = True
+    return rows
+
+
+def _moves_in(values: Array, rows: NDArray[np.intp]) -> bool:
+    """Return whether a channel moves in some rows by more than a share of its range."""
+    whole, part = values[np.isfinite(values)], values[rows][np.isfinite(values[rows])]
+    least: float = _PRIORS["moves"]
+    return bool(part.size and np.ptp(part) > least * np.ptp(whole))
 
 
 def _runs(values: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
