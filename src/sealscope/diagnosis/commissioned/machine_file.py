@@ -69,6 +69,8 @@ def _with_sums_of_its_terms(lesson: Any) -> Any:
     size = len(lesson.terms) + 1
     if lesson.sums.ndim != 3 or lesson.sums.shape[1:] != (size, size):
         raise ValueError(f"sums must be of the shape (E, {size}, {size}), got {lesson.sums.shape}")
+    if lesson.shut_sums is not None and lesson.shut_sums.shape != (1, size + 1, size + 1):
+        raise ValueError(f"shut_sums must be of the shape (1, {size + 1}, {size + 1}), got {lesson.shut_sums.shape}")
     return lesson
 
 
@@ -77,6 +79,8 @@ _BALANCE = _table(
     terms=list[str],
     scale=float,
     sums=_Numbers,
+    shut_sums=(_Numbers, None),
+    shut_odds=(float, None),
     flow=float,
     pressure=float,
     start_s=(float, None),
