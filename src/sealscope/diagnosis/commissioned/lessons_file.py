@@ -97,6 +97,9 @@ def _check_sums(lesson: Any) -> Any:
     size = len(lesson.terms) + 1
     if lesson.sums.ndim != 3 or not len(lesson.sums) or lesson.sums.shape[1:] != (size, size):
         raise ValueError(f"sums must be of the shape (E, {size}, {size}), got {lesson.sums.shape}")
+    shut = lesson.shut_sums
+    if shut is not None and shut.shape != (1, size + 1, size + 1):
+        raise ValueError(f"shut_sums must be of the shape (1, {size + 1}, {size + 1}), got {shut.shape}")
     if LEAK not in lesson.terms:
         raise ValueError(f"terms must have {LEAK!r}, got {', '.join(lesson.terms)}")
     leak = lesson.terms.index(LEAK)
@@ -129,6 +132,8 @@ _BALANCE = make_table(
     terms=list_of(str),
     scale=_Size,
     sums=_Array,
+    shut_sums=(_Array, None),
+    shut_odds=(_Number, None),
     flow=_Size,
     pressure=_Size,
     start_s=(_Time, None),
