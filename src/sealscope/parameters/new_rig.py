@@ -1,4 +1,4 @@
-"""A new rig's file from four numbers of its machine: what they do not tell is assumed, and says so."""
+"""A new rig's file from four numbers of its machine: all others are assumed, and marked as such."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _GAS = 5.0
 
 
 def rig_text(name: str, area_A: float, area_B: float, stroke: float, displacement: float) -> str:
-    """Return the text of a rig's file, with comments.
+    """Format a rig's file, with comments.
 
     What the four numbers do not tell is taken from `thesis` (equal areas) or `single-rod-eha`, scaled where the size of
     the machine says how: friction with the bore, moving mass with the oil displaced, valves with the volumes.
