@@ -22,12 +22,12 @@ _LONGEST_WORD = 200
 
 
 def nearest(word: str, known: Iterable[str], count: int = 1, share: float = 0.5) -> list[str]:
-    """Return up to `count` of the known words that have at least a `share` of their letters in common with `word`."""
+    """Find up to `count` of the known words that share at least `share` of their letters with `word`."""
     return difflib.get_close_matches(word, known, n=count, cutoff=share) if len(word) <= _LONGEST_WORD else []
 
 
 def closest(word: str, known: Iterable[str]) -> str:
-    """Return ``; did you mean NAME?`` with the known name nearest to `word`, or an empty text."""
+    """Format ``; did you mean NAME?`` with the known name nearest to `word`, or an empty text."""
     folded = {name.casefold(): name for name in known}
     near = nearest(word.casefold(), folded)
     return f"; did you mean {folded[near[0]]}?" if near else ""
@@ -64,7 +64,7 @@ def checked_call(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def argument(default: Any, kind: str, text: str, *, unit: str = "") -> Any:
-    """Declare an argument as a field of a dataclass: its type in words, what it is, and the SI unit of a number."""
+    """Declare an argument as a field of a dataclass: its type in words, its meaning, and the SI unit of a number."""
     return field(
         default=default, metadata={"kind": kind, "text": f"{text} [{unit}]." if unit else f"{text}.", "unit": unit}
     )
@@ -73,9 +73,9 @@ def argument(default: Any, kind: str, text: str, *, unit: str = "") -> Any:
 def with_arguments_of(declared: Callable[P, V]) -> Callable[[Callable[[V], R]], Callable[P, R]]:
     """Give a function of a dataclass the `argument` fields of that class as arguments, in signature and docstring."""
     rows: list[str] = []
-    for own in fields(declared):  # type: ignore[arg-type]
-        wrapped = fill(own.metadata["text"], 110, break_long_words=False, break_on_hyphens=False)
-        rows += [f"{own.name} : {own.metadata['kind']}, optional", indent(wrapped, "    ")]
+    for declared_field in fields(declared):  # type: ignore[arg-type]
+        wrapped = fill(declared_field.metadata["text"], 110, break_long_words=False, break_on_hyphens=False)
+        rows += [f"{declared_field.name} : {declared_field.metadata['kind']}, optional", indent(wrapped, "    ")]
     section = "\n".join(["Parameters", "----------", *rows, "", ""])
 
     def decorated(function: Callable[[V], R]) -> Callable[P, R]:

@@ -69,7 +69,7 @@ def _compiler() -> ModuleType:
 
 
 def source_hash(root: Path) -> str:
-    """Hash of every source file, and of the numbers beside them, in the compiled packages under `root`."""
+    """Compute a hash of every source file, and of the numbers beside them, in the compiled packages under `root`."""
     digest = hashlib.sha256()
     for package in _COMPILED_PACKAGES:
         place = root / package
@@ -90,13 +90,13 @@ def _user_cache_folder() -> Path | None:
 
 
 def _prune(kernels: Path, current: str) -> None:
-    """Forget the generations of compiled code that nobody used for the longest time."""
-    others = sorted(
+    """Remove the generations of compiled code that nobody used for the longest time."""
+    older = sorted(
         (entry for entry in kernels.iterdir() if entry.is_dir() and entry.name != current),
         key=lambda entry: entry.stat().st_mtime,
         reverse=True,
     )
-    for entry in others[_KEPT_GENERATIONS - 1 :]:
+    for entry in older[_KEPT_GENERATIONS - 1 :]:
         shutil.rmtree(entry, ignore_errors=True)
 
 
@@ -120,7 +120,7 @@ def _private(folder: Path) -> None:
 
 @cache
 def cache_directory() -> Path | None:
-    """Return the directory of this source's compiled code, made if need be; None where none can be written safely."""
+    """Make and return the directory of this source's compiled code; None where none can be written safely."""
     base = _user_cache_folder()
     if base is None:
         return None
@@ -196,13 +196,13 @@ class Entry:
 
 
 def entry(function: Callable[..., Any]) -> Entry:
-    """Compile a function of two blocks of numbers that is called by its address, by kernels that do not know it."""
+    """Compile a function of two blocks of numbers that kernels call by its address."""
     return Entry(function)
 
 
 @intrinsic  # type: ignore[misc]
-def call_at(context: Any, address: Any, memory: Any, given: Any) -> Any:
-    """Call double f(double *memory, double *given) at an address; all three are addresses as whole numbers."""
+def call_at(context: Any, address: Any, memory: Any, sample: Any) -> Any:
+    """Call double f(double *memory, double *sample) at an address; all three are addresses as whole numbers."""
 
     def generate(target: Any, builder: Any, signature: Any, values: Any) -> Any:
         double = target.get_value_type(numba.float64)
@@ -224,13 +224,13 @@ def address_of(context: Any, pointer: Any) -> Any:
 
 
 def layout_of(*numbers: str, **parts: Any) -> np.dtype[Any]:
-    """Return the type of a record of numbers by name, and of parts: arrays of a shape, or records of a type."""
+    """Build the type of a record of numbers by name, and of parts: arrays of a shape, or records of a type."""
     shaped = [(name, part) if isinstance(part, np.dtype) else (name, "f8", part) for name, part in parts.items()]
     return np.dtype([*((name, "f8") for name in numbers), *shaped])
 
 
 def record_of(layout: np.dtype[Any], source: object = None, **values: Any) -> np.recarray[Any, Any]:
-    """Return an array (1,) of a record: its parts are `values` or else attributes of `source` by name, or zeros."""
+    """Make an array (1,) of a record; its parts are `values` or else attributes of `source` by name, or zeros."""
     record = np.zeros(1, layout).view(np.recarray)
     for name in layout.fields or ():
         record[name] = values.get(name, getattr(source, name, 0.0))
@@ -238,7 +238,7 @@ def record_of(layout: np.dtype[Any], source: object = None, **values: Any) -> np
 
 
 def record_at(layout: Any) -> Callable[[Any], Any]:
-    """Return the law that reads a block of numbers, at the pointer to its first, as a record, in code for `plain_code`.
+    """Build the law that reads a block of numbers, at the pointer to its first, as a record.
 
     `layout`: NumPy's type of a record of doubles and arrays of them; what is assigned to its parts is in the block.
     """
@@ -259,7 +259,7 @@ def record_at(layout: Any) -> Callable[[Any], Any]:
 
 
 def plain_code(function: Callable[..., Any], *arguments: str) -> tuple[str, str]:
-    """Return a function's LLVM code, free of Python, and its symbol there.
+    """Compile a function to LLVM code free of Python; return the code and the function's symbol.
 
     `arguments`: "double*", "double" or "int64" each. The function returns an integer, takes pointers and numbers, and
     allocates nothing; what C calls is ``int symbol(int64_t *result, void **unused, arguments...)``.

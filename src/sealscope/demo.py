@@ -25,7 +25,7 @@ LEAK = "0.0042 L/min from 30 s"
 
 @dataclass(frozen=True)
 class Demo:
-    """What the demo made: the machine, diagnoses of a healthy and of a leaking recording, the truth, and the files."""
+    """Results of the demo: the machine, diagnoses of a healthy and a leaking recording, the truth, and the files."""
 
     machine: CommissionedMachine
     healthy: Diagnosis

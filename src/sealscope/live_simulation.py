@@ -52,7 +52,7 @@ _one_at_a_time = Lock()
 
 
 def simulated_sources(settings: MonitorSettings, say: Callable[[str], None]) -> list[Source]:
-    """Return a source for each actuator that has `simulate`; raises InputError where its words make no experiment.
+    """Build a source for each actuator that has `simulate`; raise InputError where its words make no experiment.
 
     `say` is told when a simulation begins, and when its time is over.
     """

@@ -12,7 +12,7 @@ WIDTH = 80
 
 
 def paragraph(text: str, head: str = "", indent: int | None = None, width: int = WIDTH) -> str:
-    """Return a text beside `head` as lines that are as wide as whole words allow.
+    """Wrap a text beside `head` in lines as wide as whole words allow.
 
     The second line and those below are indented by `indent` columns, by default those of the head.
     """
@@ -28,5 +28,5 @@ def paragraph(text: str, head: str = "", indent: int | None = None, width: int =
 
 
 def paragraphs(rows: Iterable[tuple[str, str | None]], columns: int, width: int = WIDTH) -> list[str]:
-    """Return rows (label, text) as paragraphs beside their labels, which take `columns`; without those of no text."""
+    """Format rows (label, text) as paragraphs beside their labels, which take `columns`; empty texts are left out."""
     return [paragraph(text, f"  {label}".ljust(columns), columns, width) for label, text in rows if text]

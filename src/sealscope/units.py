@@ -48,7 +48,7 @@ class Unit(NamedTuple):
     offset: Fraction = Fraction(0)
 
     def times(self, other: Unit, power: Fraction) -> Unit:
-        """Return the product with a power of another unit, without an offset; ValueError beyond a double's range."""
+        """Multiply by a power of another unit without an offset; raise ValueError beyond a double's range."""
         bits = max(other.factor.numerator, other.factor.denominator).bit_length()
         if abs(power) * bits > _MOST_BITS:
             raise ValueError
@@ -58,7 +58,7 @@ class Unit(NamedTuple):
         powers = dict(self.powers)
         for base, exponent in other.powers:
             powers[base] = powers.get(base, Fraction(0)) + exponent * power
-        return Unit(factor, pi_power, tuple(sorted((base, own) for base, own in powers.items() if own)))
+        return Unit(factor, pi_power, tuple(sorted((base, power) for base, power in powers.items() if power)))
 
 
 def _unit(row: Mapping[str, Any]) -> Unit:
@@ -68,7 +68,7 @@ def _unit(row: Mapping[str, Any]) -> Unit:
 
 
 def _absolute(unit: Unit) -> Unit:
-    """Return the unit of an absolute pressure: inside are gauge pressures, a standard atmosphere less."""
+    """Build the unit of an absolute pressure: inside are gauge pressures, a standard atmosphere less."""
     return unit._replace(offset=-_TABLES["absolute"]["atmosphere"] / unit.factor)
 
 
@@ -81,8 +81,10 @@ _ATOMS = {
 } | {name: _unit(row) for name, row in _TABLES["plain"].items()}
 #: Standard atmosphere [Pa], by which a gauge pressure is less than the absolute one.
 P_ATM = float(_TABLES["absolute"]["atmosphere"])
-_ATOMS |= {name: _absolute(_ATOMS[of]) for name, of in _TABLES["absolute"].items() if name != "atmosphere"}
-_SPELLINGS = {own: name for name, spellings in _TABLES["spellings"].items() for own in spellings.split()} | {"": "1"}
+_ATOMS |= {name: _absolute(_ATOMS[gauge]) for name, gauge in _TABLES["absolute"].items() if name != "atmosphere"}
+_SPELLINGS = {spelling: name for name, spellings in _TABLES["spellings"].items() for spelling in spellings.split()} | {
+    "": "1"
+}
 _SIGNS, _KINDS = str.maketrans(_TABLES["signs"]), _TABLES["kinds"]
 _TOKEN = re.compile(
     r"\s*(?:(?P<op>[/()])|\^(?P<power>[+-]?\d(?:\.5)?)(?![\d.])|(?P<name>[^\W\d]\w*?|%|°[CF]?|1)(?P<digit>[23]?)(?=$|[\s/()^]))"
@@ -127,13 +129,13 @@ def _atom(name: str) -> Unit:
 
 
 def _tokens(text: str) -> list[str]:
-    """Return names, powers (^2), brackets and strokes of a product of units; ValueError for anything else."""
-    tokens, at = [], 0
-    while at < len(text):
-        match = _TOKEN.match(text, at)
+    """Split a product of units into names, powers (^2), brackets and strokes; raise ValueError for anything else."""
+    tokens, place = [], 0
+    while place < len(text):
+        match = _TOKEN.match(text, place)
         if match is None:
             raise ValueError
-        at = match.end()
+        place = match.end()
         name, digit = match["name"] or "", match["digit"] or ""
         if not digit or name + digit in _SPELLINGS:
             tokens.append(match["op"] or (f"^{match['power']}" if match["power"] else name + digit))
@@ -173,7 +175,7 @@ def _product(tokens: list[str]) -> Unit:
 
 
 def _marked_pressure(text: str) -> Unit | None:
-    """Return the unit of a pressure marked as absolute, which has an offset, or as gauge; None for any other text."""
+    """Find the unit of a pressure marked as absolute, which has an offset, or as gauge; None for other texts."""
     marked = _MARKED.fullmatch(text)
     if marked is None:
         return None
@@ -188,7 +190,7 @@ def _marked_pressure(text: str) -> Unit | None:
 
 @lru_cache(maxsize=1024)
 def parse_unit(text: str) -> Unit:
-    """Return the unit that `text` names; raises InputError where it is not one."""
+    """Parse the unit that `text` names; raise InputError for any other text."""
     text = text.strip()
     text = _SPELLINGS.get(text, text)
     if text in _ATOMS:
@@ -212,14 +214,14 @@ def parse_unit(text: str) -> Unit:
 
 
 def _expected(si_unit: str) -> str:
-    """Return what a unit must measure, in words, for messages: `a unit of pressure, such as Pa`."""
+    """Describe the units of a dimension for messages: `a unit of pressure, such as Pa`."""
     if parse_unit(si_unit).powers == ():
         return "no unit, or %"
     return f"a unit of {_KINDS[si_unit]}, such as {si_unit}" if si_unit in _KINDS else f"a unit such as {si_unit}"
 
 
 def same_dimension(unit: str, other: str) -> bool:
-    """Whether values can be converted from one unit to the other; False also where one of them is no unit."""
+    """Return whether values can be converted from one unit to the other; False also for a text that is no unit."""
     try:
         return parse_unit(unit).powers == parse_unit(other).powers
     except InputError:
@@ -227,7 +229,7 @@ def same_dimension(unit: str, other: str) -> bool:
 
 
 def is_familiar(unit: str) -> bool:
-    """Whether a unit is made of those known without pint, as `bar`, `psig` and `cm3/s`; a name's last word may be one.
+    """Return whether a unit is made of those known without pint, as `bar`, `psig` and `cm3/s`.
 
     Of pint's thousands of names many are plain words: a rod is 5 m long.
     """
@@ -238,7 +240,7 @@ def is_familiar(unit: str) -> bool:
 
 @lru_cache(maxsize=1024)
 def _conversion(unit: str, si_unit: str) -> _Conversion:
-    """(factor, power of pi, offset before, offset after): target = (value + before) * factor * pi**power - after."""
+    """Compute (factor, power of pi, offsets): target = (value + before) * factor * pi**power - after."""
     source, target = parse_unit(unit), parse_unit(si_unit)
     if source.powers != target.powers:
         raise InputError(f"got {unit.strip() or 'none'}")
@@ -271,7 +273,7 @@ def to_si(values: ArrayLike, unit: str, si_unit: str, *, name: str = ..., place:
 def to_si(
     values: ArrayLike | float, unit: str, si_unit: str, *, name: str = "value", place: str | None = None
 ) -> Array | float:
-    """`values` (any shape, or one number) given in `unit`, as doubles in `si_unit`.
+    """Convert `values` (any shape, or one number) in `unit` to doubles in `si_unit`.
 
     One number is converted exactly and rounded once; an array within 2 units in the last place. Raises InputError that
     names `name`, the unit and the dimension expected (and `place`, a file), where the dimension is another.
@@ -305,7 +307,7 @@ def from_si(values: ArrayLike, unit: str, si_unit: str, *, name: str = ..., plac
 def from_si(
     values: ArrayLike | float, unit: str, si_unit: str, *, name: str = "value", place: str | None = None
 ) -> Array | float:
-    """`values` in `si_unit`, as doubles in `unit`; the inverse of `to_si`, with the same errors."""
+    """Convert `values` in `si_unit` to doubles in `unit`; the inverse of `to_si`, with the same errors."""
     _look_up(unit, si_unit, name, place)
     return to_si(values, si_unit, unit, name=name, place=place)
 
@@ -313,7 +315,7 @@ def from_si(
 def parse_quantity(
     value: float | str, si_unit: str, *, name: str = "value", place: str | None = None, finite: bool = True
 ) -> float:
-    """Return the number that a text such as ``2[L/min]``, ``3 psi`` or ``5`` (already SI) stands for, in `si_unit`.
+    """Parse a text such as ``2[L/min]``, ``3 psi`` or ``5`` (already SI) to a number in `si_unit`.
 
     A number is taken as SI. Raises InputError where there is no number, for another dimension, and, if `finite`, for an
     infinite one or NaN.

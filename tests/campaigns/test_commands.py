@@ -56,7 +56,7 @@ def test_no_more_processes_than_two_a_core(call, tiny, tmp_path, monkeypatch):
 
     def ended(task, cases, jobs, cluster):
         started.append(jobs)
-        yield from ((case, CaseRow.of(case, error="not carried out")) for case in cases)
+        yield from ((case, CaseRow.from_case(case, error="not carried out")) for case in cases)
 
     monkeypatch.setattr(run, "carried_out", ended)
     _, _, err = call("campaign", "run", tiny, "-o", tmp_path / "out", "-j", "30")

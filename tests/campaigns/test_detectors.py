@@ -251,7 +251,7 @@ def test_detectors_may_assume_another_rig(plan, done, tmp_path):
 
 def test_what_names_stand_for(plan):
     observed = plan_detector("watcher @ pressures")
-    assert (observed.of, observed.view, observed.scorer) == ("watcher", "pressures", None)
+    assert (observed.base, observed.view, observed.scorer) == ("watcher", "pressures", None)
     assert plan_detector("rms change").scorer is None
     assert plan_detector("d3 of p_A fell @ pressures").needs_threshold
     assert not plan_detector("sign rule: d3 of p_A fell").needs_threshold

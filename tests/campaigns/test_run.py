@@ -159,7 +159,7 @@ def doomed(case):
 def break_some(plan, case, folder=None):
     """A task that fails on a third of the records to judge."""
     if doomed(case):
-        return CaseRow.of(case, error=str(SimulationFailed("the run diverged")))
+        return CaseRow.from_case(case, error=str(SimulationFailed("the run diverged")))
     return work(plan, case, folder)
 
 

@@ -20,7 +20,7 @@ def noise_record(seed, n):
 
 
 def middle(recording):
-    return Sides.of(recording, float(recording.t[0]) + recording.duration / 2)
+    return Sides.from_recording(recording, float(recording.t[0]) + recording.duration / 2)
 
 
 def score(name, recording):
@@ -30,7 +30,7 @@ def score(name, recording):
 def test_every_scorer_is_finite_or_none():
     long, short = middle(noise_record(1, 4000)), middle(noise_record(2, 100))
     for name, scorer in SCORERS.items():
-        assert scorer.name == name and scorer.about
+        assert scorer.name == name and scorer.description
         assert math.isfinite(scorer.score(long))
         assert scorer.score(short) is None
         assert (scorer.threshold == 0.0) == name.startswith("sign rule")

@@ -35,5 +35,5 @@ def test_a_machine_without_its_channels_cannot_be_watched(recording):
 
 def test_a_plan_names_it_with_a_view():
     parsed = plan_detector("watch @ some")
-    assert (parsed.of, parsed.scorer, parsed.view) == ("watch", None, "some")
+    assert (parsed.base, parsed.scorer, parsed.view) == ("watch", None, "some")
     check_detector("watch", {})

@@ -110,7 +110,7 @@ def test_a_soft_sensor_says_what_the_live_balance_says(version, recording, tmp_p
 @pytest.mark.parametrize("rate", [16.0, 500.0, 10e3])
 def test_the_code_has_the_terms_of_the_balance_and_a_bounded_memory(rig, rate):
     """Memory grows with the samples of 50 ms around the present one, and not with those of a block."""
-    choice = SensorChoice.of(ss.load_rig(rig), rate)
+    choice = SensorChoice.from_rig(ss.load_rig(rig), rate)
     assert sorted(choice.place) == list(range(len(COLUMNS)))
     assert memory_of(choice).itemsize // 8 < 12000 + 4 * 0.06 * rate
 

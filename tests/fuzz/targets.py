@@ -321,7 +321,7 @@ count = 3
 
 
 def _unmade(plan: SimulatedPlan, case: CampaignCase, folder: Path | None) -> CaseRow:
-    return CaseRow.of(case, error="not carried out")
+    return CaseRow.from_case(case, error="not carried out")
 
 
 def campaigns(folder: Path) -> Use:

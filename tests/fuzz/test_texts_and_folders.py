@@ -16,7 +16,7 @@ FEW = {
     "rigs": 60,
     "machines": 40,
     "profiles": 120,
-    "plans": 30,
+    "plans": 60,
     "campaign folders": 15,
     "kept files": 60,
 }

@@ -191,7 +191,9 @@ def test_words_of_targets_and_loads():
     two = parse_position("position 50 mm sin(2t) + 5 mm sin(9t)").value_at(t)
     np.testing.assert_allclose(two, 0.05 * np.sin(2 * t) + 0.005 * np.sin(9 * t))
     trapezoid = parse_position("position trapezoid 40 mm within 1 s every 8 s")
-    np.testing.assert_allclose(trapezoid.at(np.array([0.0, 0.5, 3.0, 4.25, 6.0, 8.5])), [0, 0.02, 0.04, 0.03, 0, 0.02])
+    np.testing.assert_allclose(
+        trapezoid.value_at(np.array([0.0, 0.5, 3.0, 4.25, 6.0, 8.5])), [0, 0.02, 0.04, 0.03, 0, 0.02]
+    )
     assert parse_position("3 sin(4t)") is None
     for text in ("position 50 mm sin(2t)", "position ramp 100 mm from 1 s to 3 s"):
         assert str(parse_position(str(parse_position(text)))) == text

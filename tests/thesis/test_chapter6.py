@@ -118,4 +118,4 @@ def test_the_comparison_of_pump_and_valve_is_made():
 
 def test_a_valve_draws_what_its_open_edge_passes():
     run = {"x_s": np.array([1e-4, -1e-4]), "Q_A": np.array([2e-5, -3e-5]), "Q_B": np.array([1e-5, -4e-5])}
-    np.testing.assert_allclose(chapter6.drawn(run), [2e-5, 4e-5])
+    np.testing.assert_allclose(chapter6.supply_flow(run), [2e-5, 4e-5])

@@ -1,1 +1,1 @@
-"""Campaigns: a plan of many simulated (or given) records, judged by detectors alike, kept on disk, resumable."""
+"""Campaigns: a plan of many simulated records or recordings, judged by several detectors, kept on disk, resumable."""

@@ -19,7 +19,7 @@ from sealscope.storage.folders import make_folder
 
 @dataclass(frozen=True)
 class CampaignResult:
-    """A campaign and what it shows.
+    """A campaign and its results.
 
     `missing`: records of the plan that have no row yet; `mode`: how the rows of a simulated campaign were
     made, "" for another; `known`: detector -> what it was given beside the record.
@@ -34,7 +34,7 @@ class CampaignResult:
 
 
 def prior_knowledge(plan: SimulatedPlan | RecordedPlan) -> dict[str, PriorKnowledge]:
-    """Return what a plan gives its detectors beside the recording.
+    """Collect the knowledge that a plan's detectors have besides the recording.
 
     A scorer of the two sides of a split knows the true onset where the records are simulated, for they are split
     there; in recordings it is split half-way, and nothing is known. Other detectors assume the rig that the plan
@@ -53,7 +53,7 @@ def prior_knowledge(plan: SimulatedPlan | RecordedPlan) -> dict[str, PriorKnowle
     return known
 
 
-def _judged(
+def _judge(
     plan: SimulatedPlan | RecordedPlan,
     rows: Sequence[CaseRow],
     onset_s: float | None = None,
@@ -71,20 +71,20 @@ def _judged(
 
 
 def simulated_result(plan: SimulatedPlan, folder: Path) -> CampaignResult:
-    """Return the result of a simulated campaign, complete or not; InputError where its rows do not suffice for one."""
+    """Judge a simulated campaign, complete or not; raise InputError where its rows do not suffice."""
     rows = tuple(store.rows_of(plan, folder).values())
     if not rows:
         raise InputError(f"a campaign must have rows to report on, got none; run it first ({folder})")
     head = store.head(folder) or store.made_from(plan)
-    judgement = _judged(plan, rows, onset_s=plan.onset_s, hours=plan.duration_s / 3600.0)
+    judgement = _judge(plan, rows, onset_s=plan.onset_s, hours=plan.duration_s / 3600.0)
     mode = str(head.get("mode", store.RUN_BY_RUN))
     return CampaignResult(plan, rows, plan.size - len(rows), judgement, mode=mode, known=prior_knowledge(plan))
 
 
 def recorded_result(plan: RecordedPlan, folder: Path, progress: ProgressCallback | None = None) -> CampaignResult:
-    """Return the result of a campaign over the recordings in a folder."""
+    """Judge a campaign over the recordings in a folder."""
     rows = recorded_rows(plan, folder, progress)
-    return CampaignResult(plan, tuple(rows), 0, _judged(plan, rows), known=prior_knowledge(plan))
+    return CampaignResult(plan, tuple(rows), 0, _judge(plan, rows), known=prior_knowledge(plan))
 
 
 def write_result(result: CampaignResult, folder: Path) -> list[Path]:

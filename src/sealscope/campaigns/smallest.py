@@ -1,4 +1,4 @@
-"""Plan a recording before anyone measures: which command, load and duration find a leak of a size on a rig.
+"""Plan a recording: the command, load and duration that find a leak of a size on a rig.
 
 Leak-free recordings of the rig with its instruments are simulated under each duty; the information of their blocks says
 which step of the leak's conductance `diagnose` finds in them, by the same test that judges (`StepTest.findable`),
@@ -56,7 +56,7 @@ USUAL = PlannedDuty(COMMANDS[0])
 
 
 class Findable(NamedTuple):
-    """What recordings of a duty and a `duration` [s] find.
+    """The smallest leak that recordings of a duty and a `duration` [s] find.
 
     `conductance` of the smallest step of the leak that is found, and of that which is separable from the pump's [m^3/(s
     Pa)], infinite where none is; `pressure`: mean |p_A - p_B| [Pa]; `note`: why there are no figures.
@@ -71,14 +71,14 @@ class Findable(NamedTuple):
 
 
 class RecordingPlan(NamedTuple):
-    """The recording to make, and all duties that were compared; `wanted` conductance [m^3/(s Pa)], None for none.
+    """The recording to make, and all duties compared; `target` conductance [m^3/(s Pa)], None for none.
 
     `chosen`: of the shortest duration that finds it, or the best that was tried; `separating`: the same of what is
     separable from the pump; `usual` pressure [Pa], at which flows are stated.
     """
 
     rig: str
-    wanted: float | None
+    target: float | None
     chosen: Findable
     separating: Findable
     compared: tuple[Findable, ...]
@@ -88,40 +88,50 @@ class RecordingPlan(NamedTuple):
 
     @property
     def finds(self) -> bool:
-        """Whether the chosen recording finds what is wanted."""
-        return self.wanted is None or self.chosen.conductance <= self.wanted
+        """Whether the chosen recording finds the target."""
+        return self.target is None or self.chosen.conductance <= self.target
 
     def lpm(self, conductance: float) -> float | None:
-        """Return a conductance as the flow at the usual pressure [L/min], None for one that is not finite."""
+        """Convert a conductance to the flow at the usual pressure [L/min], None for one that is not finite."""
         return conductance * self.usual / LITRE_PER_MINUTE if np.isfinite(conductance) else None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the plan as plain JSON values, sizes in L/min at the usual pressure."""
+        """Convert the plan to plain JSON values, sizes in L/min at the usual pressure."""
 
-        def plain(own: Findable) -> dict[str, Any]:
-            sizes = {"smallest_leak_lpm": self.lpm(own.conductance), "separable_from_pump_lpm": self.lpm(own.separable)}
-            driving = own.pressure if np.isfinite(own.pressure) else None
-            return {**own.duty._asdict(), "duration_s": own.duration, **sizes, "pressure_Pa": driving, "note": own.note}
+        def plain(findable: Findable) -> dict[str, Any]:
+            sizes = {
+                "smallest_leak_lpm": self.lpm(findable.conductance),
+                "separable_from_pump_lpm": self.lpm(findable.separable),
+            }
+            driving = findable.pressure if np.isfinite(findable.pressure) else None
+            return {
+                **findable.duty._asdict(),
+                "duration_s": findable.duration,
+                **sizes,
+                "pressure_Pa": driving,
+                "note": findable.note,
+            }
 
         return {
             "rig": self.rig,
-            "wanted_lpm": None if self.wanted is None else self.lpm(self.wanted),
+            "wanted_lpm": None if self.target is None else self.lpm(self.target),
             "finds": self.finds,
             "usual_pressure_Pa": self.usual,
             "false_alarm_probability": self.false_alarm,
             "detection_probability": self.detection,
             "recording": plain(self.chosen),
             "separating_from_pump": plain(self.separating),
-            "compared": [plain(own) for own in self.compared],
+            "compared": [plain(findable) for findable in self.compared],
         }
 
     def text(self) -> str:
-        """Return the plan as lines of text, the answer first."""
-        own, separating, at = self.chosen, self.separating, f"at {self.usual / 1e6:.2g} MPa"
-        wanted = "" if self.wanted is None else f"{self.lpm(self.wanted):.2g} L/min {at}: "
+        """Format the plan as lines of text, the answer first."""
+        chosen, separating, usual_pressure = self.chosen, self.separating, f"at {self.usual / 1e6:.2g} MPa"
+        target = "" if self.target is None else f"{self.lpm(self.target):.2g} L/min {usual_pressure}: "
         doubt = "" if self.finds else "not found; the best is "
         lines = [
-            f"{wanted}{doubt}{own.duty} for {own.duration:g} s finds {self._size(own.conductance)} {at}",
+            f"{target}{doubt}{chosen.duty} for {chosen.duration:g} s "
+            f"finds {self._size(chosen.conductance)} {usual_pressure}",
             f"  in {100 * self.detection:g} % of recordings, {100 * self.false_alarm:g} % false alarms; rig {self.rig}",
             "  separated from a leak of the pump: "
             + (
@@ -143,7 +153,7 @@ class RecordingPlan(NamedTuple):
 
 
 def experiment_of(rig: Rig, duty: PlannedDuty, duration: float, seed: int = 0) -> Experiment:
-    """Return the leak-free experiment of a duty, its sweep centred; raises InputError for what is no command."""
+    """Build the leak-free experiment of a duty, its sweep centred; raise InputError for a text that is no command."""
     command = command_or_target(duty.command)
     if isinstance(command, Position):
         raise InputError(f"a plan must be of a command in volts ('3 sin(4t)'), got a target ({command})")
@@ -155,23 +165,23 @@ def experiment_of(rig: Rig, duty: PlannedDuty, duration: float, seed: int = 0) -
 def findable(
     rig: Rig, duty: PlannedDuty, duration: float, *, false_alarm: float = 0.01, detection: float = 0.9
 ) -> Findable:
-    """Return what leak-free recordings of a duty say they find; what cannot be simulated or judged is its note."""
+    """Compute the smallest leak that recordings of a duty find; the note says why where there is none."""
     steps, separable_steps, pressures = [], [], []
     try:
         for seed in range(RECORDS):
             recording = simulate_experiment(experiment_of(rig, duty, duration, seed)).recording
-            step, apart, pressure = _detectable_in(recording, rig, false_alarm, detection)
+            step, separable, pressure = _detectable_in(recording, rig, false_alarm, detection)
             steps.append(step)
-            separable_steps.append(apart)
+            separable_steps.append(separable)
             pressures.append(pressure)
     except SealscopeError as error:
         return Findable(duty, duration, np.inf, np.inf, np.nan, str(error))
-    step, apart, pressure = (float(np.median(own)) for own in (steps, separable_steps, pressures))
-    return Findable(duty, duration, step, apart, pressure)
+    step, separable, pressure = (float(np.median(values)) for values in (steps, separable_steps, pressures))
+    return Findable(duty, duration, step, separable, pressure)
 
 
 def _detectable_in(recording: Recording, rig: Rig, false_alarm: float, detection: float) -> tuple[float, float, float]:
-    """Return the conductance found, that separable from the pump, and the mean pressure, of a leak-free recording."""
+    """Compute the conductance found, that separable from the pump, and the mean pressure, of a leak-free recording."""
     detector = VolumeBalance(rig)
     if reason := detector.usable(recording):
         raise InputError(f"no balance: {reason}")
@@ -187,15 +197,15 @@ def _detectable_in(recording: Recording, rig: Rig, false_alarm: float, detection
 
 
 def _free_over_known(blocks: Blocks, columns: Sequence[Columns]) -> float:
-    """Return the deviation of a step of the leak at mid-record with the pump's step free, over that with it known.
+    """Compute the deviation of a leak's step at mid-record with the pump's step free, over that with it known.
 
     Infinite where no term of the pump is in the balance.
     """
-    own = columns[0]
-    if PUMP not in own.names or len(columns) > 1:
+    column = columns[0]
+    if PUMP not in column.names or len(columns) > 1:
         return np.inf
     gram, late = (blocks.gram[first:, 0].sum(axis=0) for first in (0, len(blocks) // 2))
-    levels, steps = np.array(own.nuisance), np.array([own.leak, own.names.index(PUMP)])
+    levels, steps = np.array(column.nuisance), np.array([column.leak, column.names.index(PUMP)])
     cross = late[np.ix_(levels, steps)]
     information = late[np.ix_(steps, steps)] - cross.T @ solve(gram[np.ix_(levels, levels)], cross)
     lone, free = information[0, 0], information[0, 0] - information[0, 1] ** 2 / max(information[1, 1], 1e-300)
@@ -212,13 +222,13 @@ def plan_recording(
     detection: float = 0.9,
     progress: Callable[[str, float], None] = lambda label, share: None,
 ) -> RecordingPlan:
-    """Return the shortest recording that finds a leak of `find` [m^3/s] at the pressure of the usual duty.
+    """Find the shortest recording that finds a leak of `find` [m^3/s] at the pressure of the usual duty.
 
     Without `find`: the recording of `COMPARED` seconds that finds the smallest. Raises InputError where the usual duty
     cannot be simulated or judged.
     """
-    others = [PlannedDuty(command, load) for load in LOADS for command in COMMANDS] if duties is None else list(duties)
-    tried = [usual, *(duty for duty in others if duty != usual)]
+    choices = [PlannedDuty(command, load) for load in LOADS for command in COMMANDS] if duties is None else list(duties)
+    tried = [usual, *(duty for duty in choices if duty != usual)]
     compared = []
     for k, duty in enumerate(tried):
         compared.append(findable(rig, duty, COMPARED, false_alarm=false_alarm, detection=detection))
@@ -226,15 +236,17 @@ def plan_recording(
             raise InputError(f"the usual duty must have a balance, got none of {usual}: {compared[0].note}")
         progress("duties compared", (k + 1) / len(tried))
     pressure = compared[0].pressure
-    wanted = None if find is None else find / pressure
+    target = None if find is None else find / pressure
     best = []
     for name in ("conductance", "separable"):
-        own = min(compared, key=lambda own: float(getattr(own, name)))
-        if wanted is not None and np.isfinite(getattr(own, name)):
-            guess = COMPARED * (getattr(own, name) / wanted) ** 2  # a deviation falls with the root of the duration
-            for duration in [of for of in DURATIONS if of >= 0.5 * guess] or DURATIONS[-1:]:
-                own = findable(rig, own.duty, duration, false_alarm=false_alarm, detection=detection)
-                if getattr(own, name) <= wanted:
+        best_duty = min(compared, key=lambda best_duty: float(getattr(best_duty, name)))
+        if target is not None and np.isfinite(getattr(best_duty, name)):
+            guess = (
+                COMPARED * (getattr(best_duty, name) / target) ** 2
+            )  # a deviation falls with the root of the duration
+            for duration in [seconds for seconds in DURATIONS if seconds >= 0.5 * guess] or DURATIONS[-1:]:
+                best_duty = findable(rig, best_duty.duty, duration, false_alarm=false_alarm, detection=detection)
+                if getattr(best_duty, name) <= target:
                     break
-        best.append(own)
-    return RecordingPlan(rig.name, wanted, best[0], best[1], tuple(compared), pressure, false_alarm, detection)
+        best.append(best_duty)
+    return RecordingPlan(rig.name, target, best[0], best[1], tuple(compared), pressure, false_alarm, detection)

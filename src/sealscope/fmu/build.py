@@ -43,7 +43,7 @@ system, with clang or `zig cc`: clang -O2 -fPIC -shared -I. -Iheaders -o NAME.so
 
 
 class Platform(NamedTuple):
-    """A system that a unit runs on: LLVM's and the compiler's names of it, its folders in the archive, its suffix."""
+    """A system that a unit runs on: its names in LLVM and the compiler, its folders in the archive, its suffix."""
 
     triple: str
     target: str
@@ -57,7 +57,7 @@ PLATFORMS: Mapping[str, Platform] = as_type(
 
 
 def this_platform() -> str:
-    """Return the name in `PLATFORMS` of the system that runs.
+    """Return the name in `PLATFORMS` of this system.
 
     Raises InputError on another one.
     """
@@ -72,7 +72,7 @@ def this_platform() -> str:
 
 
 def compiler() -> tuple[list[str], bool]:
-    """Return the call of a C compiler, and whether it compiles for other systems, too: zig's, else the system's.
+    """Find a C compiler and whether it compiles for other systems: zig's, else the system's.
 
     Raises InputError where there is none.
     """
@@ -87,7 +87,7 @@ def compiler() -> tuple[list[str], bool]:
 
 
 def fmi_headers() -> Path:
-    """Return the folder of the standard's headers, which FMPy carries; raise InputError where it is not installed."""
+    """Find the folder of the standard's headers, which FMPy carries; raise InputError where it is not installed."""
     from importlib.util import find_spec
 
     package = find_spec("fmpy")
@@ -97,7 +97,7 @@ def fmi_headers() -> Path:
 
 
 def chosen_step(rig: Rig, error: float) -> tuple[float, float]:
-    """Return a step [s] of the solver by which pressures are off by `error` [Pa rms] at most, and the error it has.
+    """Choose a step [s] of the solver by which pressures are off by `error` [Pa rms] at most, and its error.
 
     As a run of some seconds under each of `COMMANDS` chooses it, at the piston's mid-stroke.
     """
@@ -109,7 +109,7 @@ def chosen_step(rig: Rig, error: float) -> tuple[float, float]:
 
 
 class MockUp(NamedTuple):
-    """A unit before it is built: its code, what it lists, and the sizes and starts that its layer in C needs.
+    """A unit before it is built: its code, its variables, and the sizes and starts that its layer in C needs.
 
     `modules`: LLVM code of its functions; `values`: parameters at the start, in the order of the code; `inputs`,
     `results`, `states`: how many; `step` [s]: longest step of its solver; `failures`: words for the codes that its
@@ -128,7 +128,7 @@ class MockUp(NamedTuple):
 
     @property
     def token(self) -> str:
-        """The unit's identity, as the description and the library hold it."""
+        """The unit's identity in the description and the library."""
         return hashlib.sha256("".join([self.words, str(self.listed), *self.modules.values()]).encode()).hexdigest()[:32]
 
     def write(self, path: Path, version: Version, platforms: Sequence[str]) -> None:
@@ -166,7 +166,7 @@ class MockUp(NamedTuple):
         return [place / name for name in texts]
 
     def _library(self, folder: Path, system: str, version: Version) -> bytes:
-        """Return the shared library of the unit for a platform, from the sources in `folder`."""
+        """Build the shared library of the unit for a platform, from the sources in `folder`."""
         platform, (call, crosses) = PLATFORMS[system], compiler()
         inputs = [folder / "unit.c", folder / f"fmi{version}.c"]
         for function, module in self.modules.items():
@@ -178,8 +178,8 @@ class MockUp(NamedTuple):
         command = [*call, *target, *flags, *map(str, inputs), "-lm"]
         done = subprocess.run(command, capture_output=True, text=True, timeout=_COMPILE_TIMEOUT, check=False)
         if done.returncode:
-            caller, said = " ".join(call), done.stderr[-500:]
-            raise InputError(f"the C compiler ({caller}) could not build the unit for {system}: {said}")
+            caller, messages = " ".join(call), done.stderr[-500:]
+            raise InputError(f"the C compiler ({caller}) could not build the unit for {system}: {messages}")
         return output.read_bytes()
 
 
@@ -232,7 +232,7 @@ def write_fmu(
     >>> [variable.name for variable in variables if variable.causality == "input"]  # doctest: +SKIP
     ['u', 'G', 'C', 'F', 'G_ext_A', 'G_ext_B']
     """
-    path, wanted = Path(path), _checked(path, fmi, platforms)
+    path, chosen_platforms = Path(path), _checked(path, fmi, platforms)
     machine = _pump_controlled(rig)
     if step is None:
         step, reached = chosen_step(machine, error)
@@ -243,7 +243,7 @@ def write_fmu(
         raise InputError(f"step must be > 0 s, got {step}")
     unit = MockUp(
         f"{machine.title}; {accuracy}",
-        code(Choice.of(machine)),
+        code(Choice.from_rig(machine)),
         tuple(variables(machine, step)),
         values_of(machine),
         len(INPUTS),
@@ -252,7 +252,7 @@ def write_fmu(
         step,
         FAILURES,
     )
-    unit.write(path, fmi, wanted)
+    unit.write(path, fmi, chosen_platforms)
     return unit.listed
 
 
@@ -305,13 +305,13 @@ def write_sensor_fmu(
     """
     from sealscope.fmu import sensor as own
 
-    path, wanted = Path(path), _checked(path, fmi, platforms)
+    path, chosen_platforms = Path(path), _checked(path, fmi, platforms)
     if sensor != "volume":
         raise InputError(f"sensor must be volume, got {sensor!r}")
     if not rate >= RESOLVED / STRIDE:
         raise InputError(f"rate of a soft sensor must be >= {RESOLVED / STRIDE:g} Hz, got {rate:g}")
     machine = _pump_controlled(rig)
-    choice = own.SensorChoice.of(machine, float(rate))
+    choice = own.SensorChoice.from_rig(machine, float(rate))
     unit = MockUp(
         f"soft sensor of leakage (volume balance of angle and position at {rate:g} Hz) for {machine.title}",
         own.sensor_code(choice),
@@ -323,12 +323,12 @@ def write_sensor_fmu(
         1.0 / rate,
         own.FAILURES,
     )
-    unit.write(path, fmi, wanted)
+    unit.write(path, fmi, chosen_platforms)
     return unit.listed
 
 
 def _pump_controlled(rig: Rig | str | os.PathLike[str]) -> Rig:
-    """Return the rig of a unit; raise InputError for one with a servo valve."""
+    """Load the rig of a unit; raise InputError for one with a servo valve."""
     machine = load_rig(rig)
     if machine.valve.spool == "present":
         raise InputError(f"a unit must be of a pump-controlled rig (valve.spool = absent), got {machine.name}")
@@ -336,16 +336,16 @@ def _pump_controlled(rig: Rig | str | os.PathLike[str]) -> Rig:
 
 
 def _checked(path: str | os.PathLike[str], fmi: int, platforms: Sequence[str] | None) -> tuple[str, ...]:
-    """Return the platforms of a unit to write; raise InputError for a wrong name, version or platform."""
+    """Check name, version and platforms of a unit; return the platforms."""
     if Path(path).suffix != ".fmu":
         raise InputError(f"a unit's file must end in .fmu, got {path}")
     if fmi not in (2, 3):
         raise InputError(f"fmi must be 2 or 3, got {fmi!r}")
-    wanted = tuple(dict.fromkeys(platforms or (this_platform(),)))
-    for name in wanted:
+    chosen_platforms = tuple(dict.fromkeys(platforms or (this_platform(),)))
+    for name in chosen_platforms:
         if name not in PLATFORMS or fmi not in PLATFORMS[name].folders:
             known = ", ".join(key for key, platform in PLATFORMS.items() if fmi in platform.folders)
             raise InputError(f"a platform of FMI {fmi} must be one of {known}, got {name!r}")
         if name != this_platform() and not compiler()[1]:
             raise InputError(f"a unit for {name} needs a compiler for it: pip install 'sealscope[fmu]'")
-    return wanted
+    return chosen_platforms

@@ -1,4 +1,4 @@
-"""The description of a unit as FMI asks for it: modelDescription.xml, versions 2.0 and 3.0."""
+"""The description of a unit: modelDescription.xml of FMI 2.0 and 3.0."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @cache
 def templates() -> jinja2.Environment:
-    """Return the templates of a unit's texts."""
+    """Load the templates of a unit's texts."""
     import jinja2
 
     return jinja2.Environment(
@@ -30,7 +30,7 @@ def templates() -> jinja2.Environment:
 
 
 def base_units(unit: str) -> dict[str, str] | None:
-    """Return a unit as FMI writes it: exponents of SI's base units and a factor; None where one is not whole.
+    """Convert a unit to FMI's exponents of SI's base units and a factor; None where one is not whole.
 
     Raises InputError for a unit that is not known.
     """
@@ -43,7 +43,7 @@ def base_units(unit: str) -> dict[str, str] | None:
 
 
 def description(fmi: int, identifier: str, token: str, words: str, variables: Sequence[Variable]) -> str:
-    """Return modelDescription.xml of FMI 2.0 or 3.0."""
+    """Format modelDescription.xml of FMI 2.0 or 3.0."""
     by_name = {variable.name: variable for variable in variables}
     outputs = [variable for variable in variables if variable.causality == "output"]
     units = sorted({"s", *(variable.unit for variable in variables)} - {"1"})  # that of the time is always needed
@@ -59,6 +59,6 @@ def description(fmi: int, identifier: str, token: str, words: str, variables: Se
             variables=variables,
             outputs=outputs,
             index={variable.name: k for k, variable in enumerate(variables, 1)},
-            dependencies={own.name: [by_name[name] for name in DIRECT.get(own.name, ())] for own in outputs},
+            dependencies={output.name: [by_name[name] for name in DIRECT.get(output.name, ())] for output in outputs},
         )
     )

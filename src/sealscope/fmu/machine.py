@@ -1,4 +1,4 @@
-"""The code of a unit: the laws that `simulate` runs, compiled for a rig's choice of them, as functions that C can call.
+"""The code of a unit: the laws of `simulate`, compiled for a rig's choice of them, as functions for C.
 
 Pointers of all functions: `values` in the order of `variables.VALUES`, `inputs` of `variables.INPUTS`, the state `y` of
 `physics.state.STATES`, `results` of `variables.RESULTS`. What they return: 0, or one of `FAILURES`.
@@ -78,15 +78,15 @@ ARGUMENTS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 
 
 @law
-def _along(a: float, b: float, t: float, h: float) -> tuple[float, float, float]:
-    """Return a + b t at the nodes of an explicit step of h [s]."""
+def _nodes_along(a: float, b: float, t: float, h: float) -> tuple[float, float, float]:
+    """Compute a + b t at the nodes of an explicit step of h [s]."""
     n = RK4_NODES
     return a + b * (t + n[0] * h), a + b * (t + n[1] * h), a + b * (t + n[2] * h)
 
 
 @law
 def _along_implicit(a: float, b: float, t: float, h: float) -> tuple[float, float, float, float, float, float]:
-    """Return a + b t at the nodes of an implicit-explicit step of h [s]."""
+    """Compute a + b t at the nodes of an implicit-explicit step of h [s]."""
     n = IMEX_NODES
     first = a + b * (t + n[0] * h), a + b * (t + n[1] * h), a + b * (t + n[2] * h)
     return first[0], first[1], first[2], a + b * (t + n[3] * h), a + b * (t + n[4] * h), a + b * (t + n[5] * h)
@@ -102,28 +102,28 @@ class Choice(NamedTuple):
     euler: bool
 
     @classmethod
-    def of(cls, rig: Rig) -> Choice:
-        """Return a rig's choice, with the laws of a load and of leakage outwards, which are inputs of every unit."""
+    def from_rig(cls, rig: Rig) -> Choice:
+        """Return a rig's choice, with the laws of a load and of outward leakage, which are inputs of every unit."""
         laws = tuple(rig_numbers(rig)._replace(open_circuit=(True,), pushed=(True,)))[len(NUMBERS) :]
         return cls(laws, *throttle_readings(rig), choose_method(rig, "auto") == "imex", rig.motor.integrator == "euler")
 
 
 def numbers_of(choices: tuple[bool | tuple[bool, ...], ...], exponent: float, literal: bool) -> Callable[..., Any]:
-    """Return the law that makes `RigNumbers` of a unit's values, with leakage outwards beside the rig's."""
+    """Build the law that makes `RigNumbers` of a unit's values and its outward leakage."""
 
     @law
     def numbers(v: Any, outward_A: float, outward_B: float) -> Any:
         derived = derived_numbers(RigValues(*to_fixed_tuple(v, _N_VALUES)), exponent, literal)
-        taken = to_fixed_tuple(v, _N_PARAMETERS)
-        taken = tuple_setitem(taken, _OUTWARD_A, taken[_OUTWARD_A] + outward_A)
-        taken = tuple_setitem(taken, _OUTWARD_B, taken[_OUTWARD_B] + outward_B)
-        return RigNumbers(*(taken + derived + choices))
+        parameters = to_fixed_tuple(v, _N_PARAMETERS)
+        parameters = tuple_setitem(parameters, _OUTWARD_A, parameters[_OUTWARD_A] + outward_A)
+        parameters = tuple_setitem(parameters, _OUTWARD_B, parameters[_OUTWARD_B] + outward_B)
+        return RigNumbers(*(parameters + derived + choices))
 
     return numbers  # type: ignore[no-any-return]
 
 
 def functions(choice: Choice) -> dict[str, Callable[..., Any]]:
-    """Return the functions of a unit, to be compiled.
+    """Build the functions of a unit, to be compiled.
 
     ``start(values, inputs, x_0, y)`` puts the state at standstill under the load of the inputs; ``advance(values,
     inputs, slopes, y, span, steps)`` moves it over `span` [s], while the inputs move along their slopes;
@@ -138,16 +138,16 @@ def functions(choice: Choice) -> dict[str, Callable[..., Any]]:
         return of_values(v, inputs[_MORE_A], inputs[_MORE_B])
 
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
-        v, given, state = carray(values, _N_VALUES), carray(inputs, _N_INPUTS), carray(y, _N_STATES)
-        p = numbers(v, given)
+        v, input_values, state = carray(values, _N_VALUES), carray(inputs, _N_INPUTS), carray(y, _N_STATES)
+        p = numbers(v, input_values)
         state[:] = 0.0
-        return stand_still(state, x_0, carried_at_standstill(x_0, p) + given[_F], p)  # type: ignore[no-any-return]
+        return stand_still(state, x_0, carried_at_standstill(x_0, p) + input_values[_F], p)  # type: ignore[no-any-return]
 
     def report(values: Any, inputs: Any, y: Any, results: Any) -> int:
-        v, given, state = carray(values, _N_VALUES), carray(inputs, _N_INPUTS), carray(y, _N_STATES)
+        v, input_values, state = carray(values, _N_VALUES), carray(inputs, _N_INPUTS), carray(y, _N_STATES)
         out = carray(results, _N_RESULTS)
-        p, z = numbers(v, given), state_of(state)
-        observe(z, given[_U], given[_G], given[_C], p, out)
+        p, z = numbers(v, input_values), state_of(state)
+        observe(z, input_values[_U], input_values[_G], input_values[_C], p, out)
         out[_N_OUTPUTS] = _electric(out[_VOLTAGE], z[CURRENT])
         out[_N_OUTPUTS + 1] = _hydraulic(out[_Q_1], (out[P_1] - out[P_2]) if throttled else (out[P_A] - out[P_B]))
         out[_N_OUTPUTS + 2] = _mechanical(out[P_A], out[P_B], z[VELOCITY], p.A_A, p.A_B)
@@ -165,8 +165,8 @@ def functions(choice: Choice) -> dict[str, Callable[..., Any]]:
 
         @law
         def step(z: Any, h: float, t: float, a: Any, b: Any, p: Any) -> Any:
-            u, G = _along(a[_U], b[_U], t, h), _along(a[_G], b[_G], t, h)
-            C, F = _along(a[_C], b[_C], t, h), _along(a[_F], b[_F], t, h)
+            u, G = _nodes_along(a[_U], b[_U], t, h), _nodes_along(a[_G], b[_G], t, h)
+            C, F = _nodes_along(a[_C], b[_C], t, h), _nodes_along(a[_F], b[_F], t, h)
             return rk4_step(z, h, u, G, C, F, p, euler)
 
     def advance(values: Any, inputs: Any, slopes: Any, y: Any, span: float, steps: int) -> int:
@@ -189,12 +189,12 @@ def functions(choice: Choice) -> dict[str, Callable[..., Any]]:
 
 @lru_cache(maxsize=8)
 def code(choice: Choice) -> Mapping[str, str]:
-    """Return the LLVM code of a rig's unit (`unit_code`)."""
+    """Compile the LLVM code of a rig's unit (`unit_code`)."""
     return unit_code(functions(choice))
 
 
 def unit_code(functions: Mapping[str, Callable[..., Any]]) -> Mapping[str, str]:
-    """Return the LLVM code of each function of a unit, by its name, with the symbol ``sealscope_NAME``."""
+    """Compile the LLVM code of each function of a unit, by its name, with the symbol ``sealscope_NAME``."""
     modules = {}
     for name, function in functions.items():
         text, symbol = plain_code(function, *ARGUMENTS[name])
@@ -203,7 +203,7 @@ def unit_code(functions: Mapping[str, Callable[..., Any]]) -> Mapping[str, str]:
 
 
 def object_code(module: str, triple: str | None = None) -> bytes:
-    """Return the machine code of LLVM code for a target ("x86_64-pc-windows-gnu"); None: this machine's system.
+    """Compile LLVM code to machine code for a target ("x86_64-pc-windows-gnu"); None: this machine's system.
 
     For any processor of the target's family, with the addresses of a shared library.
     """

@@ -1,4 +1,4 @@
-"""Record another program's unit: run by FMPy, read by the instruments of a rig."""
+"""Record another program's unit: FMPy runs it, the instruments of a rig read it."""
 
 from __future__ import annotations
 
@@ -99,9 +99,9 @@ def record_fmu(
     driven = _driven(path, experiment, names, variables, t)
     rows = _run(path, t, driven, list(measured.values()), experiment.duration, progress)
     outputs = {}
-    for name, own in measured.items():
-        unit = variables[own].unit or CHANNEL_UNITS[name]  # what has no unit is taken to be in SI units
-        outputs[name] = to_si(rows[own], unit, CHANNEL_UNITS[name], name=f"{own} of {path.name}")
+    for name, variable in measured.items():
+        unit = variables[variable].unit or CHANNEL_UNITS[name]  # what has no unit is taken to be in SI units
+        outputs[name] = to_si(rows[variable], unit, CHANNEL_UNITS[name], name=f"{variable} of {path.name}")
     volts = experiment.commanded.volts(t[: n * factor : factor])
     everything = {name: outputs.get(name, np.zeros(t.size)) for name in _MEASURED}
     recorded = record(experiment.rig, everything, volts, factor, experiment.seed, experiment.readings())
@@ -120,7 +120,7 @@ def record_fmu(
 
 
 def _check(experiment: Experiment) -> None:
-    """Raise InputError for what an experiment cannot ask of somebody else's machine."""
+    """Raise InputError for settings of an experiment that a foreign machine cannot have."""
     if experiment.target is not None:
         raise InputError(f"a unit must have a command, not a target, got {experiment.command}")
     if experiment.effects():
@@ -146,21 +146,21 @@ def _description(path: Path) -> Any:
         ) from error
 
 
-def _names(path: Path, variables: Mapping[str, Any], given: Mapping[str, str]) -> dict[str, str]:
-    """Return the unit's own name of each channel and input that it has."""
+def _names(path: Path, variables: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, str]:
+    """Find the unit's own name of each channel and input that it has."""
     known = {*_DRIVING, *_MEASURED}
-    for channel, own in given.items():
+    for channel, variable in names.items():
         if channel not in known:
             raise InputError(f"--map must name a channel or an input, got {channel!r}{closest(channel, sorted(known))}")
-        if own not in variables:
-            raise InputError(f"{path} has no variable {own!r}{closest(own, sorted(variables))}")
-    return {name: given.get(name, name) for name in known if given.get(name, name) in variables}
+        if variable not in variables:
+            raise InputError(f"{path} has no variable {variable!r}{closest(variable, sorted(variables))}")
+    return {name: names.get(name, name) for name in known if names.get(name, name) in variables}
 
 
 def _driven(
     path: Path, experiment: Experiment, names: Mapping[str, str], variables: Mapping[str, Any], t: Array
 ) -> Array:
-    """Return the inputs over time as FMPy takes them: a row a communication point.
+    """Build the inputs over time for FMPy: a row a communication point.
 
     An input is held over a step, at its value in the middle of it, which is right to the second order.
     """
@@ -169,9 +169,9 @@ def _driven(
     if experiment.load is not None and experiment.load.tables() is not None:
         raise InputError(f"a unit takes its load over time, got one over position or velocity ({experiment.load})")
     load = np.zeros(t.size) if experiment.load is None else np.asarray(experiment.load.value_at(t + half))
-    given = {"u": u, "G": G, "C": C, "F": load}
+    inputs = {"u": u, "G": G, "C": C, "F": load}
     columns: dict[str, Array] = {}
-    for name, values in given.items():
+    for name, values in inputs.items():
         if name in names:
             variable = variables[names[name]]
             unit = INPUTS[name][0]
@@ -184,8 +184,8 @@ def _driven(
     return rows
 
 
-def _run(path: Path, t: Array, driven: Array, wanted: list[str], duration: float, progress: Progress | None) -> Any:
-    """Return the outputs of the unit at the communication points `t` [s]."""
+def _run(path: Path, t: Array, driven: Array, outputs: list[str], duration: float, progress: Progress | None) -> Any:
+    """Run the unit; return its outputs at the communication points `t` [s]."""
     import fmpy
 
     def tell(time: float, _recorder: Any) -> bool:
@@ -193,16 +193,16 @@ def _run(path: Path, t: Array, driven: Array, wanted: list[str], duration: float
             progress("running the unit", min(1.0, time / duration))
         return True
 
-    span, said = float(t[1] - t[0]), io.StringIO()
+    span, log = float(t[1] - t[0]), io.StringIO()
     try:
-        with redirect_stdout(said):  # FMPy prints what the unit logs
+        with redirect_stdout(log):  # FMPy prints what the unit logs
             rows = fmpy.simulate_fmu(
                 str(path), start_time=0.0, stop_time=float(t[-1]), step_size=span, output_interval=span, input=driven,
-                output=wanted, step_finished=tell, validate=False,
+                output=outputs, step_finished=tell, validate=False,
             )  # fmt: skip
     except Exception as error:  # of the unit's code, of FMPy, of a library for another system
-        logged = [line.removeprefix("[ERROR] ") for line in said.getvalue().splitlines() if line.startswith("[")]
+        logged = [line.removeprefix("[ERROR] ") for line in log.getvalue().splitlines() if line.startswith("[")]
         raise SimulationFailed(f"the unit {path.name} failed: {'; '.join([*logged[-1:], str(error)])}") from error
-    if len(rows) < t.size or not all(math.isfinite(rows[name][-1]) for name in wanted):
+    if len(rows) < t.size or not all(math.isfinite(rows[name][-1]) for name in outputs):
         raise SimulationFailed(f"the unit {path.name} ended at t = {rows['time'][-1]:.4g} s of {t[-1]:.4g} s")
     return rows[: t.size]

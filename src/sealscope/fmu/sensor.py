@@ -90,7 +90,7 @@ def variables(rig: Rig) -> Iterator[Variable]:
 
 
 class SensorChoice(NamedTuple):
-    """What the code of a soft sensor depends on.
+    """The parameters that the code of a soft sensor depends on.
 
     `rate` [Hz]; `size_error`: how far the machine's size is known; `place`, `fast`: columns as `weigh` takes them.
     """
@@ -101,7 +101,7 @@ class SensorChoice(NamedTuple):
     fast: int
 
     @classmethod
-    def of(cls, rig: Rig, rate: float) -> SensorChoice:
+    def from_rig(cls, rig: Rig, rate: float) -> SensorChoice:
         """Return a rig's choice; raise InputError where its balance has other terms than the code."""
         (balance,) = live_equations(rig, INPUTS)
         columns = Columns(balance)
@@ -112,19 +112,19 @@ class SensorChoice(NamedTuple):
 
 
 class _Numbers(NamedTuple):
-    """Counts that the code is made for: samples of a stride, strides of a block, half the samples of a difference."""
+    """Counts of the code: samples of a stride, strides of a block, half the samples of a difference."""
 
     stride: int
     strides: int
     half: int
 
     @classmethod
-    def of(cls, rate: float) -> _Numbers:
+    def from_rate(cls, rate: float) -> _Numbers:
         return cls(stride_samples(rate), round(BLOCK_SECONDS / STRIDE), max(1, round(HALF_DIFFERENCE * rate)))
 
 
 def memory_of(choice: SensorChoice) -> np.dtype[Any]:
-    """Return the layout of a soft sensor's memory.
+    """Build the layout of a soft sensor's memory.
 
     `ring`: the last samples; `increments`, `opened`: of an interval, and the rows that it is part of; `rows`, `ends`,
     `gram`: of the blocks that are weighted together; `sizes`: sum and number of abs(p_A - p_B) in the last blocks;
@@ -132,7 +132,7 @@ def memory_of(choice: SensorChoice) -> np.dtype[Any]:
     blocks that are learned from; `last`: of each of the last blocks total, conductance, its variance, that of the
     level, and abs(p_A - p_B); `workspace`, `known`: a `Workspace` and a `Known`.
     """
-    n, slow = _Numbers.of(choice.rate), len(choice.place) - choice.fast - 1
+    n, slow = _Numbers.from_rate(choice.rate), len(choice.place) - choice.fast - 1
     rows = SUPPORT * n.strides
     workspace = workspace_shapes(rows, SUPPORT, len(choice.place), slow)
     return layout_of(
@@ -155,7 +155,7 @@ def memory_of(choice: SensorChoice) -> np.dtype[Any]:
 
 
 def functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
-    """Return the functions of a soft sensor, to be compiled: ``start``, ``advance`` and ``report`` as of a machine."""
+    """Build the functions of a soft sensor: ``start``, ``advance`` and ``report`` as of a machine."""
     from scipy.special import stdtrit
 
     layout = memory_of(choice)
@@ -186,16 +186,16 @@ def functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
 
 
 def _sample(choice: SensorChoice) -> Callable[..., Any]:
-    """Return the law that takes a sample of the channels `INPUTS`."""
-    (stride, strides, half), rate = _Numbers.of(choice.rate), choice.rate
+    """Build the law that takes a sample of the channels `INPUTS`."""
+    (stride, strides, half), rate = _Numbers.from_rate(choice.rate), choice.rate
     support, weight = SPAN * stride, float(test_function(rate)[0, 0]) / (1.0 - (1.0 / (SPAN * stride) - 1.0) ** 2) ** 4
     close, length = _close(choice), stride * strides
 
     @law
     def sample(m: Any, displacement: float, p_A: float, p_B: float, theta: float, x: float) -> None:
         count, width = int(m.sample_count), m.ring.shape[1]
-        at = count % width
-        m.ring[0, at], m.ring[1, at], m.ring[2, at], m.ring[3, at] = p_A, p_B, theta, x
+        slot = count % width
+        m.ring[0, slot], m.ring[1, slot], m.ring[2, slot], m.ring[3, slot] = p_A, p_B, theta, x
         m.sample_count += 1.0
         k = count - half - 1  # the interval from sample k on, which half a difference is known after
         if k < 0:
@@ -230,7 +230,7 @@ def _sample(choice: SensorChoice) -> Callable[..., Any]:
 
 @large_law
 def _increments(ring: Any, k: int, half: int, rate: float, displacement: float, out: Any) -> None:
-    """Put the increments of the interval from sample k on, in the order of `COLUMNS`, into `out`."""
+    """Write the increments of the interval from sample k on, in the order of `COLUMNS`, into `out`."""
     width = ring.shape[1]
     here, there = k % width, (k + 1) % width
     dx, x = ring[3, there] - ring[3, here], 0.5 * (ring[3, there] + ring[3, here])
@@ -244,9 +244,9 @@ def _increments(ring: Any, k: int, half: int, rate: float, displacement: float, 
     for side in range(2):
         before, after = ring[side, here], ring[side, there]
         low, high = max(before + P_ATM, LEAST_ABSOLUTE), max(after + P_ATM, LEAST_ABSOLUTE)
-        at = 4 + 4 * side
-        out[at], out[at + 1] = after - before, x * (after - before)
-        out[at + 2], out[at + 3] = 1.0 / high - 1.0 / low, math.log(high) - math.log(low)
+        column = 4 + 4 * side
+        out[column], out[column + 1] = after - before, x * (after - before)
+        out[column + 2], out[column + 3] = 1.0 / high - 1.0 / low, math.log(high) - math.log(low)
     earlier, later = max(k - 1, 0), k + 1
     slope = ring[3, (later + 1) % width] - ring[3, later % width]
     slope -= ring[3, (earlier + 1) % width] - ring[3, earlier % width]
@@ -258,7 +258,7 @@ def _increments(ring: Any, k: int, half: int, rate: float, displacement: float, 
 
 @law
 def _orient(m: Any, count: int) -> None:
-    """Write the sign in which the left side counts (`BlockStream`), by the first rows."""
+    """Determine the sign of the left side's counts (`BlockStream`) from the first rows."""
     mean, work = 0.0, 0.0
     for r in range(count):
         mean += m.rows[r, _LEAK] / count
@@ -269,7 +269,7 @@ def _orient(m: Any, count: int) -> None:
 
 @large_law
 def _show(m: Any, error: float, rows: float, size: float, adds: bool) -> None:
-    """Put what the block `known.own` shows among the last ones."""
+    """Append the result of the block `known.own` to the last ones."""
     known = m.known
     moved = motion(known.own[-1, -1], rows, known.numbers)
     precision, lead, shift, leaning = says(known, rows, adds)
@@ -288,7 +288,7 @@ def _show(m: Any, error: float, rows: float, size: float, adds: bool) -> None:
 
 @large_law
 def _learn(m: Any, error: float) -> None:
-    """Learn from the blocks that wait, and show them."""
+    """Learn from the waiting blocks, and append their results."""
     known = m.known
     for again in range(3):
         for k in range(LEARNED):
@@ -309,7 +309,7 @@ def _learn(m: Any, error: float) -> None:
 
 @large_law
 def _take(m: Any, error: float, b: int, rows: float, size: float) -> None:
-    """Take the sums of a block: `LEARNED` blocks are learned from together, the others one by one."""
+    """Take the sums of a block: the first `LEARNED` blocks are learnt from together, the others one by one."""
     known = m.known
     if m.precision > 0.0:
         moved = motion(m.gram[b, _LEFT, _LEFT], rows, known.numbers)
@@ -336,7 +336,7 @@ def _take(m: Any, error: float, b: int, rows: float, size: float) -> None:
 
 
 def _close(choice: SensorChoice) -> Callable[..., Any]:
-    """Return the law that closes a block."""
+    """Build the law that closes a block."""
     place, fast, error = choice.place, choice.fast, choice.size_error
 
     @large_law
@@ -364,7 +364,7 @@ def _close(choice: SensorChoice) -> Callable[..., Any]:
 
 @large_law
 def _mean(last: Any, newest: int, n: int, column: int) -> float:
-    """Return the mean of a column of the last n blocks up to the `newest`."""
+    """Compute the mean of a column of the last n blocks up to the `newest`."""
     total = 0.0
     for k in range(n):
         total += last[(newest - k) % WINDOW, column] / n
@@ -373,7 +373,7 @@ def _mean(last: Any, newest: int, n: int, column: int) -> float:
 
 @large_law
 def _variance(last: Any, newest: int, n: int) -> float:
-    """Return the variance of the mean conductance of the last n blocks up to the `newest`."""
+    """Compute the variance of the mean conductance of the last n blocks up to the `newest`."""
     mean, square = _mean(last, newest, n, 1), 0.0
     for k in range(n):
         square += (last[(newest - k) % WINDOW, 1] - mean) ** 2 / (n - 1.0)
@@ -410,5 +410,5 @@ def _write_results(m: Any, error: float, quantiles: Any, out: Any) -> None:
 
 @lru_cache(maxsize=8)
 def sensor_code(choice: SensorChoice) -> Mapping[str, str]:
-    """Return the LLVM code of a soft sensor (`unit_code`)."""
+    """Compile the LLVM code of a soft sensor (`unit_code`)."""
     return unit_code(functions(choice))

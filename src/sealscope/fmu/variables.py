@@ -1,4 +1,4 @@
-"""The variables of a unit: what goes in, what can be tuned, what comes out, with units and words."""
+"""The variables of a unit: inputs, tunable parameters and outputs, with units and words."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def outputs(rows: Mapping[str, tuple[str, str]]) -> Iterator[Variable]:
 
 
 def parameter(rig: Rig, name: str, variability: Literal["tunable", "fixed"]) -> Variable | None:
-    """Return a parameter of a rig as a variable; None where it is absent: it has no law in the unit."""
+    """Describe a parameter of a rig as a variable; None for one without a law in the unit."""
     value, field = float(attrgetter(name)(rig)), dict(leaves(Rig))[name]
     reference, words = REFERENCES["value"] + VALUES.index(name), str(field.title or name)
     absent = value == absent_of(field)
@@ -69,7 +69,7 @@ def variables(rig: Rig, step: float) -> Iterator[Variable]:
     """Yield the variables of a rig's unit; `step` [s]: the longest of its solver."""
     yield from inputs(INPUTS)
     yield from filter(None, (parameter(rig, name, "tunable") for name in VALUES))
-    at, words = REFERENCES["start_position"], "piston position at the start, from mid-stroke"
-    yield Variable(at, "start_position", "parameter", "fixed", "m", words, 0.0)
+    reference, words = REFERENCES["start_position"], "piston position at the start, from mid-stroke"
+    yield Variable(reference, "start_position", "parameter", "fixed", "m", words, 0.0)
     yield Variable(REFERENCES["step"], "step", "parameter", "fixed", "s", "longest step of the solver", step)
     yield from outputs(RESULTS)

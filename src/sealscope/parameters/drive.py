@@ -48,7 +48,7 @@ class Pump(Part):
 
 
 class HydraulicLine(Part):
-    """Lines between pump and cylinder, and what is in them: throttles (eqs. (4.7)-(4.12)), shut-off valves, filters.
+    """Lines between pump and cylinder: throttles (eqs. (4.7)-(4.12)), shut-off valves, filters.
 
     `orifices = "absent"`: the pump is piped to the cylinder directly (p_1 = p_A, p_2 = p_B, V_1 and V_2 unused), with
     neither valves nor filters. Filters may clog by the volume that passes them (`clogged_resistance`) and have a

@@ -1,4 +1,4 @@
-"""How a parameter is declared: symbol = field name; human name, SI unit and range stand in the model.
+"""Declaration of a parameter: the field's name is the symbol; human name, SI unit and range stand in the model.
 
 A model holds SI numbers and choices only. It has no default: every value comes from a rig's file, with its source. A
 parameter may declare the value at which it is `absent` from the model; a file that does not state it means that one.
@@ -34,7 +34,7 @@ def choice(name: str, *, absent: str | None = None) -> Any:
 
 
 def unit_of(field: FieldInfo) -> str:
-    """SI unit of a declared parameter ("" for a choice)."""
+    """Return the SI unit of a declared parameter ("" for a choice)."""
     extra = field.json_schema_extra
     return str(extra["unit"]) if isinstance(extra, dict) else ""
 
@@ -52,12 +52,12 @@ def choices_of(field: FieldInfo) -> tuple[str, ...]:
 
 
 def with_unit(number: float, unit: str) -> str:
-    """Return `number` followed by its unit, bare where it has none."""
+    """Format `number` with its unit, bare where it has none."""
     return f"{number:g}" if unit in ("", "1") else f"{number:g} {unit}"
 
 
 def rule_broken(error: ValidationError, model: type[BaseModel]) -> str:
-    """Return pydantic's first message on values of `model` as "SYMBOL must be ..., got ...", bounds with their unit."""
+    """Format pydantic's first message on values of `model` as "SYMBOL must be ..., got ...", bounds with their unit."""
     first = error.errors(include_url=False)[0]
     symbol = ".".join(map(str, first["loc"]))
     bounded = symbol in model.model_fields and first.get("ctx", {}).keys() & {"gt", "ge", "lt", "le"}
@@ -89,7 +89,7 @@ class Part(BaseModel):
 
 
 def leaves(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
-    """Dotted name and declaration of every parameter below `model`, in the order of declaration."""
+    """List dotted name and declaration of every parameter below `model`, in the order of declaration."""
     for symbol, field in model.model_fields.items():
         annotation = field.annotation
         if isinstance(annotation, type) and issubclass(annotation, BaseModel):

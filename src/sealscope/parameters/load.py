@@ -23,7 +23,7 @@ OF_MACHINES = ("machine", "learnt", "healthy", "alarms")
 
 
 def rig_names() -> tuple[str, ...]:
-    """Names of the packaged rigs."""
+    """List the names of the packaged rigs."""
     return tuple(sorted(path.stem for path in _PACKAGED.glob("*.toml")))
 
 
@@ -88,7 +88,7 @@ def _build(path: Path, place: str) -> Rig:
 
 
 def save_channel_map(path: str | os.PathLike[str], columns: Mapping[str, str]) -> None:
-    """Write channel -> column into the table `[map]` of a rig's file, in place of the one that is there.
+    """Write channel -> column into the table `[map]` of a rig's file, in place of the former one.
 
     Raises InputError where the file is no rig's, or cannot be written; then it stays as it was.
     """
@@ -112,7 +112,7 @@ def save_channel_map(path: str | os.PathLike[str], columns: Mapping[str, str]) -
 def _collect(
     path: Path, place: str, visited: tuple[Path, ...]
 ) -> tuple[dict[str, str], dict[str, ParameterEntry], dict[str, str]]:
-    """Head, entries and map of columns of a file, on top of those of the rig it extends."""
+    """Read head, entries and map of columns of a file, over those of the rig it extends."""
     here = path.resolve()
     if here in visited or len(visited) >= _DEEPEST:
         raise InputError(f"extends must end at a rig of its own, got a circle or more than {_DEEPEST} files ({place})")
@@ -129,9 +129,13 @@ def _collect(
             raise InputError(f"rig.{key} is not known; [rig] has name, title and extends ({place})")
         if not isinstance(value, str) or not value.strip():
             raise InputError(f"rig.{key} must be a text, got {value!r} ({place})")
-    own = tree.pop("map", {})
-    if not isinstance(own, dict) or not all(isinstance(column, str) and column.strip() for column in own.values()):
-        raise InputError(f"map must be a table of channels and the names of their columns, got {own!r:.80} ({place})")
+    channel_map = tree.pop("map", {})
+    if not isinstance(channel_map, dict) or not all(
+        isinstance(column, str) and column.strip() for column in channel_map.values()
+    ):
+        raise InputError(
+            f"map must be a table of channels and the names of their columns, got {channel_map!r:.80} ({place})"
+        )
     entries: dict[str, ParameterEntry] = {}
     columns: dict[str, str] = {}
     base = head.get("extends")
@@ -143,4 +147,4 @@ def _collect(
         raise InputError(
             f"extends must be a packaged rig ({', '.join(rig_names())}) or a .toml file, got {base!r} ({place})"
         )
-    return head, entries | flatten(tree.items(), place), own or columns
+    return head, entries | flatten(tree.items(), place), channel_map or columns

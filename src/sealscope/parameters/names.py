@@ -19,7 +19,7 @@ _OTHER_NAMES = {
 
 
 def resolve(name: str, dotted: Sequence[str]) -> str:
-    """Return the dotted name that `name` stands for: itself, or the only one that ends with it (`V_1`, `p_A.noise`).
+    """Find the dotted name of `name`: itself, or the only one that ends with it (`V_1`, `p_A.noise`).
 
     Raises InputError where no parameter has the name, or several have.
     """
@@ -39,7 +39,7 @@ def resolve(name: str, dotted: Sequence[str]) -> str:
 
 
 def parse_override(text: str) -> tuple[str, str]:
-    """Name and value of one `NAME=VALUE[unit]`; the value stays text, for `Rig.with_overrides` to read.
+    """Parse one `NAME=VALUE[unit]`; the value stays text, for `Rig.with_overrides` to read.
 
     Raises InputError where there is no name, no equals sign or no value.
     """
@@ -51,7 +51,7 @@ def parse_override(text: str) -> tuple[str, str]:
 
 
 def parse_overrides(texts: Sequence[str]) -> dict[str, str]:
-    """All overrides of one command; a name given twice with different values raises InputError."""
+    """Parse all overrides of one command; raise InputError for a name with two values."""
     overrides: dict[str, str] = {}
     for text in texts:
         name, value = parse_override(text)

@@ -1,4 +1,4 @@
-"""A new rig's file from the numbers of a data sheet: what they do not tell is assumed, and says so."""
+"""A new rig's file from the numbers of a data sheet: what they do not tell is assumed, and marked as such."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def piston_areas(bore: float, rod: float, *, both: bool = False) -> tuple[float,
 
 
 def rig_text(name: str, area_A: float, area_B: float, stroke: float, displacement: float) -> str:
-    """Return the text of the file of a pump-controlled rig, with comments.
+    """Format the file of a pump-controlled rig, with comments.
 
     What the four numbers do not tell is taken from `thesis` (equal areas) or `single-rod-eha`, scaled where the size of
     the machine says how: friction with the bore, moving mass with the oil displaced, valves with the volumes.

@@ -1,4 +1,4 @@
-"""The Rig: all parameters of one machine, immutable, each number in SI with the unit and source it came with."""
+"""The Rig: all parameters of one machine, immutable, each number in SI with its unit and source."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _GAS_OVER_ROD = 5.0
 
 
 class ParameterEntry(NamedTuple):
-    """One value as given: number or choice, unit ("" for a choice), source, and the file or option it stands in."""
+    """One value as stated: number or choice, unit ("" for a choice), source, and its file or option."""
 
     value: Value
     unit: str
@@ -150,7 +150,7 @@ class Rig(Part):
         return self
 
     def _valve_fits(self) -> None:
-        """Raise ValueError for a valve without a supply, a supply without a valve, and what neither can have."""
+        """Raise ValueError for a valve without a supply, a supply without a valve, and parts that neither can have."""
         valve, supply = self.valve, self.supply
         if (valve.spool == "present") != (supply.drive != "absent"):
             raise ValueError(
@@ -173,7 +173,7 @@ class Rig(Part):
             )
 
     def _lines_hold_what_is_in_them(self) -> None:
-        """Raise ValueError for shut-off valves or filters in lines that are not there, and for an oil that thickens."""
+        """Raise ValueError for shut-off valves or filters in absent lines, and for an oil that thickens."""
         line, oil = self.line, self.fluid
         for name, absent in (("open_A", 1.0), ("open_B", 1.0), ("R_A", 0.0), ("R_B", 0.0)):
             if getattr(line, name) != absent and line.orifices == "absent":
@@ -215,7 +215,7 @@ class Rig(Part):
 
     @property
     def title(self) -> str:
-        """What the rig is, in words."""
+        """Description of the rig in words."""
         return self._title
 
     @property
@@ -237,8 +237,8 @@ class Rig(Part):
         return value  # type: ignore[no-any-return]
 
     def entry(self, name: str) -> ParameterEntry:
-        """Value, unit, source and place of a parameter, as given."""
-        return self._given()[resolve(name, declared_names())]
+        """Return value, unit, source and place of a parameter, as stated."""
+        return self._stated_entries()[resolve(name, declared_names())]
 
     def states(self, *names: str) -> bool:
         """Return whether these parameters are stated: a source that begins with `assumed:` states nothing."""
@@ -246,17 +246,17 @@ class Rig(Part):
 
     def as_assumed(self, reason: str) -> Rig:
         """Return the same rig with each value an assumption, for this reason."""
-        entries = {name: entry._replace(source=f"{ASSUMED} {reason}") for name, entry in self._given().items()}
+        entries = {name: entry._replace(source=f"{ASSUMED} {reason}") for name, entry in self._stated_entries().items()}
         rig = Rig.from_entries(entries, name=self._name, title=self._title, place=self._name)
         return rig.with_channel_map(self.channel_map)
 
-    def _given(self) -> dict[str, ParameterEntry]:
+    def _stated_entries(self) -> dict[str, ParameterEntry]:
         if not self._entries:
             raise InputError("a rig must have sources; make it with load_rig or Rig.from_entries, not from bare parts")
         return dict(self._entries)
 
     def with_overrides(self, overrides: Mapping[str, Value], *, source: str = "set by caller") -> Rig:
-        """Another rig with some values replaced, `source` written beside each.
+        """Return another rig with some values replaced, each with the source `source`.
 
         A name is bare where it is unique (`V_1`), else dotted (`sensors.p_A.noise`). A number is in SI; a text carries
         its unit (`"0.8[ohm]"`, `"50 %"`) or is a choice's value. Raises InputError for an unknown or ambiguous name, a
@@ -264,7 +264,7 @@ class Rig(Part):
         """
         if not source.strip():
             raise InputError("source must not be blank")
-        entries = self._given()
+        entries = self._stated_entries()
         replaced: dict[str, str] = {}
         for name, value in overrides.items():
             full = resolve(name, declared_names())
@@ -299,8 +299,8 @@ class Rig(Part):
         return rig.with_channel_map(self.channel_map)
 
     def table(self) -> list[ParameterRow]:
-        """Every parameter in the order of declaration."""
-        entries = self._given()
+        """List every parameter in the order of declaration."""
+        entries = self._stated_entries()
         return [
             ParameterRow(
                 name.rpartition(".")[2],
@@ -315,27 +315,27 @@ class Rig(Part):
         ]
 
     def present(self) -> dict[str, Value]:
-        """Return the values in SI by dotted name, without those at which a parameter is absent from the model.
+        """Return the values in SI by dotted name, without those of parameters absent from the model.
 
         Two rigs have the same ones where they are the same machine, whichever parameters Sealscope has learnt since.
         """
         return {name: self[name] for name, field in declared().items() if self[name] != absent_of(field)}
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the rig as plain nested values, fit for JSON: `{"motor": {"R_c": {"value": 0.73, ...}}, ...}`."""
+        """Convert the rig to plain nested values, fit for JSON: `{"motor": {"R_c": {"value": 0.73, ...}}, ...}`."""
         tree: dict[str, Any] = {"rig": {"name": self._name, "title": self._title}}
-        for name, entry in self._given().items():
+        for name, entry in self._stated_entries().items():
             *groups, symbol = name.split(".")
-            at = tree
+            node = tree
             for group in groups:
-                at = at.setdefault(group, {})
+                node = node.setdefault(group, {})
             unit = {} if entry.unit == "" else {"unit": entry.unit}
-            at[symbol] = {"value": entry.value, **unit, "source": entry.source}
+            node[symbol] = {"value": entry.value, **unit, "source": entry.source}
         return tree
 
     @classmethod
     def from_dict(cls, tree: Mapping[str, Any], *, place: str) -> Rig:
-        """Return the rig that `as_dict` wrote down, for example in a recording's provenance.
+        """Read the rig that `as_dict` wrote, for example in a recording's provenance.
 
         `place` is named in errors.
         """
@@ -346,7 +346,7 @@ class Rig(Part):
 
     @classmethod
     def from_entries(cls, entries: Mapping[str, ParameterEntry], *, name: str, title: str = "", place: str) -> Rig:
-        """Return a rig from one entry for each declared parameter, by dotted name.
+        """Build a rig from one entry for each declared parameter, by dotted name.
 
         One that is not stated has the value at which it is absent; `place` is named where it has none such.
         """
@@ -371,7 +371,7 @@ def declared() -> dict[str, FieldInfo]:
 
 
 def _absent_entries(place: str) -> dict[str, ParameterEntry]:
-    """Return an entry for each parameter that need not be stated."""
+    """Make an entry for each parameter that need not be stated."""
     return {
         full: ParameterEntry(value, unit_of(field), "absent from the model: not stated", place)
         for full, field in declared().items()
@@ -381,12 +381,12 @@ def _absent_entries(place: str) -> dict[str, ParameterEntry]:
 
 @cache
 def declared_names() -> tuple[str, ...]:
-    """Dotted names of all parameters, in the order of declaration."""
+    """List the dotted names of all parameters, in the order of declaration."""
     return tuple(declared())
 
 
 def _built(model: type[P], path: str, entries: Mapping[str, ParameterEntry], place: str) -> P:
-    """Build a part whose parameters' names begin with `path`; a broken rule is named with the place of its value."""
+    """Build a part of parameters whose names begin with `path`; an error names the place of the wrong value."""
     values: dict[str, Any] = {}
     for symbol, field in model.model_fields.items():
         kind = field.annotation
@@ -404,23 +404,23 @@ def _built(model: type[P], path: str, entries: Mapping[str, ParameterEntry], pla
 
 
 def _qualified(full: str, text: str) -> str:
-    """`text` as it is where its first word, a symbol, is unique among parameters, else with the dotted name."""
+    """Replace the first word of `text` by its dotted name where it is not unique among parameters."""
     symbol = full.rpartition(".")[2]
     unique = sum(name.rpartition(".")[2] == symbol for name in declared_names()) <= 1
     return text if unique else full + text[len(symbol) :]
 
 
 @cache
-def _shown(full: str) -> str:
+def _short_name(full: str) -> str:
     return _qualified(full, full.rpartition(".")[2])
 
 
 def _si_value(full: str, field: FieldInfo, entry: ParameterEntry) -> Value:
-    """Return the SI number or the choice of one entry.
+    """Convert one entry to its SI number or its choice.
 
     Raises InputError for a blank source, a wrong type or a wrong unit.
     """
-    shown, place = _shown(full), entry.place
+    shown, place = _short_name(full), entry.place
     if not isinstance(entry.source, str) or not entry.source.strip():
         raise InputError(f"{shown} must have a source, got none ({place})")
     if allowed := choices_of(field):
@@ -444,18 +444,18 @@ def _si_value(full: str, field: FieldInfo, entry: ParameterEntry) -> Value:
 
 
 def _as_given(full: str, value: Any, place: str) -> tuple[Value, str]:
-    """Value and unit that a caller's number (SI) or text (with its unit) stands for."""
+    """Parse value and unit of a caller's number (SI) or text (with its unit)."""
     field = declared()[full]
     if choices_of(field):
         return (value.strip() if isinstance(value, str) else value), ""
     si_unit = unit_of(field)
     if isinstance(value, str):
-        return parse_quantity(value, si_unit, name=_shown(full), place=place), si_unit
+        return parse_quantity(value, si_unit, name=_short_name(full), place=place), si_unit
     return (value.item() if isinstance(value, np.generic) else value), si_unit
 
 
 def flatten(tree: Iterable[tuple[str, Any]], place: str, prefix: str = "") -> dict[str, ParameterEntry]:
-    """Entries of nested tables `{group: {symbol: {value, unit, source}}}` by dotted name; else InputError."""
+    """Flatten nested tables `{group: {symbol: {value, unit, source}}}` to entries by dotted name."""
     entries: dict[str, ParameterEntry] = {}
     for key, item in tree:
         full = prefix + key
@@ -471,7 +471,7 @@ def flatten(tree: Iterable[tuple[str, Any]], place: str, prefix: str = "") -> di
 def _entry(full: str, item: Any, place: str) -> ParameterEntry:
     if full not in declared():
         raise InputError(f"{full} is not a parameter{closest(full, declared_names())} ({place})")
-    shown = _shown(full)
+    shown = _short_name(full)
     if not isinstance(item, dict):
         raise InputError(f"{shown} must be {{ value = ..., unit = ..., source = ... }}, got {item!r} ({place})")
     if unknown := sorted(set(item) - {"value", "unit", "source"}):

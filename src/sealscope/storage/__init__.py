@@ -1,1 +1,1 @@
-"""Files from outside and files of our own: opened safely, written whole, kept in folders that links do not leave."""
+"""Files from outside and files of our own: opened safely, written whole, in folders that links do not leave."""

@@ -64,7 +64,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def _mode_of(target: Path) -> int:
-    """Return the mode of the file, or where there is none the mode that any new file of this user gets."""
+    """Return the mode of the file, or else the mode of any new file of this user."""
     with suppress(FileNotFoundError):
         return target.stat().st_mode & 0o777
     mask = os.umask(0)
@@ -82,7 +82,7 @@ def _sync(path: Path, flags: int) -> None:
 
 
 def remove_temporaries(folder: Path, target: str | None = None) -> None:
-    """Remove the temporary files in `folder` whose process was killed, those of the file `target` or of all.
+    """Remove the temporary files of killed processes in `folder`, those of the file `target` or of all.
 
     A process of this machine that is gone has left its files for good; those of another machine are given up after a
     day. Links to folders are not resolved.

@@ -1,4 +1,4 @@
-"""Folders of results: made, entered and held by one process, a link in them leads nowhere; the order of their files."""
+"""Folders of results: made, entered and held by one process; links out of them are refused."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def inner_files(folder: Path, paths: Iterable[Path]) -> Iterator[Path]:
 
 
 def by_numbers(name: str) -> list[str | int]:
-    """Return a key that orders names as people count: day_2 before day_10."""
+    """Compute a key that orders names as people count: day_2 before day_10."""
     return [int(word) if word.isdecimal() else word for word in re.split(r"(\d+)", name)]
 
 

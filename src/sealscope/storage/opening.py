@@ -1,4 +1,4 @@
-"""Open files from outside: a pipe is not waited for, and in a folder of results no link is followed out of it."""
+"""Open files from outside: a pipe is not waited for, and no link is followed out of a folder of results."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ _KINDS = (
 
 
 def names_a_file(text: str | os.PathLike[str]) -> bool:
-    """Whether a text from outside is the path of a file; False, too, for what no path can be (too long, odd bytes)."""
+    """Return whether a text from outside can be the path of a file; too long a text or odd bytes cannot."""
     return os.path.isfile(text)  # noqa: PTH113 - pathlib raises for these until Python 3.14
 
 
 def kind_of(mode: int) -> str | None:
-    """Return what a file of this `st_mode` is, in words; None for a regular file."""
+    """Name the kind of a file of this `st_mode`; None for a regular file."""
     return next((name for is_kind, name in _KINDS if is_kind(mode)), None)
 
 
@@ -78,7 +78,7 @@ def _opened(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+"],
 
 @contextmanager
 def whole(what: str, place: str | os.PathLike[str]) -> Iterator[None]:
-    """Turn whatever a damaged file raises in the block into an UnreadableFile of one line; the log has the original.
+    """Turn any error of a damaged file in the block into an UnreadableFile of one line; the log has the original.
 
     `what` it is ("a rig") and its `place` stand in the message. MissingExtra and UnreadableFile pass.
     """

@@ -20,7 +20,7 @@ _LARGEST = 50_000_000
 
 
 def plain_array(values: NDArray[Any]) -> dict[str, Any]:
-    """Return an array of numbers as a mapping of its shape and its bytes (little endian, base64).
+    """Convert an array of numbers to a mapping of its shape and its bytes (little endian, base64).
 
     Named columns are the last axis, without their names.
     """
@@ -29,18 +29,18 @@ def plain_array(values: NDArray[Any]) -> dict[str, Any]:
 
 
 def _unnamed(values: NDArray[Any]) -> NDArray[Any]:
-    """Return an array whose named columns, all floats, are the last axis."""
+    """Convert an array of named columns, all floats, to one with the columns as last axis."""
     names = values.dtype.names
     return values if names is None else values.view(float).reshape(*values.shape, len(names))
 
 
 def plain_fields(values: Any) -> dict[str, Any]:
-    """Return the fields of a dataclass whose values are plain already; lists are copied, for they may grow."""
+    """Return the fields of a dataclass of plain values; lists are copied, for they may grow."""
     return {name: list(value) if isinstance(value, list) else value for name, value in vars(values).items()}
 
 
 def restored(kind: type[_T], state: Any, name: str) -> _T:
-    """Return a part of a saved state as the dataclass `kind`; raises InputError where it does not fit."""
+    """Restore a part of a saved state as the dataclass `kind`; raise InputError where it does not fit."""
     try:
         return as_type(kind, state)
     except ValueError as error:
@@ -48,7 +48,7 @@ def restored(kind: type[_T], state: Any, name: str) -> _T:
 
 
 def array_of(value: Any, name: str) -> NDArray[np.float64]:
-    """Return the array that `plain_array` made a mapping of; `name` stands in the error.
+    """Restore the array of a mapping by `plain_array`; `name` stands in the error.
 
     Raises InputError where it is none.
     """
@@ -63,7 +63,7 @@ def array_of(value: Any, name: str) -> NDArray[np.float64]:
 
 
 def part_of(state: Any, name: str, kind: type | tuple[type, ...]) -> Any:
-    """Return the part `name` of a saved state; raises InputError where it is missing or of a wrong kind."""
+    """Return the part `name` of a saved state; raise InputError where it is missing or of a wrong kind."""
     if not isinstance(state, Mapping) or name not in state:
         raise InputError(f"saved state must have {name!r}, got {type(state).__name__} without")
     value = state[name]
@@ -73,7 +73,7 @@ def part_of(state: Any, name: str, kind: type | tuple[type, ...]) -> Any:
 
 
 def count_of(state: Any, name: str) -> int:
-    """Return a whole number >= 0 of a saved state; raises InputError for anything else."""
+    """Return a whole number >= 0 of a saved state; raise InputError for anything else."""
     value = part_of(state, name, object)
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
         raise InputError(f"saved state's {name} must be a whole number >= 0, got {value!r}")
@@ -81,7 +81,7 @@ def count_of(state: Any, name: str) -> int:
 
 
 def numbers_of(state: Any, name: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return numbers of this shape that a saved state holds as they are; raises InputError for anything else."""
+    """Return numbers of this shape from a saved state; raise InputError for anything else."""
     try:
         values = np.asarray(part_of(state, name, object))
         if values.size and values.dtype.kind not in "fi":
@@ -94,7 +94,7 @@ def numbers_of(state: Any, name: str, shape: tuple[int, ...]) -> NDArray[np.floa
 
 
 def saved(owner: Any, names: Iterable[str]) -> dict[str, Any]:
-    """Return attributes as plain values, for `recall`: numbers, texts, lists, arrays, dataclasses, what has a `state`.
+    """Convert attributes to plain values, for `recall`: numbers, texts, lists, arrays, dataclasses, states.
 
     A number that is not finite is null.
     """
@@ -114,7 +114,7 @@ def _plain(value: Any) -> Any:
 
 
 def recall(owner: Any, names: Iterable[str], state: Any, kinds: Mapping[str, Any] = MappingProxyType({})) -> None:
-    """Set the attributes that `saved` returned; null leaves a number, or None. Arrays of a tuple are written to.
+    """Set the attributes that `saved` returned; null stands for a number left unchanged, or None.
 
     `kinds`: types of attributes that may be None, or hold others. Raises InputError where one is missing or unlike what
     is there: in its type, or in the shape of an array but for axes that are empty.

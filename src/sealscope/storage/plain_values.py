@@ -1,4 +1,4 @@
-"""Plain values of files from outside: JSON of finite numbers, and values of the types that the program counts on."""
+"""Plain values of files from outside: JSON of finite numbers, and values of expected types."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ LARGEST_WHOLE = 2**53
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Return the value of a JSON text; ValueError where it is none, or holds a number that is not finite or too large.
+    """Parse a JSON text; raise ValueError for any other, and for numbers that are not finite or too large.
 
     Whole numbers are at most 2^53 in size.
     """
     try:
-        return json.loads(text, parse_float=_finite, parse_int=_whole, parse_constant=_finite)
+        return json.loads(text, parse_float=_finite, parse_int=_whole_number, parse_constant=_finite)
     except RecursionError:
         raise ValueError("nested too deeply") from None
 
@@ -36,7 +36,7 @@ def _finite(text: str) -> float:
     return number
 
 
-def _whole(text: str) -> int:
+def _whole_number(text: str) -> int:
     if len(text) > 17 or abs(int(text)) > LARGEST_WHOLE:
         raise ValueError(f"a whole number must be at most 2^53, got {text[:40]}")
     return int(text)
@@ -50,7 +50,7 @@ def _adapter(kind: Any) -> Any:
 
 
 def as_type(kind: type[_T], value: Any, named: Callable[[str], str] = str, context: Any = None) -> _T:
-    """Return plain values as the dataclass or model `kind`; ValueError of one line where a value has no place in it.
+    """Convert plain values to the dataclass or model `kind`; ValueError of one line names a value without a place.
 
     `named`: name in the error of an entry of `value`; `context` is for the validators of `kind`.
     """
@@ -72,13 +72,13 @@ _PLAIN_RULES = {
 
 
 def one_line(error: ValidationError, named: Callable[[str], str] = str, unit: str = "") -> str:
-    """Return what pydantic says first of values: entry, rule and value, as "ENTRY must be ..., got ...".
+    """Format pydantic's first error: entry, rule and value, as "ENTRY must be ..., got ...".
 
     An entry that is not known comes before others. `named`: name of an entry of the whole ("" for this); `unit`: of the
     rule.
     """
     errors = error.errors(include_url=False)
-    first = next((own for own in errors if _PLAIN_RULES.get(own["type"]) == "is not known"), errors[0])
+    first = next((error for error in errors if _PLAIN_RULES.get(error["type"]) == "is not known"), errors[0])
     entry, *inner = (str(part) for part in first["loc"] or ("",) if part != "[key]")
     place = "".join([named(entry), *(f"[{int(part) + 1}]" if part.isdigit() else f".{part}" for part in inner)])
     if plain_rule := _PLAIN_RULES.get(first["type"]):
@@ -90,15 +90,15 @@ def one_line(error: ValidationError, named: Callable[[str], str] = str, unit: st
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON holds it: records as objects, tuples as lists, a number that is not finite as null."""
+    """Convert a value for JSON: records to objects, tuples to lists, numbers that are not finite to null."""
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {name: plain(own) for name, own in value.items()}
+        return {name: plain(item) for name, item in value.items()}
     if hasattr(value, "_asdict"):
         return plain(value._asdict())
     if is_dataclass(value):
         return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, tuple | list):
-        return [plain(own) for own in value]
+        return [plain(item) for item in value]
     return value

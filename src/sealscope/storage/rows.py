@@ -1,4 +1,4 @@
-"""Rows of finished jobs in a file of a folder: each on the disk before the next, so that what is broken off goes on."""
+"""Rows of finished jobs in a file of a folder: each is on the disk before the next job's, so that a run can go on."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LONGEST = 10_000_000
 
 
 class StoredRow(Protocol):
-    """What can be stored: it has an `id`, and is plain JSON values."""
+    """A row that can be stored: an `id` and plain JSON values."""
 
     @property
     def id(self) -> str:
@@ -37,7 +37,7 @@ Row = TypeVar("Row", bound=StoredRow)
 def read_rows(
     folder: Path, row_of: Callable[[Any], Row | None], what: str, parse: Callable[[bytes], Any] = parse_json
 ) -> dict[str, Row]:
-    """Return the rows of a folder by id, the last of each; a torn last line is ignored.
+    """Read the rows of a folder by id, the last of each; a torn last line is ignored.
 
     `row_of` makes a row of a line's JSON value, None where it does not count; `what` the rows are of stands in errors.
     Raises UnreadableFile for a line that is no row, with its place.

@@ -1,4 +1,4 @@
-"""Read TOML: a file from outside, bounded and with one line for whatever is wrong with it, or a package's priors."""
+"""Read TOML: a file from outside, bounded and with errors of one line, or a package's priors."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _HEADER, _INNER_KEY = re.compile(r"\s*\[[^\[\],]*\]\s*(?:#.*)?\n?"), re.compile(
 
 
 def read_toml(path: Path, what: str, place: str, largest: int = LARGEST) -> dict[str, Any]:
-    """Return the tables of the TOML file `path`; `what` it is ("a rig file") and its `place` stand in the errors.
+    """Read the tables of the TOML file `path`; its kind `what` ("a rig file") and its `place` stand in the errors.
 
     Raises InputError where it cannot be read, has more than `largest` bytes, is not UTF-8 or not TOML, or holds a whole
     number beyond 2^53, which doubles do not hold, or a key of more than 30 dots.
@@ -66,7 +66,7 @@ def parse_toml(data: bytes, what: str, place: str, largest: int = LARGEST) -> di
 def read_model(
     tree: Mapping[str, Any], kind: type[_T], place: str, named: Callable[[str], str] = str, context: Any = None
 ) -> _T:
-    """Return the tables of a TOML file as the model or dataclass `kind` (`plain_values.as_type`).
+    """Read the tables of a TOML file as the model or dataclass `kind` (`plain_values.as_type`).
 
     Raises InputError that names the entry, the rule, the value and the `place`.
     """
@@ -78,7 +78,7 @@ def read_model(
 
 @cache
 def priors_of(package: str) -> Mapping[str, Mapping[str, Any]]:
-    """Return the values of a package's `priors.toml` by table and name; each states its unit and source beside it.
+    """Read the values of a package's `priors.toml` by table and name; each states its unit and source.
 
     Raises KeyError where a row lacks unit or source.
     """

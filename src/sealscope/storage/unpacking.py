@@ -1,4 +1,4 @@
-"""What a packed file may unpack to: bounded before memory or disk is spent on it."""
+"""Limits on the unpacked size of a packed file, checked before memory or disk is spent."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _SMALL, _EXPANSION = 2**26, 200
 
 
 def most_unpacked(path: Path) -> int:
-    """Return how many bytes a packed file may unpack to.
+    """Compute the most bytes that a packed file may unpack to.
 
     Logs shrink to a tenth, those of standing channels to a hundredth. What a sparse file does not have on the disk does
     not count.

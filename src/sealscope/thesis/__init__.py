@@ -1,1 +1,1 @@
-"""Every case, table and figure of the thesis as data, and how each is reproduced."""
+"""Every case, table and figure of the thesis as data, and the code that reproduces each."""

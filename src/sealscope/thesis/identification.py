@@ -1,4 +1,4 @@
-"""The rig `thesis-calibrated`: what was fitted to the leak-free tests of Appendix C, how well, and what it predicts.
+"""The rig `thesis-calibrated`: its fit to the leak-free tests of Appendix C, the residuals, and its predictions.
 
 The package holds the result of the fit, the rig's file, and what judges it: `docs/decisions/0006-calibration.md` gives
 the method, the figures and the limits. The simulated trajectory carries no noise. White noise of standard deviation
@@ -58,7 +58,7 @@ def noise_free_squares(
 
 
 def log_rms(squares: Array, sigma: float) -> Array:
-    """Return log RMS of d1..d4, d3d4 with white noise of deviation `sigma` [psi], (..., 5), from noise-free squares."""
+    """Compute log RMS of d1..d4, d3d4 with white noise of deviation `sigma` [psi], (..., 5), from their squares."""
     s = np.square(sigma)
     product = squares[..., 4] + s * squares[..., 2] + s * squares[..., 3] + s * s
     return np.asarray(0.5 * np.log(np.concatenate([squares[..., :4] + s, product[..., None]], axis=-1)))
@@ -75,7 +75,7 @@ def noise_of(rig: Rig, chamber: str) -> float:
 
 
 def log_residuals(rig: Rig, sheet: DataSheet) -> Array:
-    """Return log(simulated/measured) of the leak-free RMS of every test, (tests, 2, 5), at the rig's rate and noise."""
+    """Compute log(simulated/measured) of the leak-free RMS of every test, (tests, 2, 5), at the rig's rate."""
     of_group = {group: noise_free_squares(rig, Condition(0, *group, 0.0, "extra-small")) for group in groups()}
     squares = np.array([of_group[condition.group] for condition in APPENDIX_C])
     simulated = [log_rms(squares[:, k], noise_of(rig, chamber)) for k, chamber in enumerate(CHAMBERS)]
@@ -153,20 +153,20 @@ def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     log = log_residuals(load_rig(BENCH_RIG), context.sheet)
     columns = [(c, q, log[:, k, j]) for k, c in enumerate(CHAMBERS) for j, q in enumerate(QUANTITIES)]
     rows: list[tuple[Cell, ...]] = []
-    for chamber, name, of in columns:
-        mean, scatter = float(np.exp(of.mean())), float(np.exp(of.std(ddof=1)))
+    for chamber, name, logs in columns:
+        mean, scatter = float(np.exp(logs.mean())), float(np.exp(logs.std(ddof=1)))
         rows.append((chamber, name, mean, "yes" if abs(mean - 1.0) <= 0.25 else "no", scatter))
     by_condition: list[tuple[Cell, ...]] = []
     for group in groups():
-        own = np.array([condition.group == group for condition in APPENDIX_C])
-        by_condition.append((*group, int(own.sum()), *np.exp(log[own].mean(axis=0)).ravel().tolist()))
+        members = np.array([condition.group == group for condition in APPENDIX_C])
+        by_condition.append((*group, int(members.sum()), *np.exp(log[members].mean(axis=0)).ravel().tolist()))
     heads = ("input", "closed [%]", "tests", *(f"{c} {q} simulated / measured" for c, q, _ in columns))
     title = f"{item.title}, by operating condition"
     return item.table(rows, note("fit")), item.table(by_condition, "", heads, tail="-conditions", title=title)
 
 
 def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate what each hypothesis makes of the leak-free level and of the change with the leak, beside the sheet."""
+    """Tabulate each hypothesis's leak-free level and its change with the leak, with those of the sheet."""
     assert context.sheet is not None
     sheet = context.sheet
     # d2 is shown in the changes only
@@ -176,8 +176,8 @@ def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     heads += [f"{c} {q} change with leak [%]" for c, q in changed]
     heads += [f"{c} {q} sign right [of 41]" for c, q in shown]
 
-    def signs(of: DataSheet, c: str, q: str) -> Array:
-        return np.asarray(np.sign(of.rms[c][q][:, 1] - of.rms[c][q][:, 0]))
+    def signs(sheet: DataSheet, c: str, q: str) -> Array:
+        return np.asarray(np.sign(sheet.rms[c][q][:, 1] - sheet.rms[c][q][:, 0]))
 
     measured = [float(100 * np.expm1(np.mean(sheet.log_change(c, q)))) for c, q in changed]
     rows: list[tuple[Cell, ...]] = [("the sheet", *[1.0] * 4, *measured, *[41] * 4)]

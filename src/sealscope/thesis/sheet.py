@@ -1,4 +1,4 @@
-"""Appendix C of the thesis: the 41 leakage tests, and the data sheet of what was measured in them.
+"""Appendix C of the thesis: the 41 leakage tests, and the data sheet of their measurements.
 
 Only the inputs of the tests are part of the package. The measured values are read from two files where a user has them.
 """
@@ -53,12 +53,12 @@ class Condition:
 
     @property
     def group(self) -> tuple[str, float]:
-        """Command and throttle: tests that share it are repeats of one operating condition."""
+        """Command and throttle: tests that share them repeat one operating condition."""
         return self.command, self.closed_pct
 
 
 def experiment_values(condition: Condition) -> dict[str, str | float]:
-    """Return the rig's parameters that a test sets, by name, for `Rig.with_overrides` or `Experiment.of(set=...)`.
+    """Build the rig's parameters of a test, by name, for `Rig.with_overrides` or `Experiment.of(set=...)`.
 
     Both throttles are closed alike. A test with the throttles fully open leaves `line.orifices` as the rig has it:
     absent in the thesis's model (section 4.2.1), present in a rig whose open valve bodies stay in the line.
@@ -82,7 +82,7 @@ APPENDIX_C: tuple[Condition, ...] = tuple(_conditions())
 
 
 def groups(conditions: tuple[Condition, ...] = APPENDIX_C) -> tuple[tuple[str, float], ...]:
-    """Return the different operating conditions (command, closed [%]) in order of first appearance."""
+    """List the different operating conditions (command, closed [%]) in order of first appearance."""
     return tuple(dict.fromkeys(condition.group for condition in conditions))
 
 
@@ -107,13 +107,13 @@ class DataSheet:
         return len(self.rms["p_A"]["d3"])
 
     def log_change(self, chamber: str, quantity: str) -> Array:
-        """Return log(RMS with leak / RMS without) of each test, (tests,)."""
+        """Compute log(RMS with leak / RMS without) of each test, (tests,)."""
         pairs = self.rms[chamber][quantity]
         return np.asarray(np.log(pairs[:, 1] / pairs[:, 0]))
 
 
 def find_sheet(folder: str | os.PathLike[str] | None = None) -> Path | None:
-    """Find the folder of the sheet: `folder`, else the environment's SEALSCOPE_SHEET, else `./data` where it is there.
+    """Find the folder of the sheet: `folder`, else the environment's SEALSCOPE_SHEET, else `./data` if it exists.
 
     Raises InputError where a named folder does not hold both files.
     """
@@ -159,7 +159,7 @@ def read_sheet(folder: Path) -> tuple[DataSheet, str]:
 
 
 def _number(row: dict[str, str], column: str, number: int, path: Path, zero: bool = False) -> float:
-    """Return a number of a row: > 0, or where `zero` may stand >= 0."""
+    """Read a number of a row: > 0, or where `zero` is allowed >= 0."""
     try:
         value = float(row[column] or "nan")
     except ValueError:
@@ -174,10 +174,10 @@ def _check_condition(row: dict[str, str], condition: Condition, path: Path) -> N
     leak, amplitude, omega = (_number(row, column, condition.number, path) for column in _CONDITION[:3])
     closed = _number(row, _CONDITION[3], condition.number, path, zero=True)
     command = f"{amplitude:g} sin({'' if omega == 1 else f'{omega:g}'}t)"
-    given = Condition(condition.number, command, closed, leak, (row["leakage_level"] or "").strip())
-    if given != condition:
-        wanted, got = (
-            f"{of.command!r}, {of.closed_pct:g} % closed, {of.mean_leak_lpm:g} L/min, {of.level}"
-            for of in (condition, given)
+    found = Condition(condition.number, command, closed, leak, (row["leakage_level"] or "").strip())
+    if found != condition:
+        expected, got = (
+            f"{test.command!r}, {test.closed_pct:g} % closed, {test.mean_leak_lpm:g} L/min, {test.level}"
+            for test in (condition, found)
         )
-        raise InputError(f"row {condition.number} must be the test {wanted}, got {got} ({path})")
+        raise InputError(f"row {condition.number} must be the test {expected}, got {got} ({path})")

@@ -11,7 +11,7 @@ from sealscope.recordings.recording import Array
 
 
 class SineFit(NamedTuple):
-    """Complex `amplitudes` (k,) of the sines, `slope` [unit/s] beside them, and what is `left` of the signal (n,)."""
+    """Complex `amplitudes` (k,) of the sines, `slope` [unit/s], and the residual `left` of the signal (n,)."""
 
     amplitudes: NDArray[np.complex128]
     slope: float

@@ -1,4 +1,4 @@
-"""The cases of a plan: each one record, with a name and seeds that derive from its content."""
+"""The cases of a plan: one record each, with a name and seeds that derive from its content."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _NOT_IN_ROWS = (
 
 @dataclass(frozen=True, kw_only=True)
 class CaseInputs:
-    """What a case is: what a record is made of and used for.
+    """The inputs and the use of a case's record.
 
     `levels`: factor -> level; `leak_lpm` [L/min] of that `law` and `fault`: what is put in at the plan's onset;
     `replicate` counts within the cell.
@@ -61,19 +61,19 @@ class CampaignCase(CaseInputs):
 
 
 def digest(value: Any) -> str:
-    """Return a SHA-256 of plain values: it differs wherever they do."""
+    """Compute a SHA-256 of plain values."""
     text = json.dumps(value, sort_keys=True, ensure_ascii=True, allow_nan=False, default=repr)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def profile_key(name: str) -> str:
-    """Return a digest of what a bench profile says, the same wherever its file lies."""
+    """Compute a digest of the content of a bench profile, wherever its file lies."""
     profile = load_profile(name)
     return digest(repr(replace(profile, name=profile.seeds or profile.name, place="")))
 
 
 def world(plan: SimulatedPlan) -> dict[str, Any]:
-    """Return what all cases of a plan share and a record depends on: rig, bench, length, onset and base seed."""
+    """Collect the inputs that all cases of a plan share: rig, bench, length, onset and base seed."""
     return {
         "rig": digest({name: repr(value) for name, value in plan.rig.present().items() if name not in _PRIORS}),
         "profile": profile_key(plan.profile) if plan.profile else "",
@@ -83,8 +83,8 @@ def world(plan: SimulatedPlan) -> dict[str, Any]:
     }
 
 
-def _named(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
-    """Return factor -> level -> digest of what its name stands for: a family, or a controller of the user's own.
+def _named_digests(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
+    """Compute factor -> level -> digest of the family or the user's controller behind the level's name.
 
     Another law gives other cases; a case does not depend on another family.
     """
@@ -98,10 +98,10 @@ def _named(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
 
 
 def cases_of(plan: SimulatedPlan) -> list[CampaignCase]:
-    """Return all cases of a plan: records of each kind go round the cells one by one, the last round may be short."""
+    """List all cases of a plan: records of each kind go round the cells in turn, and the last round may be short."""
     cells = [dict(zip(plan.factors, levels, strict=True)) for levels in itertools.product(*plan.factors.values())]
     shared = world(plan)
-    named = _named(plan)
+    named = _named_digests(plan)
     cases = []
     for group in plan.records:
         for number in range(group.count):
@@ -115,7 +115,7 @@ def cases_of(plan: SimulatedPlan) -> list[CampaignCase]:
                 "replicate": replicate,
             }
             levels = {key: str(level) for key, level in cells[k].items()}
-            behind = {key: own[levels[key]] for key, own in named.items() if levels.get(key) in own}
+            behind = {key: digests[levels[key]] for key, digests in named.items() if levels.get(key) in digests}
             name = digest({"world": shared, **content, **behind})
             machine, noise = np.random.SeedSequence(int(name, 16)).generate_state(2, np.uint64)
             machine_seed, noise_seed = int(machine >> np.uint64(1)), int(noise >> np.uint64(1))
@@ -124,7 +124,7 @@ def cases_of(plan: SimulatedPlan) -> list[CampaignCase]:
 
 
 def interleaved(cases: Sequence[CampaignCase]) -> list[CampaignCase]:
-    """Return the cases so that each kind (use, leak, law, fault) is spread evenly over the order.
+    """Order the cases so that each kind (use, leak, law, fault) is spread evenly.
 
     A campaign that is ended early then has every kind in its proportion, each with its cells in turn.
     """
@@ -146,12 +146,12 @@ def sources() -> Iterator[Path]:
 
 
 def code_key() -> str:
-    """Return a hash of the sources that a row depends on: rows of other sources must not stand in the same table."""
+    """Compute a hash of the sources that a row depends on, so that rows of other sources are not mixed in."""
     return files_digest(sources())[:16]
 
 
 def files_digest(paths: Iterable[Path]) -> str:
-    """Return a SHA-256 of files of the package, their names and contents."""
+    """Compute a SHA-256 of files of the package, their names and contents."""
     key = hashlib.sha256()
     for path in paths:
         key.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0")

@@ -1,4 +1,4 @@
-"""From a case to the machine it is run on: the bench's draw, the case's duty on it, the leak sized for it."""
+"""From a case to its machine: the bench's draw, the case's duty, the leak sized for it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SIZING_SECONDS = 13.0
 
 
 def leak_of(plan: SimulatedPlan, case: CampaignCase) -> tuple[Leak, ...]:
-    """Return the case's leak, open from the plan's onset on; its size still a mean flow."""
+    """Build the case's leak, open from the plan's onset on, its size still a mean flow."""
     if not case.leak_lpm:
         return ()
     laws: tuple[Any, ...] = ("laminar", "orifice") if case.law == "mixture" else (case.law,)
@@ -34,7 +34,7 @@ def leak_of(plan: SimulatedPlan, case: CampaignCase) -> tuple[Leak, ...]:
 
 
 def unsized(plan: SimulatedPlan, case: CampaignCase, profile: Profile | None = None) -> Experiment:
-    """Return the experiment of a case with the size of its leak still a mean flow.
+    """Build the experiment of a case, the size of its leak still a mean flow.
 
     The machine is the one that the case's seed draws from the bench (or the plan's rig), with the case's levels on
     top. `profile`: the plan's bench, where it has been loaded.
@@ -64,18 +64,18 @@ def unsized(plan: SimulatedPlan, case: CampaignCase, profile: Profile | None = N
 
 
 def experiment_of(plan: SimulatedPlan, case: CampaignCase) -> Experiment:
-    """Return the experiment of a case (`unsized`) with its leak sized on its machine."""
+    """Build the experiment of a case (`unsized`) with its leak sized on its machine."""
     experiment = unsized(plan, case)
     return replace(experiment, leaks=sized_once(experiment))
 
 
 def _by_full_name(values: Mapping[str, str | float]) -> dict[str, str | float]:
-    """Return the values by their full names, a later one in place of an earlier."""
+    """Key the values by their full names; the later of two with the same name counts."""
     return {resolve(name, declared_names()): value for name, value in values.items()}
 
 
 def sizing_run(experiment: Experiment) -> Experiment:
-    """Return the short run on which an experiment's leaks are sized, open from its start."""
+    """Build the short run on which an experiment's leaks are sized, open from its start."""
     return replace(
         experiment,
         duration=min(experiment.duration, SIZING_SECONDS),
@@ -84,7 +84,7 @@ def sizing_run(experiment: Experiment) -> Experiment:
 
 
 def sized_once(experiment: Experiment) -> tuple[Leak, ...]:
-    """Return the experiment's leaks with coefficients that give their means on this machine over a short run.
+    """Find the coefficients of an experiment's leaks that give their means over a short run.
 
     Sizing on the whole record would cost it two or three times over; the mean that the record really had is in its
     row.
@@ -92,4 +92,4 @@ def sized_once(experiment: Experiment) -> tuple[Leak, ...]:
     if not experiment.leaks:
         return ()
     sized = sized_leaks(sizing_run(experiment))
-    return tuple(replace(leak, opening=wanted.opening) for leak, wanted in zip(sized, experiment.leaks, strict=True))
+    return tuple(replace(leak, opening=planned.opening) for leak, planned in zip(sized, experiment.leaks, strict=True))

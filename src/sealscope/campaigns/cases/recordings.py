@@ -41,7 +41,7 @@ def _files(plan: RecordedPlan, folder: Path) -> Iterator[tuple[RecordingSet, Pat
 
 
 def recorded_rows(plan: RecordedPlan, folder: Path, progress: ProgressCallback | None = None) -> list[CaseRow]:
-    """Return a row for each recording, in the order of their ids; one that cannot be judged has its error."""
+    """Judge each recording, in the order of their ids; one that cannot be judged has its error."""
     files = list(_files(plan, folder))
     for path, count in Counter(path for _, path in files).items():
         if count > 1:
@@ -56,7 +56,7 @@ def recorded_rows(plan: RecordedPlan, folder: Path, progress: ProgressCallback |
 
 
 def _direction(recording: Recording) -> str:
-    """Return the direction of a single stroke by the mean of p_A - p_B, against its rms; `both` where it has none."""
+    """Determine the direction of a single stroke by the mean of p_A - p_B against its rms; `both` for neither."""
     if not all(name in recording for name in CHAMBERS):
         return "both"
     dp = recording["p_A"] - recording["p_B"]

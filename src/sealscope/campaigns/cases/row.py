@@ -1,4 +1,4 @@
-"""The row that a case leaves: scores, and what each detector stated."""
+"""The row of a case: scores, and the statements of each detector."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ class Statement:
     cause: Cause | None = None
 
     @classmethod
-    def of(cls, evidence: Evidence | Statement) -> Statement:
-        """Return what a row stores of evidence."""
+    def from_evidence(cls, evidence: Evidence | Statement) -> Statement:
+        """Select the figures of evidence that a row stores."""
         values = {field.name: getattr(evidence, field.name) for field in fields(cls)}
         for name, value in values.items():
             ends = value if isinstance(value, tuple) else (value,)
@@ -51,7 +51,7 @@ class Statement:
 
 @cache
 def cause_of(fault: str) -> str:
-    """Return the cause that a detector should name for a fault as text; where there is none, the text itself."""
+    """Return the cause that a detector should name for a fault as text; else the text itself."""
     try:
         parsed = parse_fault(fault)
     except InputError:  # of rows that were not simulated
@@ -60,12 +60,12 @@ def cause_of(fault: str) -> str:
 
 
 def duty_of(levels: Mapping[str, str | float]) -> str:
-    """Return what must be alike before scores are compared: the command, and the direction of a stroke."""
+    """Return the duty within which scores are compared: the command, and the direction of a stroke."""
     return ", ".join(str(levels[name]) for name in (COMMAND, STROKE) if name in levels)
 
 
 def covers(named: str, true: str) -> bool:
-    """Return whether a named cause is the true one, or names it with another that no channel tells from it."""
+    """Return whether a named cause is the true one, alone or with another that no channel tells from it."""
     return named == true or true in _EITHER.get(named, ())
 
 
@@ -88,12 +88,12 @@ def named_cause(evidence: Evidence | Statement) -> str:
 
 
 def rank_of(evidence: Evidence | Statement) -> float | None:
-    """Return the score by which records are ordered; None where it cannot tell, or names another cause."""
+    """Return the score by which records are ordered; None for `cannot tell` or another cause."""
     return evidence.score if named_cause(evidence) in (*LEAKS, NO_CAUSE) else None
 
 
 def error_text(error: Exception) -> str:
-    """Return what a row says of an error, in one line."""
+    """Format an error in one line."""
     if isinstance(error, SealscopeError):
         return str(error)
     if isinstance(error, MemoryError):
@@ -103,7 +103,7 @@ def error_text(error: Exception) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class CaseRow(CaseInputs):
-    """What a campaign stores of a case: its inputs and the scores; or the `error` of it.
+    """The stored result of a case: its inputs and the scores; or the `error` of it.
 
     `flow_lpm`: mean leak [L/min] while open, as the run really had it; `scores` and `statements` by the
     plan's name of a detector; `seconds`: processor time, which takes no part in the result.
@@ -116,15 +116,15 @@ class CaseRow(CaseInputs):
     statements: Mapping[str, Statement] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the row as plain JSON values."""
-        return {**self.__dict__, "statements": {name: asdict(own) for name, own in self.statements.items()}}
+        """Convert the row to plain JSON values."""
+        return {**self.__dict__, "statements": {name: asdict(statement) for name, statement in self.statements.items()}}
 
     @classmethod
-    def of(cls, case: CampaignCase, **values: Any) -> CaseRow:
-        """Return the row of a case, with its results or its `error`."""
-        return cls(**{of.name: getattr(case, of.name) for of in fields(CaseInputs)}, **values)
+    def from_case(cls, case: CampaignCase, **values: Any) -> CaseRow:
+        """Build the row of a case, with its results or its `error`."""
+        return cls(**{field.name: getattr(case, field.name) for field in fields(CaseInputs)}, **values)
 
     @classmethod
     def from_dict(cls, tree: Any) -> CaseRow:
-        """Return the row of plain values; raise ValueError where they are none."""
+        """Read a row from plain values; raise ValueError for any others."""
         return as_type(cls, tree)

@@ -28,7 +28,7 @@ _PORTION = 1.0
 def judged_record(
     recording: Recording, split_s: float | None, plan: SimulatedPlan | RecordedPlan, rig: Rig
 ) -> tuple[Scores, dict[str, Statement]]:
-    """Return score and onset of each detector of a plan, and what each that is no scorer states; each is run once.
+    """Run each detector of a plan once; return scores with onsets, and the statements of those that are no scorers.
 
     `split_s` [s]: the moment on the recording's time axis at which scorers split it, None for its middle; `rig`: what
     detectors may assume. Raises InputError for a recording that none of them can judge.
@@ -44,27 +44,27 @@ def judged_record(
     scores: dict[str, tuple[float | None, float | None]] = {}
     if any(detector.scorer is not None for detector in detectors):
         split_s = float(record.part.t[0]) + record.part.duration / 2 if split_s is None else split_s
-        scores = scored(Sides.of(record.part, split_s), plan.detectors, plan.views)
+        scores = scored(Sides.from_recording(record.part, split_s), plan.detectors, plan.views)
     statements: dict[str, Statement] = {}
     for detector in detectors:
         if detector.scorer is None:
-            statement = Statement.of(_evidence(detector, examinations[detector.view]))
+            statement = Statement.from_evidence(_evidence(detector, examinations[detector.view]))
             statements[detector.name] = statement
-            rank = _share(statement) if detector.of == DIAGNOSE else rank_of(statement)
+            rank = _share(statement) if detector.base == DIAGNOSE else rank_of(statement)
             scores[detector.name] = (rank, statement.onset_s)
     return scores, statements
 
 
 def _evidence(detector: PlanDetector, examination: Examination) -> Evidence:
-    if detector.of == WATCH:
+    if detector.base == WATCH:
         return watched(examination.recording, examination.rig, examination.false_alarm_probability)
-    if detector.of == DIAGNOSE:
+    if detector.base == DIAGNOSE:
         return examination.fused()
-    return examination.evidence(detector.of)
+    return examination.evidence(detector.base)
 
 
 def scored(sides: Sides, names: Sequence[str], views: Views) -> dict[str, tuple[float | None, float | None]]:
-    """Return the scores of scorers, which find no onset."""
+    """Compute the scores of scorers, which find no onset."""
     scores: dict[str, tuple[float | None, float | None]] = {}
     for name in names:
         detector = plan_detector(name)
@@ -75,7 +75,7 @@ def scored(sides: Sides, names: Sequence[str], views: Views) -> dict[str, tuple[
 
 
 def _share(evidence: Statement) -> float | None:
-    """Return the fused verdict's score over its threshold: the deciding detector differs between records."""
+    """Compute the fused verdict's score over its threshold: the deciding detector differs between records."""
     rank, threshold = rank_of(evidence), evidence.threshold
     if rank is None or threshold is None:
         return None
@@ -83,7 +83,7 @@ def _share(evidence: Statement) -> float | None:
 
 
 def watched(recording: Recording, rig: Rig | str | os.PathLike[str], false_alarm: float) -> Evidence:
-    """Return what the watch of a machine says at the record's end; an alarm that was raised stays.
+    """Run the watch of a machine; return its evidence at the record's end, where a raised alarm stays.
 
     Its rate of alarms is the one at which a healthy machine alarms within the record with the probability
     `false_alarm` at most.

@@ -20,7 +20,7 @@ def work(plan: SimulatedPlan, case: CampaignCase, folder: Path | None = None) ->
     try:
         row = _work(plan, case, folder)
     except Exception as error:  # a defect of the program must not end ten thousand other cases; the table says it
-        row = CaseRow.of(case, error=error_text(error))
+        row = CaseRow.from_case(case, error=error_text(error))
     return replace(row, seconds=round(time.process_time() - started, 4))
 
 
@@ -32,4 +32,4 @@ def _work(plan: SimulatedPlan, case: CampaignCase, folder: Path | None) -> CaseR
         write(simulated.recording, folder / f"{case.id}.nc")
     scores, statements = judged_record(simulated.recording, plan.onset_s, plan, plan.assumed)
     flow = simulated.truth.mean_leak_lpm if case.leak_lpm else 0.0
-    return CaseRow.of(case, flow_lpm=flow, scores=scores, statements=statements)
+    return CaseRow.from_case(case, flow_lpm=flow, scores=scores, statements=statements)

@@ -1,4 +1,4 @@
-"""A plan's cases many at a time: simulated side by side, scored from the RMS of the details on both sides of the onset.
+"""Many cases of a plan at a time: simulated side by side, scored from the RMS of the details about the onset.
 
 The scores are the same functions of the same samples as those of a recording (`scorers.Sides`); nothing else of a
 record is there, so that a plan is refused where something asks for more. The solver's step of a case comes from a few
@@ -45,13 +45,13 @@ SCOUTS, SCOUTED = 4, 4.0
 
 
 def bounds_of(plan: SimulatedPlan) -> IntArray:
-    """Return the samples (2, 2) of a record that the scorers compare."""
+    """Compute the samples (2, 2) of a record that the scorers compare."""
     rate = plan.rig.daq.sample_rate
     return side_bounds(round(plan.duration_s * rate), rate, round(plan.onset_s * rate))
 
 
 def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
-    """Raise InputError for what a plan asks that no batch can do, naming it."""
+    """Raise InputError for a request of a plan that no batch can carry out."""
 
     def no(rule: str) -> InputError:
         return InputError(f"a plan in batches must have {rule}; run it without --batch ({plan.place})")
@@ -100,14 +100,14 @@ def in_batches(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads: int)
                 experiment = unsized(plan, case, profile)
                 drawn.append((case, replace(experiment, step=step_of(case, experiment))))
             except Exception as error:
-                rows.append(CaseRow.of(case, error=error_text(error)))
+                rows.append(CaseRow.from_case(case, error=error_text(error)))
         rows += _carried_out(plan, drawn, threads)
         seconds = round((time.process_time() - started) / len(batch), 4)
         yield from (replace(row, seconds=seconds) for row in rows)
 
 
 def _carried_out(plan: SimulatedPlan, drawn: Sequence[tuple[CampaignCase, Experiment]], threads: int) -> list[CaseRow]:
-    """Return the rows of one batch; where it fails, of its halves, down to the run that is to blame."""
+    """Carry out one batch; where it fails, its halves, down to the run that is to blame."""
     if not drawn:
         return []
     bounds, rows = bounds_of(plan), []
@@ -115,19 +115,19 @@ def _carried_out(plan: SimulatedPlan, drawn: Sequence[tuple[CampaignCase, Experi
         experiments = _sized([experiment for _, experiment in drawn], threads)
         batch = simulate_batch(experiments, bounds=bounds.ravel() / plan.rig.daq.sample_rate, threads=threads)
         for (case, _), rms, flow in zip(drawn, batch.rms, batch.mean_leak_lpm, strict=True):
-            sides = Sides.of_squares(dict(zip(CHAMBERS, rms[:, [0, 2]] ** 2, strict=True)), bounds)
+            sides = Sides.from_squares(dict(zip(CHAMBERS, rms[:, [0, 2]] ** 2, strict=True)), bounds)
             scores = scored(sides, plan.detectors, plan.views)
-            rows.append(CaseRow.of(case, flow_lpm=float(flow) if case.leak_lpm else 0.0, scores=scores))
+            rows.append(CaseRow.from_case(case, flow_lpm=float(flow) if case.leak_lpm else 0.0, scores=scores))
         return rows
     except Exception as error:
         if len(drawn) == 1:
-            return [CaseRow.of(drawn[0][0], error=error_text(error))]
+            return [CaseRow.from_case(drawn[0][0], error=error_text(error))]
     middle = len(drawn) // 2
     return _carried_out(plan, drawn[:middle], threads) + _carried_out(plan, drawn[middle:], threads)
 
 
 def _sized(experiments: Sequence[Experiment], threads: int) -> list[Experiment]:
-    """Return the experiments with steps that resolve their leaks, sized side by side as `sized_once` does."""
+    """Choose steps that resolve the experiments' leaks, and size these side by side as `sized_once` does."""
     sized = list(experiments)
     leaky = [k for k, experiment in enumerate(experiments) if experiment.leaks]
     if not leaky:
@@ -151,7 +151,7 @@ def _sized(experiments: Sequence[Experiment], threads: int) -> list[Experiment]:
 
 
 def step_chooser(plan: SimulatedPlan, profile: Profile | None = None) -> Callable[[CampaignCase, Experiment], float]:
-    """Return what chooses the step [s] of a case from what the case is, so that no other case can change it.
+    """Build the function that chooses a case's step [s] from the case alone, independent of all others.
 
     It is what `integrate` chooses by error on `SCOUTS` machines of the case's cell with seeds of their own, the finest
     of those with its method, and no longer than its own machine allows.
@@ -160,13 +160,13 @@ def step_chooser(plan: SimulatedPlan, profile: Profile | None = None) -> Callabl
 
     @cache
     def of_cell(*levels: tuple[str, str | float]) -> dict[str, float]:
-        """Return method -> step of a cell of the factors."""
+        """Compute method -> step of a cell of the factors."""
         steps: dict[str, float] = {}
         for number in range(SCOUTS):
             content: dict[str, Any] = {"use": "calibrate", "leak_lpm": 0.0, "levels": dict(levels), "replicate": number}
             seed = int(digest([shared, dict(levels), f"scout {number}"])[:15], 16)
             try:
-                method, step = _chosen(
+                method, step = _choose_method(
                     unsized(plan, CampaignCase(id="", machine_seed=seed, noise_seed=0, **content), profile)
                 )
             except SealscopeError:  # a machine of the bench that cannot do this duty
@@ -176,7 +176,7 @@ def step_chooser(plan: SimulatedPlan, profile: Profile | None = None) -> Callabl
 
     def step_of(case: CampaignCase, experiment: Experiment) -> float:
         method = choose_method(experiment.rig, experiment.method)
-        step = of_cell(*case.levels.items()).get(method) or _chosen(experiment)[1]
+        step = of_cell(*case.levels.items()).get(method) or _choose_method(experiment)[1]
         limit = max(longest_step(numbers_under(experiment.rig, experiment.load)), LONGEST_STEP / FINEST)
         return step if step <= limit else stepped(experiment.rate * oversampling(experiment), limit)
 
@@ -184,11 +184,11 @@ def step_chooser(plan: SimulatedPlan, profile: Profile | None = None) -> Callabl
 
 
 def stepped(rate: float, limit: float) -> float:
-    """Return the longest step [s] within `limit` [s] that divides the interval of outputs at `rate` [Hz]."""
+    """Compute the longest step [s] within `limit` [s] that divides the interval of outputs at `rate` [Hz]."""
     return 1.0 / (rate * steps_per_output(rate, limit))
 
 
-def _chosen(experiment: Experiment) -> tuple[str, float]:
-    """Return method and step [s] that `integrate` chooses by error over the first seconds of an experiment."""
+def _choose_method(experiment: Experiment) -> tuple[str, float]:
+    """Find the method and step [s] that `integrate` chooses over the first seconds of an experiment."""
     path = trajectory(replace(experiment, duration=min(experiment.duration, SCOUTED), leaks=()), ())
     return path.method, path.step

@@ -1,4 +1,4 @@
-"""Run a campaign: carry out what is missing in its folder; every row is stored, an interrupted run continues."""
+"""Run a campaign: carry out its missing cases; every row is stored, an interrupted run continues."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def run(
     batch: bool = False,
     trust: bool = False,
 ) -> store.CampaignProgress:
-    """Carry out what is missing of the plan in `folder`, and return how far it is then.
+    """Carry out the missing cases of the plan in `folder`, and return its progress.
 
     `jobs`: processes of this machine, one a core by default and two a core at most, 1 for this process alone;
     `cluster`: address of a Dask scheduler instead; `retry`: carry failed cases out again; `batch`: simulate cases side
@@ -84,4 +84,4 @@ def _rows(ended: Generator[tuple[CampaignCase, CaseRow | None], None, None]) -> 
     """Yield the rows of the cases as they end."""
     with closing(ended):
         for case, row in ended:
-            yield row or CaseRow.of(case, error="the process that carried it out died")
+            yield row or CaseRow.from_case(case, error="the process that carried it out died")

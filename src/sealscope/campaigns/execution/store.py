@@ -1,4 +1,4 @@
-"""A campaign's folder: which rows belong to a plan, and what they were made from."""
+"""A campaign's folder: the rows that belong to a plan, and the inputs they were made from."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ RUN_BY_RUN = "run by run"
 
 @dataclass(frozen=True)
 class CampaignProgress:
-    """How far a campaign is.
+    """Progress of a campaign.
 
     `records` in the plan, how many are `done`, and `failed` of these; `seconds`: processor time of a record on
     average, None where none is done.
@@ -61,7 +61,7 @@ class CampaignProgress:
 
 
 def made_from(plan: SimulatedPlan, mode: str = RUN_BY_RUN) -> dict[str, Any]:
-    """Return what a campaign's rows depend on, as plain values; `mode`: `RUN_BY_RUN` or `batches.IN_BATCHES`."""
+    """Collect the inputs of a campaign's rows as plain values; `mode`: `RUN_BY_RUN` or `batches.IN_BATCHES`."""
     detectors = [plan_detector(name) for name in plan.detectors]
     searching = any(detector.scorer is None for detector in detectors)  # its verdict follows from the probability
     assumed = plan.assumed
@@ -81,8 +81,8 @@ def made_from(plan: SimulatedPlan, mode: str = RUN_BY_RUN) -> dict[str, Any]:
 
 
 def _plug_ins(plan: SimulatedPlan) -> dict[str, str]:
-    """Return the detectors of other distributions that a plan runs, each with a hash of its source."""
-    run = {detector.of for name in plan.detectors if (detector := plan_detector(name)).scorer is None}
+    """Collect the detectors of other distributions that a plan runs, each with a hash of its source."""
+    run = {detector.base for name in plan.detectors if (detector := plan_detector(name)).scorer is None}
     return {
         name: plug_in.fingerprint
         for name, plug_in in detectors().items()
@@ -100,36 +100,36 @@ def _version() -> str:
 
 
 def read_rows(folder: Path) -> dict[str, CaseRow]:
-    """Return rows by case id, the last of each (`storage.rows.read_rows`)."""
+    """Read rows by case id, the last of each (`storage.rows.read_rows`)."""
     return rows.read_rows(folder, CaseRow.from_dict, WHAT)
 
 
 def rows_of(plan: SimulatedPlan, folder: Path) -> dict[str, CaseRow]:
-    """Return the folder's rows that belong to the plan, by case id in rising order.
+    """Read the folder's rows that belong to the plan, by case id in rising order.
 
     A row without one of the plan's detectors is not among them. Raises InputError
     where the rows were made from something else than the plan says, by whatever sources; UnreadableFile for a row that
     says another input than its case has.
     """
-    made = read_rows(folder)
-    if made:
+    rows_by_id = read_rows(folder)
+    if rows_by_id:
         _check_same(folder, head(folder) or {}, made_from(plan), ("mode", "code"))
-    wanted = set(plan.detectors)
+    detectors = set(plan.detectors)
     of_plan: dict[str, CaseRow] = {}
     for case in sorted(cases_of(plan), key=lambda case: case.id):
-        row = made.get(case.id)
+        row = rows_by_id.get(case.id)
         if row is None:
             continue
-        if any(getattr(row, of.name) != getattr(case, of.name) for of in fields(CaseInputs)):
+        if any(getattr(row, field.name) != getattr(case, field.name) for field in fields(CaseInputs)):
             place = folder / rows.ROWS
             raise UnreadableFile(f"a row must say the inputs of its case, got others of {case.id} ({place})")
-        if row.error is not None or wanted <= set(row.scores):
+        if row.error is not None or detectors <= set(row.scores):
             of_plan[row.id] = row
     return of_plan
 
 
 def progress_of(plan: SimulatedPlan, folder: Path) -> CampaignProgress:
-    """Return how far the campaign in the folder is."""
+    """Compute the progress of the campaign in the folder."""
     done = rows_of(plan, folder).values()
     seconds = [row.seconds for row in done if row.error is None]
     mean = sum(seconds) / len(seconds) if seconds else None
@@ -137,7 +137,7 @@ def progress_of(plan: SimulatedPlan, folder: Path) -> CampaignProgress:
 
 
 def head(folder: Path) -> dict[str, Any] | None:
-    """Return what the folder's campaign was made from, None where there is none yet."""
+    """Read the inputs of the folder's campaign, None where there is none yet."""
     path = folder / HEAD
     try:
         with open_inner(path, "a campaign's head") as file:
@@ -165,7 +165,7 @@ def begin(folder: Path, source: Mapping[str, Any]) -> None:
 
 
 def _check_same(folder: Path, before: Mapping[str, Any], source: Mapping[str, Any], but: Collection[str] = ()) -> None:
-    """Raise InputError where rows made from what `before` says were not made from `source`, `but` for these entries."""
+    """Raise InputError where the inputs `before` differ from `source`, except in the entries `but`."""
     for key, name in _SAME.items():
         if key not in but and before.get(key) != source[key]:
             raise InputError(

@@ -76,7 +76,7 @@ def carried_out(
 
 
 def in_order(jobs: int, task: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[Item, Result | None]]:
-    """Yield as `carried_out`, in the order given: an item as soon as it and all before it are there."""
+    """Yield as `carried_out`, in the order of the items: one as soon as it and all before it are done."""
     results: dict[int, Result | None] = {}
     place = 0
     for (number, _), result in carried_out(partial(_numbered, task), enumerate(items), jobs):
@@ -87,7 +87,7 @@ def in_order(jobs: int, task: Callable[[Item], Result], items: Sequence[Item]) -
 
 
 class _Pools(NamedTuple):
-    """What carries items out: `most` at once, each by `submit` to a pool of `new`; a process's end raises `death`."""
+    """Pools of workers: at most `most`, each from `new`, takes items by `submit`; a process's end raises `death`."""
 
     new: Callable[[], Executor]
     most: int
@@ -97,7 +97,7 @@ class _Pools(NamedTuple):
 
 @contextmanager
 def _processes(task: Callable[[Any], Any], most: int) -> Iterator[_Pools]:
-    """Give processes of this machine, each a pool of its own, so that one that dies breaks no other."""
+    """Start processes of this machine, each a pool of its own, so that one that dies breaks no other."""
     context = get_context("spawn")
     lifeline, held = context.Pipe(duplex=False)
     pools: list[Executor] = []
@@ -119,7 +119,7 @@ def _processes(task: Callable[[Any], Any], most: int) -> Iterator[_Pools]:
 
 @contextmanager
 def _on_cluster(task: Callable[[Any], Any], address: str) -> Iterator[_Pools]:
-    """Give the workers of the Dask scheduler at `address`, which are one pool."""
+    """Use the workers of the Dask scheduler at `address`, which are one pool."""
     try:
         import distributed
     except ImportError:
@@ -161,7 +161,7 @@ def _carry_out(item: Any) -> Any:
 
 
 def _end_with(lifeline: Connection[Any, Any]) -> None:
-    """End this process when the parent closes its end of the pipe, or is gone."""
+    """End this process when the parent closes its end of the pipe, or has ended."""
     with suppress(EOFError, OSError):
         lifeline.recv_bytes()
     os._exit(1)
@@ -169,7 +169,7 @@ def _end_with(lifeline: Connection[Any, Any]) -> None:
 
 @contextmanager
 def _worker_environment() -> Iterator[None]:
-    """Give processes that start in the block `_ENVIRONMENT`, where the caller has not chosen otherwise."""
+    """Set `_ENVIRONMENT` for processes that start in the block, where the caller has not chosen otherwise."""
     added = {name: value for name, value in _ENVIRONMENT.items() if not os.environ.get(name)}
     os.environ.update(added)
     try:
@@ -180,10 +180,10 @@ def _worker_environment() -> Iterator[None]:
 
 
 def cores() -> int:
-    """Return the number of cores that this process may use."""
+    """Count the cores that this process may use."""
     return max(1, len(os.sched_getaffinity(0))) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def process_count(asked: int | None) -> int:
-    """Return how many processes to start: as many as asked for, at most two a core; by default one a core."""
-    return min(asked or cores(), 2 * cores())
+def process_count(jobs: int | None) -> int:
+    """Choose the number of processes: `jobs`, at most two a core; by default one a core."""
+    return min(jobs or cores(), 2 * cores())

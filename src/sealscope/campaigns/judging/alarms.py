@@ -63,71 +63,71 @@ class Alarms:
     confidence: float
 
     def _with_references(self) -> Verdicts:
-        """Return the verdicts, and after them those of the two detectors that do not look."""
+        """Append the verdicts of two detectors that do not look: one always fires, one never."""
         rows = [judged.row for judged in next(iter(self.verdicts.values()), ())]
         always = {name: [JudgedRow(row, verdict, None) for row in rows]
                   for name, verdict in ((ALWAYS, "leak"), (NEVER, "no leak"))}  # fmt: skip
         return {**self.verdicts, **always}
 
     def by_size(self, hours: float | None, together: bool = False) -> Iterator[AlarmShares]:
-        """Yield alarms by size, or of all sizes `together`, and false alarms beside; those that do not look last.
+        """Yield alarms by size, or of all sizes `together`, with false alarms; those of the references last.
 
         A detector without a record with a leak has one row of size 0, with no detection.
         """
-        for name, own in without_fault(self._with_references()).items():
-            free, leaky = ([judged for judged in own if bool(judged.size) == leaks] for leaks in (False, True))
+        for name, records in without_fault(self._with_references()).items():
+            free, leaky = ([judged for judged in records if bool(judged.size) == leaks] for leaks in (False, True))
             alarms = self._share(judged.alarm for judged in free) if free else None
             hourly = events_per_hour(alarms.count, hours * alarms.n, self.confidence) if alarms and hours else None
-            for size, alike in grouped(leaky or free, lambda judged: math.nan if together else judged.size).items():
-                shares = self._shares(name, alike, leak_lpm=size)
+            for size, group in grouped(leaky or free, lambda judged: math.nan if together else judged.size).items():
+                shares = self._shares(name, group, leak_lpm=size)
                 detected = shares.alarms if leaky else self._share(())
                 yield replace(shares, alarms=detected, false_alarm=alarms, per_hour=hourly)
 
     def by_cell(self) -> Iterator[AlarmShares]:
         """Yield the alarms at each size in each cell of the factors."""
-        for name, own in without_fault(self.verdicts).items():
-            cells = grouped(own, lambda judged: (judged.size, repr(tuple(judged.row.levels.items()))))
-            for (size, _), alike in cells.items():
-                yield self._shares(name, alike, leak_lpm=size, levels=dict(alike[0].row.levels))
+        for name, records in without_fault(self.verdicts).items():
+            cells = grouped(records, lambda judged: (judged.size, repr(tuple(judged.row.levels.items()))))
+            for (size, _), group in cells.items():
+                yield self._shares(name, group, leak_lpm=size, levels=dict(group[0].row.levels))
 
     def by_fault(self) -> Iterator[AlarmShares]:
         """Yield the alarms on records with each fault that is no piston leak."""
-        for name, own in self._with_references().items():
-            faulty = (judged for judged in own if judged.row.fault and judged.size == 0)
-            for fault, alike in grouped(faulty, lambda judged: judged.row.fault).items():
-                yield self._shares(name, alike, fault=fault)
+        for name, records in self._with_references().items():
+            faulty = (judged for judged in records if judged.row.fault and judged.size == 0)
+            for fault, group in grouped(faulty, lambda judged: judged.row.fault).items():
+                yield self._shares(name, group, fault=fault)
 
     def by_family(self) -> Iterator[AlarmShares]:
         """Yield the alarms by family, size and law; all families together first, none where there are no families.
 
         Each size has its laws apart, and together where there are several.
         """
-        for name, own in without_fault(self.verdicts).items():
-            members = (judged for judged in own if FAMILY in judged.row.levels)
+        for name, records in without_fault(self.verdicts).items():
+            members = (judged for judged in records if FAMILY in judged.row.levels)
             families = grouped(members, lambda judged: str(judged.row.levels[FAMILY]))
-            for family, relatives in {ALL: own, **families}.items() if families else ():
-                for size, alike in grouped(relatives, lambda judged: judged.size).items():
-                    laws = grouped(alike, lambda judged: judged.row.law) if size else {}
-                    for law, of_law in laws.items() if len(laws) == 1 else {ANY_LAW: alike, **laws}.items():
+            for family, relatives in {ALL: records, **families}.items() if families else ():
+                for size, group in grouped(relatives, lambda judged: judged.size).items():
+                    laws = grouped(group, lambda judged: judged.row.law) if size else {}
+                    for law, of_law in laws.items() if len(laws) == 1 else {ANY_LAW: group, **laws}.items():
                         yield self._shares(name, of_law, family=family, leak_lpm=size, law=law)
 
     def _share(self, flags: Iterable[bool]) -> Proportion:
         counted = list(flags)
         return proportion(sum(counted), len(counted), self.confidence)
 
-    def _shares(self, detector: str, alike: Sequence[JudgedRow], **common: Any) -> AlarmShares:
-        stated = [(judged, judged.statement) for judged in alike if judged.statement is not None]
+    def _shares(self, detector: str, group: Sequence[JudgedRow], **common: Any) -> AlarmShares:
+        stated = [(judged, judged.statement) for judged in group if judged.statement is not None]
         intervals = [(judged.flow_lpm, statement.leak_interval_lpm) for judged, statement in stated]
         named = [
             judged.alarm and covers(named_cause(statement), cause_of(judged.row.fault)) for judged, statement in stated
         ]
-        silent = [False] * (len(alike) - len(stated))
+        silent = [False] * (len(group) - len(stated))
         return AlarmShares(
             detector=detector,
-            alarms=self._share(judged.alarm for judged in alike),
-            cannot_tell=self._share(judged.verdict == CANNOT_TELL for judged in alike),
+            alarms=self._share(judged.alarm for judged in group),
+            cannot_tell=self._share(judged.verdict == CANNOT_TELL for judged in group),
             coverage=self._share(ends[0] <= flow <= ends[1] for flow, ends in intervals if ends is not None),
             named=self._share(named + silent) if stated else None,
-            failed=sum(judged.row.error is not None for judged in alike),
+            failed=sum(judged.row.error is not None for judged in group),
             **common,
         )

@@ -27,8 +27,8 @@ class DetectorPod:
     proven: float
 
     @property
-    def how(self) -> str:
-        """How the curve was fitted, or why there is none."""
+    def description(self) -> str:
+        """Method of the curve's fit, or the reason why there is none."""
         return self.curve.estimator if self.curve else self.why
 
 
@@ -44,8 +44,8 @@ class SizeRoc:
 
 def pods_of(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
     """Yield the probability of detection over the size, where there are leaks."""
-    for name, own in verdicts.items():
-        leaky = [judged for judged in own if judged.size > 0]
+    for name, records in verdicts.items():
+        leaky = [judged for judged in records if judged.size > 0]
         if not leaky:
             continue
         sizes, hits = [judged.size for judged in leaky], [judged.alarm for judged in leaky]
@@ -60,13 +60,13 @@ def pods_of(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
 
 def rocs_of(verdicts: Verdicts, confidence: float) -> Iterator[SizeRoc]:
     """Yield curves over the scores, with no threshold; a record that cannot be judged counts as the lowest."""
-    for name, own in verdicts.items():
-        scores = [judged.row.scores[name][0] if judged.row.error is None else None for judged in own]
+    for name, records in verdicts.items():
+        scores = [judged.row.scores[name][0] if judged.row.error is None else None for judged in records]
         lowest = min((score for score in scores if score is not None), default=None)
         if lowest is None:
             continue
         by_leak: dict[float, list[float]] = {}
-        for judged, score in zip(own, scores, strict=True):
+        for judged, score in zip(records, scores, strict=True):
             by_leak.setdefault(judged.size, []).append(lowest - 1.0 if score is None else score)
         free = by_leak.pop(0.0, [])
         together = [score for leaky in by_leak.values() for score in leaky]

@@ -1,4 +1,4 @@
-"""Judge a campaign's rows: thresholds from its leak-free records, verdicts on all others, and what they add up to."""
+"""Judge a campaign's rows: thresholds from its leak-free records, verdicts on all others, and their statistics."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sealscope.evaluation.thresholds import Promise
 
 @dataclass(frozen=True)
 class Judgement:
-    """What a campaign shows.
+    """The statistics of a campaign's verdicts.
 
     `table` by size, `overall` with all leaks together; `onsets`, `flows` and `causes`: of detectors that state them;
     `thresholds`: of scorers, from `leak_free` records; `judged`: records that had a result; `failed`: rows that had
@@ -57,7 +57,7 @@ def judge(
     onset_s: float | None = None,
     hours: float | None = None,
 ) -> Judgement:
-    """Return verdicts and figures of all rows to judge.
+    """Compute verdicts and figures of all rows to judge.
 
     A detector's verdict is the one it stated, or its score's against a threshold: that in `limits`, that of the scorer,
     else the one from the leak-free rows of the row's duty (`thresholds_of`), which are not asked where there are
@@ -70,7 +70,11 @@ def judge(
     thresholds = {} if limits is not None else thresholds_of(rows, detectors, false_alarm, promise, confidence)
     if limits is None:
         scorers = {name: plan_detector(name).scorer for name in detectors}
-        limits = {name: own.threshold for name, own in scorers.items() if own is not None and own.threshold is not None}
+        limits = {
+            name: scorer.threshold
+            for name, scorer in scorers.items()
+            if scorer is not None and scorer.threshold is not None
+        }
     verdicts = verdicts_of(judged, detectors, limits, thresholds)
     of_leaks = without_fault(verdicts)
     alarms = Alarms(verdicts, confidence)
@@ -95,8 +99,8 @@ def judge(
 
 def _realised(rows: Sequence[CaseRow]) -> dict[float, tuple[float, float]]:
     realised = {}
-    for size, alike in grouped((row for row in rows if row.leak_lpm > 0), lambda row: row.leak_lpm).items():
-        flows = [row.flow_lpm for row in alike if row.flow_lpm is not None]
+    for size, group in grouped((row for row in rows if row.leak_lpm > 0), lambda row: row.leak_lpm).items():
+        flows = [row.flow_lpm for row in group if row.flow_lpm is not None]
         if flows:
             spread = float(np.std(flows, ddof=1)) if len(flows) > 1 else math.nan
             realised[size] = (float(np.mean(flows)), spread)

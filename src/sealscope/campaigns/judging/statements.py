@@ -1,4 +1,4 @@
-"""What detectors state beyond a verdict, against the truth: when the leak began, how large it is, what the cause is."""
+"""Statements of detectors against the truth: the onset of the leak, its size, its cause."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class StatedErrors:
 
 @dataclass(frozen=True)
 class NamedCauses:
-    """Which cause one detector names for which there is; `none` where nothing leaks and no fault is put in.
+    """Counts of the causes that one detector names, by true cause; `none` without leak and fault.
 
     `covered`: records for which it names the true cause, alone or with the one that no channel tells from it.
     """
@@ -41,23 +41,23 @@ class NamedCauses:
 
 def onset_errors(verdicts: Verdicts, onset_s: float, confidence: float) -> Iterator[StatedErrors]:
     """Yield, for detectors that search for the onset, its error over the alarms, by size."""
-    for name, own in verdicts.items():
-        for size, alike in grouped((judged for judged in own if judged.size > 0 and judged.alarm), _size).items():
+    for name, records in verdicts.items():
+        for size, group in grouped((judged for judged in records if judged.size > 0 and judged.alarm), _size).items():
             stated = [
                 (onset, onset_s, None if judged.statement is None else judged.statement.onset_interval_s)
-                for judged in alike
+                for judged in group
                 if (onset := judged.row.scores[name][1]) is not None
             ]
             yield from _errors(name, size, stated, confidence)
 
 
 def flow_errors(verdicts: Verdicts, confidence: float) -> Iterator[StatedErrors]:
-    """Yield, for detectors that state a flow, its errors against the flow that the record really had, by size."""
-    for name, own in verdicts.items():
-        for size, alike in grouped(own, _size).items():
+    """Yield, for detectors that state a flow, its errors against the record's true flow, by size."""
+    for name, records in verdicts.items():
+        for size, group in grouped(records, _size).items():
             stated = [
                 (judged.statement.leak_lpm, judged.flow_lpm, judged.statement.leak_interval_lpm)
-                for judged in alike
+                for judged in group
                 if judged.statement is not None
             ]
             yield from _errors(name, size, stated, confidence)
@@ -82,17 +82,17 @@ def _errors(
 
 
 def causes_of(verdicts: Verdicts, confidence: float) -> Iterator[NamedCauses]:
-    """Yield the causes that detectors name, where there are faults.
+    """Count the causes that detectors name, where there are faults.
 
     A record with a leak and another fault is left out; one that failed is `cannot tell`.
     """
-    for name, own in verdicts.items():
-        single = [judged for judged in own if not (judged.size > 0 and judged.row.fault)]
-        others = sorted({cause_of(judged.row.fault) for judged in single if judged.row.fault})
-        if not others or not any(name in judged.row.statements for judged in single):
+    for name, records in verdicts.items():
+        single = [judged for judged in records if not (judged.size > 0 and judged.row.fault)]
+        other_causes = sorted({cause_of(judged.row.fault) for judged in single if judged.row.fault})
+        if not other_causes or not any(name in judged.row.statements for judged in single):
             continue
         truth = [_true_cause(judged) for judged in single]
-        causes = [cause for cause in (NO_CAUSE, PISTON_LEAK) if cause in truth] + others
+        causes = [cause for cause in (NO_CAUSE, PISTON_LEAK) if cause in truth] + other_causes
         named = [CANNOT_TELL if judged.statement is None else named_cause(judged.statement) for judged in single]
         causes += sorted(set(named) - set(causes) - {CANNOT_TELL})
         covered = proportion(sum(map(covers, named, truth)), len(truth), confidence)

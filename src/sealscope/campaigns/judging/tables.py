@@ -22,7 +22,7 @@ _SHARE = ("count", "of", "fraction", "low", "high")
 
 @dataclass(frozen=True)
 class PriorKnowledge:
-    """What a detector was given beside the recording.
+    """A detector's knowledge besides the recording.
 
     `onset`: whether it knew the true onset of the leak; `channels`: those it saw; `rig`: the rig that it assumes, ""
     for none.
@@ -33,7 +33,7 @@ class PriorKnowledge:
     rig: str
 
     def plain(self) -> TableRow:
-        """Return what a table says of it."""
+        """Format the knowledge for a table."""
         return {"onset": "yes" if self.onset else "no", "channels": " ".join(self.channels), "rig": self.rig}
 
 
@@ -42,17 +42,23 @@ def _columns() -> dict[str, dict[str, str]]:
     return tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
-def attribute_of(of: Any, path: str) -> Any:
-    """Return an attribute by its path, of a mapping or of a tuple its entry; None where there is none on the way."""
+def attribute_of(source: Any, path: str) -> Any:
+    """Find an attribute by its path through mappings and tuples; None where one on the way is None."""
     for name in path.split("."):
-        if of is None:
+        if source is None:
             return None
-        of = of[name] if isinstance(of, Mapping) else of[int(name)] if name.isdigit() else getattr(of, name)
-    return of
+        source = (
+            source[name]
+            if isinstance(source, Mapping)
+            else source[int(name)]
+            if name.isdigit()
+            else getattr(source, name)
+        )
+    return source
 
 
 def _cells(column: str, content: str, row: Any, factors: Sequence[str]) -> TableRow:
-    """Return the cells of one column of `tables.toml`: one, or several by name."""
+    """Build the cells of one column of `tables.toml`: one, or several by name."""
     *how, path = content.split(" ")
     value = attribute_of(row, path)
     if path == "levels":
@@ -60,53 +66,55 @@ def _cells(column: str, content: str, row: Any, factors: Sequence[str]) -> Table
     if "share" in how:
         known = value is not None and (value.n or "stated" not in how)
         parts = (value.count, value.n, value.value, value.low, value.high) if known else (None,) * 5
-        return {f"{column}: {part}": of for part, of in zip(_SHARE, parts, strict=True)}
+        return {f"{column}: {part}": value_of_part for part, value_of_part in zip(_SHARE, parts, strict=True)}
     return {column: "any" if "size" in how and math.isnan(value) else value}
 
 
 def tables_of(
     judgement: Judgement, unit: str = "L/min", known: Mapping[str, PriorKnowledge] | None = None, part: str = ""
 ) -> dict[str, list[TableRow]]:
-    """Return every table of a judgement by the stem of its file, as `tables.toml` lays them out.
+    """Build every table of a judgement by the stem of its file, as `tables.toml` lays them out.
 
     Sizes of leaks in `unit`, `known`: what each detector was given, `part`: what the campaign's families are for.
     """
-    j, given = judgement, {name: of.plain() for name, of in (known or {}).items()}
+    j, knowledge = judgement, {name: row.plain() for name, row in (known or {}).items()}
     factors = list(dict.fromkeys(name for cell in j.cells for name in cell.levels))
     rows: dict[str, Iterable[Any]] = {
         "table": (*j.table, *j.overall),
-        "pod": ({"pod": pod, "at": at} for pod in j.pods for at in pod.sizes),
+        "pod": ({"pod": pod, "at": entry} for pod in j.pods for entry in pod.sizes),
         "roc": j.rocs,
         "cells": j.cells,
         "onsets": j.onsets,
         "estimates": j.flows,
-        "thresholds": ({"detector": name, "duty": duty, "at": at} for (name, duty), at in j.thresholds.items()),
+        "thresholds": ({"detector": name, "duty": duty, "at": entry} for (name, duty), entry in j.thresholds.items()),
         "faults": j.faults,
         "causes": (
-            {"detector": of.detector, "true": true, "named": named, "records": share}
-            for of in j.causes
-            for true, shares in zip(of.confusion.rows, of.confusion.shares, strict=True)
-            for named, share in zip(of.confusion.columns, shares, strict=True)
+            {"detector": row.detector, "true": true, "named": named, "records": share}
+            for row in j.causes
+            for true, shares in zip(row.confusion.rows, row.confusion.shares, strict=True)
+            for named, share in zip(row.confusion.columns, shares, strict=True)
             if share.n
         ),
-        "families": ({"of": of, "part": part, "detector": of.detector} for of in j.families),
+        "families": ({"of": row, "part": part, "detector": row.detector} for row in j.families),
     }
 
     def laid_out(columns: Mapping[str, str], row: Any) -> TableRow:
         cells: TableRow = {}
         for column, content in columns.items():
-            if content.startswith("known ") and given:
-                cells[column] = attribute_of(given.get(attribute_of(row, "detector")), content.removeprefix("known "))
+            if content.startswith("known ") and knowledge:
+                cells[column] = attribute_of(
+                    knowledge.get(attribute_of(row, "detector")), content.removeprefix("known ")
+                )
             elif not content.startswith("known "):
                 name = column.format(unit=unit)
                 cells |= _cells(name, content, row, factors)
         return cells
 
-    return {name: [laid_out(_columns()[name], row) for row in own] for name, own in rows.items()}
+    return {name: [laid_out(_columns()[name], row) for row in table] for name, table in rows.items()}
 
 
 def records_table(rows: Iterable[CaseRow], detectors: Sequence[str], unit: str = "L/min") -> list[TableRow]:
-    """Return every record of a campaign in the order of its id, without what differs from run to run."""
+    """Build the table of all records in the order of their ids, without values that differ from run to run."""
     ordered = sorted(rows, key=lambda row: row.id)
     factors = list(dict.fromkeys(name for row in ordered for name in sorted(row.levels)))
     stating = sorted({name for row in ordered for name in row.statements})

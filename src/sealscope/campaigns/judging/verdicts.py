@@ -1,4 +1,4 @@
-"""The verdicts that are judged: a detector's own on each record, or its score against a threshold."""
+"""The judged verdicts: a detector's own on each record, or its score's against a threshold."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Thresholds = Mapping[tuple[str, str], Threshold]
 
 
 class JudgedRow(NamedTuple):
-    """A row, one detector's verdict on it, and what it stated, None where it states nothing or the record failed."""
+    """A row, one detector's verdict on it, and its statement; None where there is none or the record failed."""
 
     row: CaseRow
     verdict: str
@@ -25,12 +25,12 @@ class JudgedRow(NamedTuple):
 
     @property
     def size(self) -> float:
-        """Size of the leak that was put in, 0 for none."""
+        """Size of the true leak, 0 for none."""
         return self.row.leak_lpm
 
     @property
     def flow_lpm(self) -> float:
-        """Flow [L/min] that the leak really had, where that is known."""
+        """Flow [L/min] of the true leak, where it is known."""
         return self.size if self.row.flow_lpm is None else self.row.flow_lpm
 
     @property
@@ -50,26 +50,26 @@ def thresholds_of(
     promise: Promise = "average",
     confidence: float = 0.95,
 ) -> Thresholds:
-    """Return the thresholds of the scorers that need one, from the leak-free rows of each duty.
+    """Compute the thresholds of the scorers that need one, from the leak-free rows of each duty.
 
     A row without a score raises no alarm and counts as the lowest. Raises InputError where no duty has enough rows,
     saying how many it takes.
     """
-    wanted = [name for name in detectors if plan_detector(name).needs_threshold]
+    needing = [name for name in detectors if plan_detector(name).needs_threshold]
     leak_free: dict[str, list[CaseRow]] = {}
     for row in rows:
         if row.use == "calibrate" and row.error is None:
             leak_free.setdefault(duty_of(row.levels), []).append(row)
     needed = records_needed(false_alarm, confidence if promise == "bound" else None)
     most = max(map(len, leak_free.values()), default=0)
-    if wanted and most < needed:
+    if needing and most < needed:
         raise InputError(f"leak-free records must be at least {needed} of a duty, got at most {most}")
     thresholds = {}
-    for name in wanted:
-        for duty, alike in leak_free.items():
-            known = [score for row in alike if (score := row.scores[name][0]) is not None]
-            if known and len(alike) >= needed:
-                scores = known + [min(known)] * (len(alike) - len(known))
+    for name in needing:
+        for duty, group in leak_free.items():
+            known = [score for row in group if (score := row.scores[name][0]) is not None]
+            if known and len(group) >= needed:
+                scores = known + [min(known)] * (len(group) - len(known))
                 thresholds[name, duty] = quantile_threshold(scores, false_alarm, confidence, promise)
     return thresholds
 
@@ -77,9 +77,9 @@ def thresholds_of(
 def verdicts_of(
     rows: Sequence[CaseRow], detectors: Sequence[str], limits: Mapping[str, float], thresholds: Thresholds
 ) -> dict[str, list[JudgedRow]]:
-    """Return each detector's verdicts: its own, or its score's against its limit, else the threshold of the duty."""
+    """Collect each detector's verdicts: its own, or its score's against its limit or the duty's threshold."""
 
-    def judged(row: CaseRow, detector: str) -> JudgedRow:
+    def judge_row(row: CaseRow, detector: str) -> JudgedRow:
         if row.error is not None:
             return JudgedRow(row, CANNOT_TELL, None)
         if (statement := row.statements.get(detector)) is not None:
@@ -91,16 +91,16 @@ def verdicts_of(
             return JudgedRow(row, CANNOT_TELL, None)
         return JudgedRow(row, "leak" if score > limit else "no leak", None)
 
-    return {detector: [judged(row, detector) for row in rows] for detector in detectors}
+    return {detector: [judge_row(row, detector) for row in rows] for detector in detectors}
 
 
 def without_fault(verdicts: Verdicts) -> Verdicts:
-    """Return the verdicts on records that have no fault beside the leak."""
-    return {name: [judged for judged in own if not judged.row.fault] for name, own in verdicts.items()}
+    """Select the verdicts on records without another fault."""
+    return {name: [judged for judged in records if not judged.row.fault] for name, records in verdicts.items()}
 
 
 def grouped(items: Iterable[_T], key: Callable[[_T], Any]) -> dict[Any, list[_T]]:
-    """Return the items by what they have in common, in rising order."""
+    """Group the items by a key, in rising order."""
     groups: dict[Any, list[_T]] = {}
     for item in items:
         groups.setdefault(key(item), []).append(item)

@@ -1,1 +1,1 @@
-"""Plans: what a campaign simulates or reads, and which detectors judge it."""
+"""Plans: the records of a campaign, simulated or read, and its detectors."""

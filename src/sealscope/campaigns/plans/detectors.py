@@ -32,12 +32,12 @@ ALL_CHANNELS = tuple(name for name in CHANNEL_UNITS if name != "q_leak")
 class PlanDetector:
     """One name of a plan's `detectors`, parsed.
 
-    `of`: the scorer, the detector, `diagnose` or `watch`; `scorer`: None where it is judged by its own verdict;
+    `base`: the scorer, the detector, `diagnose` or `watch`; `scorer`: None where it is judged by its own verdict;
     `view`: the set of channels it sees, "" where none is named.
     """
 
     name: str
-    of: str
+    base: str
     view: str
     scorer: Scorer | None = None
 
@@ -63,7 +63,7 @@ def check_detector(name: str, views: Views) -> None:
         known_views = ", ".join(view for view in views if view) or "none"
         raise InputError(f"what stands behind '@' must be one of [views] ({known_views}), got {name!r}")
     known = [DIAGNOSE, WATCH, *detectors()]
-    if parsed.scorer is not None or parsed.of in known:
+    if parsed.scorer is not None or parsed.base in known:
         return
     near = nearest(name.partition(_VIEW)[0], [*SCORERS, *known], share=0.6)
     hint = f"; did you mean {near[0]!r}?" if near else ""

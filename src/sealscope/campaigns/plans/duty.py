@@ -1,4 +1,4 @@
-"""What a plan's levels and faults mean on a rig: closings, targets, controllers, loads and faults as text.
+"""Levels and faults of a plan on a rig: closings, targets, controllers, loads and faults as text.
 
 The words are those of `sealscope simulate`: `command` as `--command` (a voltage or a target for the piston),
 `controller` as `--controller`, `load` as `--load`.
@@ -40,7 +40,7 @@ def check_duty(name: str, level: str | float, rig: Rig, duration: float) -> None
 
 
 def check_controllers(plan: SimulatedPlan, trust: bool) -> None:
-    """Make each controller that is none of Sealscope's, before a campaign begins.
+    """Make each of the user's controllers before a campaign begins.
 
     Raises InputError where one cannot be made, and where one is a program that the plan leads to and the caller does
     not `trust` it: a plan may be hostile. Installed controllers are trusted.
@@ -61,12 +61,12 @@ def check_controllers(plan: SimulatedPlan, trust: bool) -> None:
 
 
 def voltage_in(commands: tuple[str | float, ...]) -> str | None:
-    """Return the first of these commands that is no target for a piston, None where all are."""
+    """Find the first of these commands that is no target for a piston, None where all are."""
     return next((str(command) for command in commands if parse_position(str(command)) is None), None)
 
 
 def closing_values(level: str | float) -> dict[str, str | float]:
-    """Return the rig's parameters for both throttles closed by a share; 0 leaves `line.orifices` as it is."""
+    """Compute the rig's parameters for both throttles closed by a share; 0 leaves `line.orifices` unchanged."""
     share = parse_quantity(level, "1") if isinstance(level, str) else float(level)
     if not 0.0 <= share < 1.0:
         raise InputError(f"closed must be 0 to under 100 %, got {level!r}")
@@ -75,7 +75,7 @@ def closing_values(level: str | float) -> dict[str, str | float]:
 
 
 def fault_of(text: str, onset_s: float) -> Fault:
-    """Parse a fault other than a piston leak; it sets in at the plan's onset unless the text says when."""
+    """Parse a fault other than a piston leak; its onset is the plan's unless the text states one."""
     timed = any(f" {word} " in f" {text} " for word in ("from", "growing"))
     fault = parse_fault(text if timed else f"{text} from {onset_s:g} s")
     if fault is None:

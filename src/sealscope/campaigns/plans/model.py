@@ -26,7 +26,7 @@ _LONGEST_NAME = 80
 
 
 def _quantity(unit: str) -> BeforeValidator:
-    """Return what takes a text of a number with its unit for the number."""
+    """Build a validator that reads a number with its unit from text."""
     return BeforeValidator(lambda value: parse_quantity(value, unit) if isinstance(value, str) else value)
 
 
@@ -108,7 +108,7 @@ class RecordGroup(_Entries):
 
 @dataclass(frozen=True, kw_only=True)
 class _Plan(_Entries):
-    """What all plans have in common; `title`: the name where it is empty."""
+    """The fields of all plans; `title`: the name where it is empty."""
 
     name: FileName
     title: Text = ""
@@ -119,7 +119,7 @@ class _Plan(_Entries):
 
 @dataclass(frozen=True, kw_only=True)
 class _JudgedPlan(_Plan):
-    """What plans over records of a machine have in common.
+    """The fields of plans over records of a machine.
 
     `unit`: of the sizes of leaks; `views`: sets of channels that detectors see (`detectors`), "" for those that name
     none, of which `channels` says it; `assume`: the rig that detectors may assume, with the values `assume_set`.
@@ -173,7 +173,7 @@ class SimulatedPlan(_JudgedPlan):
 
     @cached_property
     def assumed(self) -> Rig:
-        """What detectors may assume of the machine."""
+        """The rig that detectors may assume."""
         return self._assumed(self.rig) or self.rig
 
     @property
@@ -212,7 +212,7 @@ class RecordedPlan(_JudgedPlan):
 
     @cached_property
     def assumed(self) -> Rig | None:
-        """What detectors may assume of the machine, None where the plan does not say it."""
+        """The rig that detectors may assume, None where the plan states none."""
         return self._assumed(None)
 
 

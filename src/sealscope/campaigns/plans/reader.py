@@ -1,4 +1,4 @@
-"""Read a plan from TOML, and check it whole."""
+"""Read a plan from TOML, and check all of it."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _KINDS: Mapping[str, tuple[type[AnyPlan], tuple[str, ...], tuple[str, ...]]] = {
 
 
 def plan_names() -> tuple[str, ...]:
-    """Return the names of the packaged plans."""
+    """List the names of the packaged plans."""
     return tuple(sorted(path.stem for path in _PACKAGED.glob("*.toml")))
 
 
@@ -56,11 +56,11 @@ def load_plan(name_or_path: str | os.PathLike[str]) -> AnyPlan:
 
 
 def read_plan(tree: Mapping[str, Any], place: str = "plan") -> AnyPlan:
-    """Read the plan in a TOML file's tables; its kind follows from the tables that are there."""
+    """Read the plan in a TOML file's tables; its kind follows from the tables present."""
     plan = _entries(tree, place)
     plan = replace(plan, title=plan.title or plan.name)
     without_view = {} if plan.channels is None else {"": plan.channels}
-    plan = replace(plan, views={**plan.views, **without_view}, assume=plan.assume and _beside(plan.assume, place))
+    plan = replace(plan, views={**plan.views, **without_view}, assume=plan.assume and _path_beside(plan.assume, place))
     if isinstance(plan, SimulatedPlan):
         plan = _simulated(plan)
     elif not any(recordings.use == "judge" for recordings in plan.sets):
@@ -68,7 +68,7 @@ def read_plan(tree: Mapping[str, Any], place: str = "plan") -> AnyPlan:
     _in("campaign.assume", place, lambda: plan.assumed)
     for name in plan.detectors:
         _in("campaign.detectors", place, partial(check_detector, name, plan.views))
-    if {DIAGNOSE, WATCH} & {plan_detector(name).of for name in plan.detectors}:
+    if {DIAGNOSE, WATCH} & {plan_detector(name).base for name in plan.detectors}:
         _in("campaign.false_alarm", place, partial(check_probability, plan.false_alarm))
     if len(set(plan.detectors)) < len(plan.detectors):
         raise InputError(f"campaign.detectors must be named once each ({place})")
@@ -76,45 +76,45 @@ def read_plan(tree: Mapping[str, Any], place: str = "plan") -> AnyPlan:
 
 
 def _entries(tree: Mapping[str, Any], place: str) -> AnyPlan:
-    """Return the entries of all tables as a plan, each checked alone; an error names the table of its entry."""
+    """Read the entries of all tables as a plan, each checked alone; an error names the table of its entry."""
     source = next((name for name in _KINDS if name in tree), "records")
-    kind, tables, own = _KINDS[source]
+    kind, tables, entries_of_source = _KINDS[source]
     for key in tree:
         if key not in tables:
             known = ", ".join(f"[{name}]" for name in tables)
             raise InputError(f"[{key}] is not known; a plan with [{source}] has {known} ({place})")
     entries, names = {**tree, "place": place}, {name: name for name in tables}
-    for table in ("campaign", source) if own else ("campaign",):
-        given = entries.pop(table, {})
-        if not isinstance(given, Mapping):
-            raise InputError(f"{table} must be a table, got {given!r} ({place})")
-        for entry in given:
-            if (entry in own) != (table == source) or entry in ("place", *tables):
+    for table in ("campaign", source) if entries_of_source else ("campaign",):
+        values = entries.pop(table, {})
+        if not isinstance(values, Mapping):
+            raise InputError(f"{table} must be a table, got {values!r} ({place})")
+        for entry in values:
+            if (entry in entries_of_source) != (table == source) or entry in ("place", *tables):
                 raise InputError(f"{table}.{entry} is not known ({place})")
             names[entry] = f"{table}.{entry}"
-        entries |= given
+        entries |= values
     return read_model(entries, kind, place, lambda entry: names.get(entry, f"campaign.{entry}"))
 
 
 def _in(entry: str, place: str, read: Callable[[], _T]) -> _T:
-    """Return `read()`; an InputError of it gets the entry and the place of the plan."""
+    """Call `read`; name the entry and the plan's place in its InputError."""
     try:
         return read()
     except InputError as error:
         raise InputError(f"{entry}: {error} ({place})") from None
 
 
-def _beside(name: str, place: str) -> str:
-    """Return the path of a file named in a plan, which lies beside the plan; another name as it is."""
+def _path_beside(name: str, place: str) -> str:
+    """Build the path of a file in the plan's folder; another name is returned unchanged."""
     return os.fspath(Path(place).parent / name) if name.endswith(".toml") else name
 
 
 def _simulated(plan: SimulatedPlan) -> SimulatedPlan:
-    """Return a simulated plan with the paths of its files and its onset, checked."""
+    """Complete and check a simulated plan: the paths of its files, and its onset."""
     place = plan.place
-    profile = "" if plan.profile == "none" else _beside(plan.profile, place)
+    profile = "" if plan.profile == "none" else _path_beside(plan.profile, place)
     onset = plan.duration_s / 2 if math.isnan(plan.onset_s) else plan.onset_s
-    plan = replace(plan, rig_name=_beside(plan.rig_name, place), profile=profile, onset_s=onset)
+    plan = replace(plan, rig_name=_path_beside(plan.rig_name, place), profile=profile, onset_s=onset)
     _in("campaign.rig", place, lambda: load_rig(plan.rig_name))
     _in("campaign.set", place, lambda: plan.rig)
     if profile:
@@ -165,7 +165,7 @@ def _check_level(plan: SimulatedPlan, name: str, level: str | float) -> None:
 
 
 def _check_records(plan: SimulatedPlan) -> None:
-    """Refuse records that say the same twice, a fault that is none, and too few records to judge or to calibrate."""
+    """Refuse duplicate records, an unknown fault, and too few records to judge or to calibrate."""
     kinds = [(group.use, group.leak_lpm, group.law, group.fault) for group in plan.records]
     for number, (kind, group) in enumerate(zip(kinds, plan.records, strict=True), 1):
         if group.fault:
@@ -181,8 +181,8 @@ def _check_records(plan: SimulatedPlan) -> None:
     needed = records_needed(plan.false_alarm, plan.confidence if plan.promise == "bound" else None)
     commands = len(plan.factors.get("command", ("",)))  # each an operating point, with thresholds of its own
     if count < needed * commands:
-        each = f" ({needed} for each of {commands} commands)" if commands > 1 else ""
+        per_command = f" ({needed} for each of {commands} commands)" if commands > 1 else ""
         raise InputError(
-            f"records to calibrate must be at least {needed * commands}{each} for false_alarm = "
+            f"records to calibrate must be at least {needed * commands}{per_command} for false_alarm = "
             f"{plan.false_alarm:g}, got {count} ({plan.place})"
         )

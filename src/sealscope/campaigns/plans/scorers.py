@@ -1,4 +1,4 @@
-"""The thesis's rules as scorers: one number of a record from the RMS of its details, higher where it looks like a leak.
+"""The thesis's rules as scorers: one number a record from the RMS of its details, high for a leak.
 
 A threshold comes from a plan's leak-free records; a bare sign rule has one of its own.
 """
@@ -33,7 +33,7 @@ _BOTH = "d3d4 of both chambers as the thesis says"
 
 
 def side_bounds(n: int, rate: float, split: int) -> IntArray:
-    """Return first and last (exclusive) sample (2, 2) of each side of the sample `split` of `n` at `rate` [Hz].
+    """Compute first and last (exclusive) sample (2, 2) of each side of the sample `split` of `n` at `rate` [Hz].
 
     Without the start (`START_SECONDS`), and without details that saw the other side or the recording's ends. A side
     that has no sample left ends before it begins.
@@ -50,8 +50,8 @@ class Sides:
     log_rms: Mapping[str, tuple[Array, Array, Array]]
 
     @classmethod
-    def of(cls, recording: Recording, split_s: float) -> Sides:
-        """Return the sides of the moment `split_s` [s], of each chamber whose two sides have details.
+    def from_recording(cls, recording: Recording, split_s: float) -> Sides:
+        """Compute both sides of the time `split_s` [s], for each chamber whose two sides have details.
 
         The recording is uniformly sampled without missing samples.
         """
@@ -61,11 +61,11 @@ class Sides:
         for chamber in CHAMBERS if np.diff(bounds).min() > 0 else ():
             if chamber in recording:
                 squares[chamber] = mean_squares(details(recording[chamber]), bounds.ravel())[::2]
-        return cls.of_squares(squares, bounds)
+        return cls.from_squares(squares, bounds)
 
     @classmethod
-    def of_squares(cls, squares: Mapping[str, Array], bounds: IntArray) -> Sides:
-        """Return the sides with mean squares (2, 5) of each chamber's details, over samples `bounds` (2, 2)."""
+    def from_squares(cls, squares: Mapping[str, Array], bounds: IntArray) -> Sides:
+        """Build the sides from mean squares (2, 5) of each chamber's details over samples `bounds` (2, 2)."""
         log_rms = {}
         with np.errstate(divide="ignore"):
             for chamber, parts in squares.items():
@@ -74,7 +74,7 @@ class Sides:
         return cls(log_rms)
 
     def through(self, channels: Iterable[str]) -> Sides:
-        """Return the sides of these of its chambers alone."""
+        """Select some of the chambers."""
         visible = set(channels)
         return Sides({chamber: values for chamber, values in self.log_rms.items() if chamber in visible})
 
@@ -101,18 +101,18 @@ class Scorer:
 
     @property
     def split(self) -> bool:
-        """Whether it compares the two sides of the split."""
+        """Whether the rule compares the two sides of the split."""
         return all(_WORDS[word][0] == "change" for _, _, word in self.parts)
 
     @property
-    def about(self) -> str:
-        """What it scores, in words."""
-        said = " and ".join(f"the RMS of {quantity} of {chamber} {word}" for quantity, chamber, word in self.parts)
+    def description(self) -> str:
+        """The score in words."""
+        text = " and ".join(f"the RMS of {quantity} of {chamber} {word}" for quantity, chamber, word in self.parts)
         ending = " over the split, as change of its logarithm" if self.split else " over the record, as its logarithm"
-        return said + ending + ("; any change at all" if self.threshold is not None else "")
+        return text + ending + ("; any change at all" if self.threshold is not None else "")
 
     def score(self, sides: Sides) -> float | None:
-        """Return the score; None where it cannot be computed: too short, or a reading that does not move."""
+        """Compute the score; None for a recording that is too short, or a reading that does not move."""
         scores = []
         for quantity, chamber, word in self.parts:
             what, sign = _WORDS[word]
@@ -123,7 +123,7 @@ class Scorer:
         return min(scores)
 
 
-def _all() -> Iterator[Scorer]:
+def _iter_scorers() -> Iterator[Scorer]:
     for chamber, quantity, word in product(CHAMBERS, QUANTITIES, _WORDS):
         rule = Scorer(f"{quantity} of {chamber} {word}", ((quantity, chamber, word),))
         yield rule
@@ -135,4 +135,4 @@ def _all() -> Iterator[Scorer]:
 
 
 #: Every scorer by name.
-SCORERS: Mapping[str, Scorer] = MappingProxyType({scorer.name: scorer for scorer in _all()})
+SCORERS: Mapping[str, Scorer] = MappingProxyType({scorer.name: scorer for scorer in _iter_scorers()})

@@ -269,10 +269,10 @@ def _about(name: str) -> str:
     detector = plan_detector(name)
     through = f", given the channels of {detector.view} alone" if detector.view else ""
     if detector.scorer is not None:
-        return detector.scorer.about + through
-    if detector.of == DIAGNOSE:
+        return detector.scorer.description + through
+    if detector.base == DIAGNOSE:
         return f"score over threshold of the detector that judged{through}"
-    return f"the score of the detector {detector.of!r}{through}" if detector.of in detectors() else ""
+    return f"the score of the detector {detector.base!r}{through}" if detector.base in detectors() else ""
 
 
 def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:

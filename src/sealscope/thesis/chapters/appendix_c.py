@@ -1,4 +1,4 @@
-"""Appendix C simulated, as the thesis tabulates it, beside its own sheet; and Figs. 5.90 to 5.95."""
+"""Appendix C simulated and compared with the thesis's own sheet; and Figs. 5.90 to 5.95."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def _chamber_table(sheet: DataSheet, measured: DataSheet | None, chamber: str, i
             heads.append(f"{name} diff, {label} [%]")
             pairs = None if source is None else source.rms[chamber][name]
             values = (None,) * 3 if pairs is None else (pairs[:, 0], pairs[:, 1], _difference(pairs))
-            columns += [[None] * len(APPENDIX_C) if of is None else of.tolist() for of in values]
+            columns += [[None] * len(APPENDIX_C) if series is None else series.tolist() for series in values]
     rows = (
         (row.number, row.mean_leak_lpm, row.command, row.closed_pct, row.level, *(values[k] for values in columns))
         for k, row in enumerate(APPENDIX_C)
@@ -55,7 +55,7 @@ def agreement(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[Cell, 
 
 
 def appendix(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate how simulation and sheet agree, and the thesis's two tables with both side by side."""
+    """Tabulate the agreement of simulation and sheet, and the thesis's two tables with both of them."""
     table, sheet = simulated_sheet(context, "leak")
     notes = f"{table.notes} Means are geometric." + ("" if context.sheet else " No measured sheet was given.")
     summary = item.table(agreement(sheet, context.sheet), notes, resolved=table.resolved)

@@ -38,21 +38,21 @@ Pairs = Mapping[str, Mapping[str, tuple[float, ...]]]
 
 
 def drawn_drifts(number: int, half: float, draw: int = 0) -> tuple[ParameterDrift, ...]:
-    """Draw how a test's rig drifts at half time: each share uniform within its bounds, up or down, independent."""
+    """Draw the drifts of a test's rig at half time: each share uniform within its bounds, up or down, independent."""
     random, drifting = np.random.default_rng([_SEEDS["drift"], draw, number]), texts_of("cases.toml")["drifts"].values()
-    shares = [random.uniform(*own["shares"]) for own in drifting]
+    shares = [random.uniform(*part["shares"]) for part in drifting]
     moved = random.choice([-1.0, 1.0], size=len(shares)) * shares
     return tuple(
         ParameterDrift(name, tabulated(np.array([half, half]), np.array([0.0, share])))
-        for own, share in zip(drifting, moved, strict=True)
-        for name in own["parameters"]
+        for part, share in zip(drifting, moved, strict=True)
+        for name in part["parameters"]
     )
 
 
 def leak_test(
     condition: Condition, half: float, seed: int, leak: bool = True, drifts: tuple[ParameterDrift, ...] = ()
 ) -> Experiment:
-    """Return the run of a test: its command and throttles on the identified rig, its mean leak from half time on."""
+    """Build the run of a test: its command and throttles on the identified rig, its mean leak from half time on."""
     return Experiment.of(
         rig=BENCH_RIG,
         command=condition.command,
@@ -65,7 +65,7 @@ def leak_test(
 
 
 def experiments(kind: Runs, half: float, quick: bool) -> list[tuple[Condition, Experiment]]:
-    """Return the tests of Appendix C with their runs; of a drift two draws each, one where it is `quick`."""
+    """Build the runs of the tests of Appendix C; of a drift two draws each, one where it is `quick`."""
     runs = []
     for draw, condition in product(range(2 if kind == "drift" and not quick else 1), APPENDIX_C):
         drifts = drawn_drifts(condition.number, half, draw) if kind == "drift" else ()
@@ -75,7 +75,7 @@ def experiments(kind: Runs, half: float, quick: bool) -> list[tuple[Condition, E
 
 
 def _at_half_time(experiment: Experiment) -> str:
-    """Return what happens at half time in words."""
+    """Describe the change at half time in words."""
     if experiment.leaks:
         return "leak opened"
     end = np.array(experiment.duration)
@@ -84,7 +84,7 @@ def _at_half_time(experiment: Experiment) -> str:
 
 
 def detail_rms(recording: Recording, parts: Sequence[tuple[float, float]]) -> dict[str, dict[str, tuple[float, ...]]]:
-    """Return the RMS of d1..d4 [psi] and d3d4 [psi^2] of both chambers' pressures within each part (from, to) [s].
+    """Compute the RMS of d1..d4 [psi] and d3d4 [psi^2] of both chambers within each part (from, to) [s].
 
     A part is narrowed by the transform's reach on both sides, so that no coefficient saw anything outside of it.
     """
@@ -98,7 +98,7 @@ def detail_rms(recording: Recording, parts: Sequence[tuple[float, float]]) -> di
 
 
 def pressure_range(values: Array) -> float:
-    """Return the 5 to 95 % range of a pressure."""
+    """Compute the 5 to 95 % range of a pressure."""
     return float(np.ptp(np.percentile(values, [5.0, 95.0])))
 
 
@@ -118,9 +118,9 @@ COLUMNS = (
 def row_of(
     condition: Condition, happened: str, mean_leak_lpm: float, ranges_MPa: Sequence[float], rms: Pairs
 ) -> tuple[Cell, ...]:
-    """Return a test as a row under `COLUMNS`; `sheet_of` reads the RMS back."""
-    of, values = condition, (rms[chamber][name][k] for chamber, name, k, _ in _RMS_COLUMNS)
-    return (of.number, of.command, of.closed_pct, happened, mean_leak_lpm, *ranges_MPa, *values)
+    """Build the row of a test under `COLUMNS`; `sheet_of` reads the RMS back."""
+    values = (rms[chamber][name][k] for chamber, name, k, _ in _RMS_COLUMNS)
+    return (condition.number, condition.command, condition.closed_pct, happened, mean_leak_lpm, *ranges_MPa, *values)
 
 
 def column(table: ThesisTable, head: str) -> Array:
@@ -136,7 +136,7 @@ def sheet_of(table: ThesisTable) -> DataSheet:
 
 
 def runs_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate the 41 tests with their leak from half time on, with nothing happening there, or with a drift.
+    """Tabulate the 41 tests with their leak from half time on, without a change there, or with a drift.
 
     With the leak the first test of each condition is proved by halving the step, except in a quick reproduction.
     """
@@ -155,9 +155,11 @@ def runs_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
         "No run is proved (quick)." if context.quick else "One test of each condition is proved by halving the step."
     )
     drifts = texts_of("cases.toml")["drifts"]
-    bounds = {part: "{:g} to {:g} %".format(*(100 * share for share in own["shares"])) for part, own in drifts.items()}
-    of = note(f"runs-{kind}", proof=proof, **bounds)
-    notes = note("runs", rig=BENCH_RIG, half=half, quick=" (quick)" if context.quick else "", of=of)
+    bounds = {
+        name: "{:g} to {:g} %".format(*(100 * share for share in part["shares"])) for name, part in drifts.items()
+    }
+    detail_note = note(f"runs-{kind}", proof=proof, **bounds)
+    notes = note("runs", rig=BENCH_RIG, half=half, quick=" (quick)" if context.quick else "", of=detail_note)
     return (item.table(rows, notes, COLUMNS, resolved=all(proved.values()) if proved else None),)
 
 

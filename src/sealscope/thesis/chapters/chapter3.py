@@ -1,4 +1,4 @@
-"""Chapter 3: what Fourier, short-time Fourier and wavelet transforms show of a signal (Figs. 3.2-3.4, eqs. 3.3-3.6)."""
+"""Chapter 3: Fourier, short-time Fourier and wavelet transforms of a signal (Figs. 3.2-3.4, eqs. 3.3-3.6)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sealscope.thesis.chapters.chapter4.cases import visible_pressure
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Claim, Figure, FigureCurve, Image, Number, Panel, Role
-from sealscope.thesis.engine.texts import judged, note
+from sealscope.thesis.engine.texts import judge_claim, note
 
 #: Sampling rate [Hz] of the signals of this chapter; the thesis gives none.
 RATE = 1000.0
@@ -28,21 +28,21 @@ _OCTAVES = 24
 
 
 def mother_wavelet() -> tuple[Array, Array, Array]:
-    """Return scaling function, mother wavelet and their time [samples] by the cascade of db8's filters."""
+    """Compute scaling function, mother wavelet and their time [samples] by the cascade of db8's filters."""
     phi, psi, t = discrete_wavelet(WAVELET).wavefun(level=10)
     return phi, psi, t
 
 
 def wavelet_spectrum(omega: Array) -> np.ndarray:
-    """Return the Fourier transform of the mother wavelet at `omega` [rad per unit of its own time].
+    """Compute the Fourier transform of the mother wavelet at `omega` [rad per unit of its own time].
 
     Psi(w) = G(w/2)/sqrt(2) prod_(j>=2) H(w/2^j)/sqrt(2), with H and G the synthesis filters' responses
     sum_k taps_k exp(-j w k); unit l2 norm.
     Source: Daubechies, Ten Lectures on Wavelets (1992), eqs. (5.1.17), (6.2.2).
     """
 
-    def response(taps: list[float], at: Array) -> np.ndarray:
-        return np.asarray(np.polynomial.polynomial.polyval(np.exp(-1j * at), np.array(taps, dtype=np.float64)))
+    def response(taps: list[float], omega: Array) -> np.ndarray:
+        return np.asarray(np.polynomial.polynomial.polyval(np.exp(-1j * omega), np.array(taps, dtype=np.float64)))
 
     filters = discrete_wavelet(WAVELET)
     product = response(filters.rec_hi, omega / 2.0) / np.sqrt(2.0)
@@ -52,7 +52,7 @@ def wavelet_spectrum(omega: Array) -> np.ndarray:
 
 
 def wavelet_centre() -> tuple[float, float]:
-    """Return the centre of |psi|^2 in the wavelet's own time and the frequency [1 per unit] of its peak response."""
+    """Compute the centre of |psi|^2 in the wavelet's own time and the frequency [1 per unit] of its peak response."""
     _, psi, t = mother_wavelet()
     omega = np.linspace(0.1, 12.0, 12000)
     peak = omega[np.abs(wavelet_spectrum(omega)).argmax()]
@@ -60,12 +60,12 @@ def wavelet_centre() -> tuple[float, float]:
 
 
 def scales_for(frequencies: Array) -> Array:
-    """Return the scales a [s] whose wavelet responds most at `frequencies` [Hz]."""
+    """Compute the scales a [s] whose wavelet responds most at `frequencies` [Hz]."""
     return np.asarray(wavelet_centre()[1] / np.asarray(frequencies, dtype=np.float64))
 
 
 def continuous_transform(x: Array, rate: float, scales: Array) -> Array:
-    """Return CWT(a, b) of samples `x` (n,) at `rate` [Hz] for each scale a [s], (scales, n) [unit of x times s^0.5].
+    """Compute CWT(a, b) of samples `x` (n,) at `rate` [Hz] for scales a [s]: (scales, n) [unit of x times s^0.5].
 
     CWT(a, b) = integral of x(t) |a|^(-1/2) psi((t - b)/a) dt, eqs. (3.4), (3.6), with the sum over samples as the
     integral. b is the middle of the wavelet (the centre of its energy). The record is mirrored at its ends.
@@ -84,7 +84,7 @@ def continuous_transform(x: Array, rate: float, scales: Array) -> Array:
 
 
 def inverse_gain(frequencies: Array, weight: float = 2.0) -> Array:
-    """Return the gain at `frequencies` [Hz] of transforming by eq. (3.4) and back with the measure da db / |a|^weight.
+    """Compute the gain at `frequencies` [Hz] of eq. (3.4) and its inverse with the measure da db / |a|^weight.
 
     gain(w) = integral over a > 0 of a^(1 - weight) |Psi(a w)|^2 da, over 12 decades of scales about the frequencies.
     With weight 2 it is the same at every frequency (the wavelet's admissibility constant), and dividing by it gives
@@ -98,12 +98,12 @@ def inverse_gain(frequencies: Array, weight: float = 2.0) -> Array:
 
 
 def two_tone_signal(t: Array) -> Array:
-    """Return x(t) = cos(2 pi 100 t) + 0.5 sin(2 pi 30 t), eq. (3.3)."""
+    """Compute x(t) = cos(2 pi 100 t) + 0.5 sin(2 pi 30 t), eq. (3.3)."""
     return np.asarray(np.cos(2.0 * np.pi * 100.0 * t) + 0.5 * np.sin(2.0 * np.pi * 30.0 * t))
 
 
 def amplitude_spectrum(x: Array, rate: float) -> tuple[Array, Array, Array]:
-    """Return frequencies [Hz], amplitudes and phases [degree, of a cosine] of real samples by the DFT of eq. (3.2)."""
+    """Compute frequencies [Hz], amplitudes and phases [degree, of a cosine] of real samples by the DFT of eq. (3.2)."""
     spectrum = np.asarray(np.fft.rfft(x), dtype=np.complex128) * (2.0 / x.size)
     spectrum[0] /= 2.0
     if x.size % 2 == 0:
@@ -113,7 +113,7 @@ def amplitude_spectrum(x: Array, rate: float) -> tuple[Array, Array, Array]:
 
 
 def short_time_spectrum(x: Array, rate: float, window: int, step: int) -> tuple[Array, Array, Array]:
-    """Return the windows' middles [s], frequencies [Hz] and amplitudes (frequencies, times) under a Hann window."""
+    """Compute the windows' middles [s], frequencies [Hz] and amplitudes (frequencies, times) under a Hann window."""
     starts = np.arange(0, x.size - window + 1, step)
     shape = np.hanning(window + 1)[:-1]
     pieces = np.lib.stride_tricks.sliding_window_view(x, window)[starts] * shape
@@ -122,9 +122,9 @@ def short_time_spectrum(x: Array, rate: float, window: int, step: int) -> tuple[
     return np.asarray((starts + window / 2.0) / rate, dtype=np.float64), frequency, np.asarray(values)
 
 
-def nearest(values: Array, wanted: float) -> int:
-    """Return the index of the value nearest to `wanted`."""
-    return int(np.abs(values - wanted).argmin())
+def nearest(values: Array, target: float) -> int:
+    """Find the index of the value nearest to `target`."""
+    return int(np.abs(values - target).argmin())
 
 
 def two_tones(context: Context, item: Item) -> tuple[Figure, ...]:
@@ -132,12 +132,12 @@ def two_tones(context: Context, item: Item) -> tuple[Figure, ...]:
     t = np.arange(round(RATE)) / RATE
     x = two_tone_signal(t)
     frequency, amplitude, phase = amplitude_spectrum(x, RATE)
-    at = {tone: nearest(frequency, tone) for tone, _ in TONES}
+    places = {tone: nearest(frequency, tone) for tone, _ in TONES}
     numbers = []
-    for tone, k in at.items():
+    for tone, k in places.items():
         numbers.append(Number(f"amplitude at {tone:g} Hz", float(amplitude[k])))
         numbers.append(Number(f"phase at {tone:g} Hz (cosine 0)", float(phase[k]), "deg"))
-    numbers.append(Number("largest amplitude elsewhere", float(np.delete(amplitude, list(at.values())).max())))
+    numbers.append(Number("largest amplitude elsewhere", float(np.delete(amplitude, list(places.values())).max())))
     early, lines = t < 0.2, amplitude > 1e-6
     signal = FigureCurve(t[early], x[early], "x(t), eq. 3.3", "reference")
     spectrum = FigureCurve(frequency[lines], amplitude[lines], "2 |X[n]| / N, eq. 3.2", "reference", "stems")
@@ -189,13 +189,13 @@ def four_views(context: Context, item: Item) -> tuple[Figure, ...]:
     frequency, amplitude, _ = amplitude_spectrum(x, RATE)
     window = 128
     times, bins, short = short_time_spectrum(x, RATE, window, 4)
-    wanted = np.geomspace(10.0, 450.0, 64)
-    wavelet = np.abs(continuous_transform(x, RATE, scales_for(wanted)))
+    frequencies = np.geomspace(10.0, 450.0, 64)
+    wavelet = np.abs(continuous_transform(x, RATE, scales_for(frequencies)))
     signal = FigureCurve(t, x, "x(t)", "reference")
     spectrum = FigureCurve(frequency, amplitude, "2 |X[n]| / N", "reference")
     of_time = "t [s]", "frequency [Hz]"
     by_window = f"(c) Short-time Fourier transform, window {window / RATE * 1e3:g} ms"
-    by_wavelet = Image(t, wanted, wavelet, "|CWT| [s^0.5]")
+    by_wavelet = Image(t, frequencies, wavelet, "|CWT| [s^0.5]")
     panels = (
         Panel("t [s]", "x(t) [1]", (signal,), "(a) Time"),
         Panel("frequency [Hz]", "amplitude [1]", (spectrum,), "(b) Frequency"),
@@ -203,7 +203,7 @@ def four_views(context: Context, item: Item) -> tuple[Figure, ...]:
         Panel(*of_time, title="(d) Wavelet transform, db8", image=by_wavelet, log_y=True),
     )
     pulse = (t > 0.6) & (t < 0.9)
-    high = nearest(wanted, 300.0)
+    high = nearest(frequencies, 300.0)
     numbers = (
         Number("resolution in frequency of (b)", RATE / x.size, "Hz"),
         Number("resolution in frequency of (c)", RATE / window, "Hz"),
@@ -214,7 +214,7 @@ def four_views(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def _width(t: Array, values: Array) -> float:
-    """Return the root mean square half-width [s] of the energy of `values` about its middle, near its largest value."""
+    """Compute the rms half-width [s] of the energy of `values` about its middle, near its largest value."""
     near = np.abs(t - t[values.argmax()]) < 0.1
     weight = values[near] ** 2 / np.sum(values[near] ** 2)
     middle = np.sum(t[near] * weight)
@@ -226,24 +226,24 @@ def pressure_scalogram(context: Context, item: Item) -> tuple[Figure, ...]:
     run = context.run(Experiment.of(command=_COMMAND, duration=20.0, leak=f"{_LEAK} from {_ONSET:g} s"))
     t = run.recorded.t
     rate = 1.0 / float(t[1] - t[0])
-    wanted = np.geomspace(12.0, 0.45 * rate, 64)
+    frequencies = np.geomspace(12.0, 0.45 * rate, 64)
     recorded, clean = run.recorded["p_A"] * 1e-6, run.outputs["p_A"] * 1e-6
     leak = ((_ONSET, "leak"),)
     panels = [Panel("t [s]", "p_A [MPa]", (FigureCurve(t, recorded, "p_A, recorded", "A"),), "(a) Record", leak)]
     for letter, p_A, name in (("b", recorded, "as recorded"), ("c", clean, "without the instruments' noise")):
-        rows = continuous_transform(p_A, rate, scales_for(wanted))
+        rows = continuous_transform(p_A, rate, scales_for(frequencies))
         middles, power = _running_rms(t, rows, round(_BLOCK * rate))
-        image = Image(middles, wanted, power * 1e3, "rms of CWT [kPa s^0.5]")
+        image = Image(middles, frequencies, power * 1e3, "rms of CWT [kPa s^0.5]")
         title = f"({letter}) CWT(a, b), db8, {name}"
         panels.append(Panel("t [s]", "frequency [Hz]", title=title, marks=leak, image=image, log_y=True))
     parts: tuple[tuple[Role, np.ndarray], ...] = (("no leak", (t > _SETTLED) & (t < _ONSET)), ("leak", t >= _ONSET))
     strength = {role: np.sqrt(np.mean(rows[:, part] ** 2, axis=1)) * 1e3 for role, part in parts}
-    curves = tuple(FigureCurve(wanted, strength[role], role, role) for role, _ in parts)
+    curves = tuple(FigureCurve(frequencies, strength[role], role, role) for role, _ in parts)
     panels.append(Panel("frequency [Hz]", "rms of CWT [kPa s^0.5]", curves, "(d) rms of (c) over time", log_x=True))
-    fast = wanted > 30.0
+    fast = frequencies > 30.0
     ring = int(np.flatnonzero(fast)[strength["no leak"][fast].argmax()])
     numbers = (
-        Number("frequency of the ringing", float(wanted[ring]), "Hz"),
+        Number("frequency of the ringing", float(frequencies[ring]), "Hz"),
         Number("rms at the ringing, leak / no leak", float(strength["leak"][ring] / strength["no leak"][ring])),
         Number("mean leak", run.mean_leak_lpm, "L/min"),
     )
@@ -252,7 +252,7 @@ def pressure_scalogram(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def _running_rms(t: Array, rows: Array, size: int) -> tuple[Array, Array]:
-    """Return the middles [s] of blocks of `size` samples and the rms of each row of `rows` in them, (rows, blocks)."""
+    """Compute the middles [s] of blocks of `size` samples and the rms of each row in them, (rows, blocks)."""
     whole = t.size // size * size
     power = np.sqrt(np.mean(rows[:, :whole].reshape(rows.shape[0], -1, size) ** 2, axis=2))
     return t[:whole].reshape(-1, size).mean(axis=1), power
@@ -270,9 +270,9 @@ def _fourier() -> Iterator[Claim]:
     elsewhere = np.delete(amplitude, tones).max()
     present = np.abs(amplitude[tones] - [height for _, height in TONES]).max() < 1e-6
     high, low = amplitude[tones]
-    yield judged("3.1", [present, elsewhere < 1e-6], high=high, low=low, elsewhere=elsewhere)
+    yield judge_claim("3.1", [present, elsewhere < 1e-6], high=high, low=low, elsewhere=elsewhere)
     high, low = phase[tones]
-    yield judged("3.2", np.abs(phase[tones]) < 1e-3, high=high, low=low)
+    yield judge_claim("3.2", np.abs(phase[tones]) < 1e-3, high=high, low=low)
 
 
 def _wavelet() -> Iterator[Claim]:
@@ -280,17 +280,17 @@ def _wavelet() -> Iterator[Claim]:
     step = float(t[1] - t[0])
     mean, energy = float(psi.sum() * step), float((psi**2).sum() * step)
     moments, peak = vanishing_moments(psi, t), wavelet_centre()[1]
-    yield judged("3.3", [abs(mean) < 1e-9], length=t[-1] - t[0], mean=mean, moments=moments, peak=peak)
+    yield judge_claim("3.3", [abs(mean) < 1e-9], length=t[-1] - t[0], mean=mean, moments=moments, peak=peak)
     scaled = []
     for a in (0.5, 2.0, 10.0):
         fine = np.arange(0.0, a * t[-1], a * step)
         scaled.append(float(np.sum((a**-0.5 * np.interp(fine / a, t, psi)) ** 2) * a * step))
-    tests = [abs(of - 1.0) < 1e-3 for of in (energy, *scaled)]
-    yield judged("3.4", tests, energy=energy, scaled=", ".join(f"{of:.4f}" for of in scaled))
+    tests = [abs(value - 1.0) < 1e-3 for value in (energy, *scaled)]
+    yield judge_claim("3.4", tests, energy=energy, scaled=", ".join(f"{value:.4f}" for value in scaled))
     gains = (inverse_gain(np.array([30.0, 100.0]), weight) for weight in (2.0, 0.0))
     (constant, at_100), (printed, printed_at_100) = gains
     spread, falls = constant / at_100, printed / printed_at_100
-    yield judged("3.5", [abs(falls - 1.0) < 0.01], printed=falls, proper=spread, constant=constant)
+    yield judge_claim("3.5", [abs(falls - 1.0) < 0.01], printed=falls, proper=spread, constant=constant)
 
 
 def _leak(context: Context) -> Claim:
@@ -305,4 +305,4 @@ def _leak(context: Context) -> Claim:
     }
     moved = ["{}: mean {:+.0f} Pa, peak {:+.0f} Pa, range {:+.0f} Pa".format(name, *of) for name, of in changes.items()]
     tests = [change < -visible_pressure() for of in changes.values() for change in of]
-    return judged("3.6", tests, leak=leaking.mean_leak_lpm, moved="; ".join(moved))
+    return judge_claim("3.6", tests, leak=leaking.mean_leak_lpm, moved="; ".join(moved))

@@ -39,7 +39,7 @@ NOMINAL_LPM: dict[str, float] = {"large": 0.0150, "medium": 0.0100, "small": 0.0
 
 @dataclass(frozen=True)
 class ShownTest:
-    """One of the ten tests: its section, command and level, when the leak opened [s], and which figures show it.
+    """One of the ten tests: its section, command and level, when the leak opened [s], and its figures.
 
     `first` is the number of its first figure; `inputs`: how many figures show command, speed and displacement (two:
     whole and close-up).
@@ -54,7 +54,7 @@ class ShownTest:
 
     @property
     def parts(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """The settled part without and the part with the leak [s]."""
+        """Begin and end [s] of the settled part without and the part with the leak."""
         return (SETTLING, self.half), (self.half, 2 * self.half)
 
     @property
@@ -82,7 +82,7 @@ TESTS: dict[str, ShownTest] = {row[0]: ShownTest(*row) for row in texts_of("case
 
 
 def spec_of(test: ShownTest) -> Experiment:
-    """Return the run of a test: its command and throttles on the identified rig, its mean leak from half time."""
+    """Build the run of a test: its command and throttles on the identified rig, its mean leak from half time."""
     return leak_test(test.condition, test.half, test.condition.number)
 
 
@@ -101,13 +101,13 @@ class FigureView:
         return self.run.recorded
 
     def notes(self) -> str:
-        """Return which row of Appendix C was simulated, and how it was chosen."""
+        """Name the simulated row of Appendix C, and the reason for its choice."""
         row = self.test.condition
-        others = ", ".join(str(of.number) for of in self.test.candidates if of is not row)
-        chosen = note("chosen-row", row=row.number, others=others) if others else ""
+        other_rows = ", ".join(str(candidate.number) for candidate in self.test.candidates if candidate is not row)
+        chosen = note("chosen-row", row=row.number, others=other_rows) if other_rows else ""
         leak, half = self.run.mean_leak_lpm, self.test.half
-        given = {"rig": BENCH_RIG, "row": row.number, "closed": row.closed_pct, "leak": leak, "half": half}
-        return note("shown-test", chosen=chosen, **given)
+        values = {"rig": BENCH_RIG, "row": row.number, "closed": row.closed_pct, "leak": leak, "half": half}
+        return note("shown-test", chosen=chosen, **values)
 
     def _panel(self, label: str, *curves: FigureCurve) -> Panel:
         return Panel("t [s]", label, curves, marks=((self.test.half, "leak opens"),), x_range=self.span)
@@ -124,7 +124,7 @@ class FigureView:
         return [before, self._curve(y, "leak", "leak", t, low=half)]
 
     def _halves(self) -> tuple[tuple[Mask, str], ...]:
-        """Which samples belong to the part without and to the part with the leak, the start left out."""
+        """Select the samples of the part without and of the part with the leak, the start left out."""
         t, half = self.recording.t, self.test.half
         return ((t >= SETTLING) & (t < half), _WHEN[0]), (t >= half, _WHEN[1])
 
@@ -220,7 +220,7 @@ def figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def windowed(recording: Recording, chamber: str) -> tuple[Array, dict[str, Array]]:
-    """Return the centres [s] of the windows of 1000 samples, 500 apart, and the RMS of d1..d4, d3d4 in each."""
+    """Compute the centres [s] of the windows of 1000 samples, 500 apart, and the RMS of d1..d4, d3d4 in each."""
     transformed = details(recording[chamber] / PSI)
     inside = transformed.inside()
     ends, rows = windowed_rms(transformed.quantities()[:, inside], first=inside.start)
@@ -230,7 +230,7 @@ def windowed(recording: Recording, chamber: str) -> tuple[Array, dict[str, Array
 
 @dataclass(frozen=True)
 class ShownMeasures:
-    """What one simulated test shows, each pair without and with the leak.
+    """Measures of one simulated test, each pair without and with the leak.
 
     `rms`: as Appendix C; `speed`: RMS of the motor's speed [rad/s]; `drift`: of the piston's mean [mm/s]; `velocity`:
     RMS of the piston's [mm/s]; `range_MPa`: 5 to 95 % range of each chamber's true pressure; `step_s`: where a single
@@ -247,7 +247,7 @@ class ShownMeasures:
 
 
 def best_step(t: Array, y: Array, least: int = 5) -> float:
-    """Return the time at which a single step fits a series best by least squares, halfway between two points.
+    """Find the time at which a single step fits a series best by least squares, halfway between two points.
 
     At least `least` points stay on each side.
     """
@@ -270,14 +270,14 @@ def measure_test(context: Context, test: ShownTest, leak: bool = True) -> ShownM
     starts = [stop - np.floor((stop - start) / period) * period for start, stop in test.parts]
     parts = [(t >= start) & (t < stop) for start, (_, stop) in zip(starts, test.parts, strict=True)]
 
-    def pair(values: Array, of: Callable[[Array], float] = rms) -> tuple[float, float]:
-        return of(values[parts[0]]), of(values[parts[1]])
+    def pair(values: Array, statistic: Callable[[Array], float] = rms) -> tuple[float, float]:
+        return statistic(values[parts[0]]), statistic(values[parts[1]])
 
     steps = {}
     for chamber in CHAMBERS:
         centres, curves = windowed(recording, chamber)
-        settled = centres >= SETTLING
-        steps[chamber] = best_step(centres[settled], curves["d3"][settled])
+        late = centres >= SETTLING
+        steps[chamber] = best_step(centres[late], curves["d3"][late])
     before, after = (sine_fit(t[part], run.outputs["x"][part], test.omega).slope * 1e3 for part in parts)
     return ShownMeasures(
         test=test,

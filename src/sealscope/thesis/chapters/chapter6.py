@@ -19,7 +19,7 @@ from sealscope.simulation.integrate import Trajectory, trajectory
 from sealscope.thesis.engine.context import Context, first_table
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, Claim, Figure, FigureCurve, Panel, Role, ThesisTable
-from sealscope.thesis.engine.texts import judged, note
+from sealscope.thesis.engine.texts import judge_claim, note
 from sealscope.thesis.sines import sine_fit
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -60,7 +60,7 @@ DUTY = f"position {1e3 * AMPLITUDE} mm sin({OMEGA!r}t)"
 
 
 def conductance(lpm: float, rig: Rig) -> float:
-    """Return the conductance [m^3/(s Pa)] of a leak of `lpm` [L/min] under the load."""
+    """Compute the conductance [m^3/(s Pa)] of a leak of `lpm` [L/min] under the load."""
     return lpm * LITRE_PER_MINUTE / (LOAD / rig.cylinder.A_A)
 
 
@@ -70,18 +70,18 @@ def _rig(name: str = RIG) -> Rig:
 
 
 def _swing(run: Trajectory, late: NDArray[np.bool_], f: float) -> float:
-    """Return the amplitude [m] of the piston at f [Hz] over some samples."""
+    """Compute the amplitude [m] of the piston at f [Hz] over some samples."""
     return float(np.abs(sine_fit(run.t[late], run["x"][late], 2 * math.pi * f).amplitudes[0]))
 
 
-def drawn(run: Trajectory) -> Array:
-    """Return the flow [m^3/s] that a servo valve without overlap draws from its supply: that of its open edge."""
+def supply_flow(run: Trajectory) -> Array:
+    """Compute the flow [m^3/s] that a servo valve without overlap draws from its supply: that of its open edge."""
     return np.asarray(np.where(run["x_s"] > 0.0, run["Q_A"], -run["Q_B"]))
 
 
 @dataclass(frozen=True)
 class ControlledRig:
-    """A rig whose friction and stiffness are off, with a leak of `lpm` [L/min], under the load.
+    """A rig whose friction and stiffness differ from the assumed ones, with a leak of `lpm` [L/min], under the load.
 
     `controller`: its name, "" for an open loop, `ideal` for one that knows the leak; `values`: other parameters.
     """
@@ -92,7 +92,7 @@ class ControlledRig:
     values: tuple[tuple[str, float], ...] = ()
 
     def run(self, command: str, duration: float, load: str = "0 N") -> Trajectory:
-        """Run a command under a load in words beside `LOAD`."""
+        """Run a command under `LOAD` and a further load."""
         rig = _rig(self.rig)
         size, controller = conductance(self.lpm, rig), None
         if self.controller:
@@ -110,46 +110,46 @@ class ControlledRig:
         return trajectory(experiment, experiment.leaks)
 
     def on_duty(self, load: str = "0 N") -> tuple[Trajectory, Array]:
-        """Return a run of five cycles of the duty, and which of its samples are of the last two."""
+        """Run five cycles of the duty; return the run, and which of its samples are of the last two."""
         run = self.run(DUTY, 5.0 * CYCLE, load)
         return run, np.asarray((run.t >= 3.0 * CYCLE) & (run.t < 5.0 * CYCLE))
 
     def stiffness(self) -> float:
-        """Return |F/x| [N/mm] in hold at `STIFF_AT`."""
+        """Compute |F/x| [N/mm] in hold at `STIFF_AT`."""
         run = self.run("position 0 mm sin(t)", 16.0, f"{STIFF_FORCE} N sin({2 * math.pi * STIFF_AT!r}t)")
         late = run.t >= 8.0
         return STIFF_FORCE / (1e3 * _swing(run, late, STIFF_AT))
 
     def bandwidth(self) -> float:
-        """Return the frequency [Hz] from which on small targets are missed by -3 dB of themselves or more."""
+        """Find the frequency [Hz] from which on small targets are missed by -3 dB of themselves or more."""
         terms = [f"{1e3 * SMALL_SPEED / (2 * math.pi * f):.6f} mm sin({2 * math.pi * f!r}t)" for f in SMALL_AT]
         run = self.run(f"position {' + '.join(terms)}", 14.0)
         late = run.t >= 8.0
         omegas = 2 * np.pi * np.array(SMALL_AT)
         target = -1j * SMALL_SPEED / omegas
         missed = np.abs(sine_fit(run.t[late], run["x"][late], *omegas).amplitudes / target - 1.0)
-        beyond = np.flatnonzero(missed > math.sqrt(0.5))
-        if beyond.size == 0 or beyond[0] == 0:
-            return math.inf if beyond.size == 0 else SMALL_AT[0]
-        k = int(beyond[0])
+        too_fast = np.flatnonzero(missed > math.sqrt(0.5))
+        if too_fast.size == 0 or too_fast[0] == 0:
+            return math.inf if too_fast.size == 0 else SMALL_AT[0]
+        k = int(too_fast[0])
         share = (math.sqrt(0.5) - missed[k - 1]) / (missed[k] - missed[k - 1])
         return float(SMALL_AT[k - 1] * (SMALL_AT[k] / SMALL_AT[k - 1]) ** share)
 
     def efficiencies(self) -> tuple[float, float]:
-        """Return two efficiencies on the duty against a damper alone.
+        """Compute two efficiencies on the duty against a damper alone.
 
         The damper's work over the electrical energy, and over the hydraulic energy that the cylinder takes: what a
         supply without losses would give to the valve at its pressure, or the pump to its ports.
         """
         run, late = replace(self, values=(("F_l", 0.0), ("d_load", DAMPER))).on_duty()
-        flow = drawn(run) if _rig(self.rig).valve.spool == "present" else run["Q_1"]
+        flow = supply_flow(run) if _rig(self.rig).valve.spool == "present" else run["Q_1"]
         work = DAMPER * float(np.mean(run["v"][late] ** 2))
-        taken = flow * (run["p_1"] - run["p_2"])
-        return work / float(np.mean((run["V"] * run["i"])[late])), work / float(np.mean(taken[late]))
+        power = flow * (run["p_1"] - run["p_2"])
+        return work / float(np.mean((run["V"] * run["i"])[late])), work / float(np.mean(power[late]))
 
 
 def tracking(run: Trajectory, late: Array) -> tuple[float, float, float]:
-    """Return the rms error [mm], the electrical energy of a cycle [J] and the flow made good [L/min] on the duty."""
+    """Compute the rms error [mm], the electrical energy of a cycle [J] and the compensated flow [L/min] on the duty."""
     error = AMPLITUDE * np.sin(OMEGA * run.t[late]) - run["x"][late]
     flow = 0.0 if run.compensated is None else float(np.mean(run.compensated[late])) / LITRE_PER_MINUTE
     return 1e3 * float(np.sqrt(np.mean(error**2))), float(np.mean(run["V"][late] * run["i"][late])) * CYCLE, flow
@@ -179,21 +179,21 @@ def _against_the_leak(
     for column in columns:
         curves = []
         for names, role in roles.items():
-            own = [row for row in table.rows if row[: len(names)] == names]
+            group = [row for row in table.rows if row[: len(names)] == names]
             places = len(names), table.columns.index(column)
-            x, y = (np.array([float(row[k] or 0.0) for row in own]) for k in places)
+            x, y = (np.array([float(row[k] or 0.0) for row in group]) for k in places)
             curves.append(FigureCurve(np.maximum(x, 0.001), y, ", ".join(names), role))
         panels.append(Panel("leak [L/min], none drawn at 0.001", column, tuple(curves), log_x=True, log_y=log_y))
     return Figure(f"{table.id}-figure", title, tuple(panels), notes=table.notes)
 
 
 def open_loop_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate where the piston's middle goes with a leak, in the open loop and in two closed ones."""
+    """Tabulate the drift of the piston's middle with a leak, in the open loop and in two closed ones."""
     rows: list[tuple[Cell, ...]] = []
     u, still = 7.3, 0.0
 
     def drift(run: Trajectory, first: int) -> float:
-        """Return by how much the middle of a cycle moves to the next [mm/min]."""
+        """Compute the shift of the middle of a cycle to the next [mm/min]."""
         middle = [float(np.mean(run["x"][_cycle_of(run.t, k)])) for k in (first, first + 1)]
         return 60e3 * (middle[1] - middle[0]) / CYCLE
 
@@ -249,16 +249,16 @@ def valve_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...
         loop = ControlledRig(name, lpm, rig)
         run, late = loop.on_duty()
         error, energy, _ = tracking(run, late)
-        given = float(np.mean((run["Q_1"] * (run["p_1"] - run["p_2"]))[late])) * CYCLE  # by the pump
-        efficiencies = [100 * of for of in loop.efficiencies()]
-        rows.append((source, name, lpm, error, loop.bandwidth(), loop.stiffness(), energy, given, *efficiencies))
+        pump_energy = float(np.mean((run["Q_1"] * (run["p_1"] - run["p_2"]))[late])) * CYCLE  # by the pump
+        efficiencies = [100 * share for share in loop.efficiencies()]
+        rows.append((source, name, lpm, error, loop.bandwidth(), loop.stiffness(), energy, pump_energy, *efficiencies))
     notes = note("valve", rig=RIG, other=VALVE_RIG, mm=1e3 * AMPLITUDE, f=1 / CYCLE, load=LOAD, damper=DAMPER)
     table, title = item.table(rows, notes), "Energy and stiffness, pump and valve"
     return table, _against_the_leak(table, title, _VALVE_ROLES, (_ENERGY, _STIFF), log_y=True)
 
 
 def _rows(context: Context, item: str, names: int) -> dict[tuple[str, ...], dict[float, list[float]]]:
-    """Return the numbers of a table by its first `names` columns and by the leak [L/min] in the next."""
+    """Read the numbers of a table by its first `names` columns and by the leak [L/min] in the next."""
     by: dict[tuple[str, ...], dict[float, list[float]]] = {}
     for row in first_table(context, item).rows:
         leak, *numbers = (float(cell) for cell in row[names:] if isinstance(cell, int | float))
@@ -274,7 +274,7 @@ def judge_claims(context: Context, item: Item) -> tuple[Claim, ...]:
 def _disturbance(context: Context) -> Claim:
     rows = {lpm: row[2:4] for lpm, row in _rows(context, "sec-6.2-open-loop", 0)[()].items() if lpm > 0}
     texts = [f"{lpm:g} L/min: {opened:.1f} open, {closed:.2f} closed" for lpm, (opened, closed) in rows.items()]
-    return judged("6.2.1", [abs(closed) < STILL for _, closed in rows.values()], drifts="; ".join(texts))
+    return judge_claim("6.2.1", [abs(closed) < STILL for _, closed in rows.values()], drifts="; ".join(texts))
 
 
 def _tolerance(context: Context) -> Claim:
@@ -288,7 +288,9 @@ def _tolerance(context: Context) -> Claim:
         texts.append(f"{lpm:g} L/min: {a[0]:.3f} and {b[0]:.3f} mm, {a[3]:.0f} and {b[3]:.0f} N/mm")
     unharmed = tolerant[0.0][0] == error and tolerant[0.0][4] == 0.0
     unless = "" if unharmed else " NOT"
-    return judged("6.2.2", [*tests, unharmed], pairs="; ".join(texts), error=error, stiffness=stiffness, unless=unless)
+    return judge_claim(
+        "6.2.2", [*tests, unharmed], pairs="; ".join(texts), error=error, stiffness=stiffness, unless=unless
+    )
 
 
 def _load(context: Context) -> Claim:
@@ -299,7 +301,7 @@ def _load(context: Context) -> Claim:
         spread[name] = min(errors), max(errors)
     least, worst = max(low for low, _ in spread.values()), [high for _, high in spread.values()]
     text = "; ".join(f"{name} {low:.3f} to {high:.3f} mm" for name, (low, high) in spread.items())
-    return judged("6.2.3", [max(worst) > APART * min(worst)], spread=text, near=max(worst) < 0.4, least=least)
+    return judge_claim("6.2.3", [max(worst) > APART * min(worst)], spread=text, near=max(worst) < 0.4, least=least)
 
 
 def _valves(context: Context) -> Claim:
@@ -308,4 +310,4 @@ def _valves(context: Context) -> Claim:
     largest = max(pump)
     tests = [max(ends) > APART * min(ends) for ends in ((pump[0.0][k], valve[0.0][k]) for k in (5, 0))]
     worn = pump[largest], valve[largest]
-    return judged("6.2.4", tests, pump=pump[0.0], valve=valve[0.0], largest=largest, worn=worn)
+    return judge_claim("6.2.4", tests, pump=pump[0.0], valve=valve[0.0], largest=largest, worn=worn)

@@ -1,4 +1,4 @@
-"""Table 5.1 counted anew, from the sheet and from simulation, with what the thesis's rule says where nothing leaks."""
+"""Table 5.1 counted anew, from the sheet and from simulation, with the false alarms of its rules."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Rule:
     printed: str = ""
 
     def fires(self, sheet: DataSheet) -> Fires:
-        """Return which tests it fires in, (n,)."""
+        """Return which tests the rule fires in, (n,)."""
         moved = [sheet.log_change(chamber, detail) * DIRECTION[chamber] > 0 for chamber, detail in self.details]
         return np.asarray(np.all(moved, axis=0))
 
@@ -50,7 +50,7 @@ def _rules(name: str) -> tuple[Rule, ...]:
 CLAIMED, UNCLAIMED = _rules("claimed"), _rules("unclaimed")
 
 
-def _counted(fires: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
+def _count_cells(fires: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
     """Count as "k/n", share of the tests and its interval [%]."""
     if fires is None:
         return None, None, None, None
@@ -91,7 +91,7 @@ def counts(measured: DataSheet | None, leak: DataSheet, still: DataSheet, drift:
     rows: list[tuple[Cell, ...]] = []
     for name, (printed, fires) in rules.items():
         sheets = (measured, leak, still, drift)
-        cells = [cell for sheet in sheets for cell in _counted(None if sheet is None else fires(sheet))]
+        cells = [cell for sheet in sheets for cell in _count_cells(None if sheet is None else fires(sheet))]
         rows.append((name, printed or None, *cells, 100.0 * float(fires(leak).mean() - fires(drift).mean())))
     return rows
 
@@ -113,7 +113,7 @@ def column_tests(sheet: DataSheet) -> list[tuple[Cell, ...]]:
 
 
 def d1_threshold(sheet: DataSheet, chamber: str, either_side: bool = False) -> float:
-    """Return the log change that noise alone passes with probability `FALSE_ALARMS`, to one side or to either.
+    """Compute the log change that noise alone passes with probability `FALSE_ALARMS`, to one side or to either.
 
     From the scatter of d1 about zero: ``1.645 rms(log change of d1)``, or 1.960 times it. d1 is noise: no leak moves
     it, so its changes between the halves are those of a leak-free rig. The other details can only scatter more.
@@ -123,12 +123,12 @@ def d1_threshold(sheet: DataSheet, chamber: str, either_side: bool = False) -> f
 
 
 def drift_threshold(drift: DataSheet, chamber: str, detail: str) -> float:
-    """Return the log change, in the chamber's direction, that drift-only tests pass with probability `FALSE_ALARMS`."""
+    """Compute the log change, in the chamber's direction, that drift alone passes with probability `FALSE_ALARMS`."""
     return float(np.quantile(drift.log_change(chamber, detail) * DIRECTION[chamber], 1.0 - FALSE_ALARMS))
 
 
 def thresholds(measured: DataSheet | None, leak: DataSheet, drift: DataSheet) -> list[tuple[Cell, ...]]:
-    """Count how many leaks each single-detail rule still finds with a threshold instead of the bare sign."""
+    """Count the leaks that each single-detail rule still finds with a threshold instead of the bare sign."""
     rows: list[tuple[Cell, ...]] = []
     for rule in (*CLAIMED[:6], *UNCLAIMED):
         ((chamber, detail),) = rule.details
@@ -139,14 +139,16 @@ def thresholds(measured: DataSheet | None, leak: DataSheet, drift: DataSheet) ->
                 row += [None] * 5
                 continue
             fires = sheet.log_change(chamber, detail) * DIRECTION[chamber] > limit
-            row += [100.0 * float(np.expm1(DIRECTION[chamber] * limit)), *_counted(fires)]
+            row += [100.0 * float(np.expm1(DIRECTION[chamber] * limit)), *_count_cells(fires)]
         rows.append(tuple(row))
     return rows
 
 
 def table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate Table 5.1 with its controls, the sign tests of every column, and the rules with a threshold."""
-    (leak_runs, leak), (_, still), (_, drift) = (simulated_sheet(context, of) for of in ("leak", "no-leak", "drift"))
+    (leak_runs, leak), (_, still), (_, drift) = (
+        simulated_sheet(context, runs) for runs in ("leak", "no-leak", "drift")
+    )
     measured, resolved = context.sheet, leak_runs.resolved
     sheets = dict(zip(_SOURCES, (measured, leak, still, drift), strict=True))
     tests = [(name, *row) for name, sheet in sheets.items() if sheet is not None for row in column_tests(sheet)]

@@ -22,12 +22,12 @@ def detection(context: Context, item: Item) -> tuple[Claim, ...]:
 
 
 def _place(claim: Claim) -> tuple[int, ...]:
-    """Where a claim stands: the abstract first, then by the numbers of its id."""
+    """Return the order of a claim: the abstract first, then by the numbers of its id."""
     return tuple(int(number) for number in re.findall(r"[0-9]+", claim.id.replace("claim-a", "claim-0")))
 
 
 def table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate every claim of every chapter, and how many have each verdict."""
+    """Tabulate every claim of every chapter, and count the verdicts."""
     claims = [product for name in item.needs for product in context.product(name) if isinstance(product, Claim)]
     claims.sort(key=_place)
     verdicts = Counter(claim.verdict for claim in claims)

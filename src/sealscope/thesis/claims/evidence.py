@@ -1,4 +1,4 @@
-"""What the claims on detection are judged by: sheets and shown tests, counts, correlations and regressions.
+"""Evidence for the claims on detection: sheets and shown tests, counts, correlations and regressions.
 
 The regressions leave out the answer: a left-out test takes no part in its own prediction.
 """
@@ -22,7 +22,7 @@ from sealscope.thesis.chapters.chapter5 import TESTS, ShownMeasures, measure_tes
 from sealscope.thesis.chapters.success_rates import DIRECTION, Rule, column_tests
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.products import Claim, ThesisTable
-from sealscope.thesis.engine.texts import judged
+from sealscope.thesis.engine.texts import judge_claim
 from sealscope.thesis.sheet import APPENDIX_C, DataSheet
 
 NO_SHEET = "the thesis's data sheet was not given"
@@ -32,7 +32,7 @@ SENSITIVE = ("d3", "d4", "d3d4")
 
 @dataclass(frozen=True, eq=False)
 class ClaimEvidence:
-    """The data that the claims are judged by.
+    """The data by which the claims are judged.
 
     The measured sheet (None: not given), the simulated sheets with leak, with none and with drift only, the table of
     the first, the ten tests of chapter 5 by section, and the first of them without its leak.
@@ -65,7 +65,7 @@ SheetTest = Callable[[DataSheet], Iterable[Finding]]
 
 @dataclass(frozen=True)
 class SheetClaim:
-    """How a claim is judged by a sheet.
+    """A claim's test on a sheet.
 
     `test` gives the findings, written after `head` with `joint` between them; `values` of the other texts of the claim.
     """
@@ -76,36 +76,36 @@ class SheetClaim:
     values: Callable[[ClaimEvidence, DataSheet], Mapping[str, Any]] = lambda evidence, sheet: {}
 
     def judge(self, evidence: ClaimEvidence, id: str, kind: str = "") -> Claim:
-        """Judge by the measured sheet; the same test on the simulated sheet stands beside it."""
+        """Judge by the measured sheet, and state the same test on the simulated sheet."""
 
         def findings(sheet: DataSheet) -> tuple[str, list[bool]]:
             texts, parts = zip(*self.test(sheet), strict=True)
-            return self.head + self.joint.join(texts), [part for of in parts for part in of]
+            return self.head + self.joint.join(texts), [part for found in parts for part in found]
 
         result, parts = (NO_SHEET, []) if evidence.measured is None else findings(evidence.measured)
         values = self.values(evidence, evidence.measured or evidence.leak)
-        return judged(id, parts, kind, sheet=result, simulation=findings(evidence.leak)[0], **values)
+        return judge_claim(id, parts, kind, sheet=result, simulation=findings(evidence.leak)[0], **values)
 
 
 def fired(sheet: DataSheet, rule: Rule) -> str:
-    """Return `k/n = share %` of the tests that a rule fires in, with its exact 95 % interval."""
+    """Format `k/n = share %` of the tests that a rule fires in, with its exact 95 % interval."""
     return counted_share(rule.fires(sheet))
 
 
 def counted_share(tests: Sequence[bool] | np.ndarray) -> str:
-    """Return `k/n = share % (low to high)` of the tests that are true, with the exact 95 % interval."""
+    """Format `k/n = share % (low to high)` of the tests that are true, with the exact 95 % interval."""
     k, n = int(np.sum(tests)), len(tests)
     low, high = clopper_pearson(k, n)
     return f"{k}/{n} = {100 * k / n:.1f} % ({100 * low:.0f} to {100 * high:.0f} %)"
 
 
 def in_percent(change: Array | float) -> float:
-    """Return a log change, or the mean of several, in percent."""
+    """Convert a log change, or the mean of several, to percent."""
     return float(100.0 * np.expm1(np.mean(change)))
 
 
 def corrected_p(sheet: DataSheet) -> dict[tuple[str, str], float]:
-    """Return the sign-test p of every column, corrected (Holm) for all ten."""
+    """Compute the sign-test p of every column, corrected (Holm) for all ten."""
     return {(str(row[0]), str(row[1])): float(row[-2]) for row in column_tests(sheet)}  # type: ignore[arg-type]
 
 
@@ -124,20 +124,20 @@ def correlated(r: float, n: int, controls: int = 0) -> bool:
 
 
 def condition_columns() -> Array:
-    """Return the operating condition as columns (n, commands + 1): one indicator a command, and the closed share."""
+    """Build the operating condition as columns (n, commands + 1): one indicator a command, and the closed share."""
     commands = sorted({row.command for row in APPENDIX_C})
     indicators = [[float(row.command == command) for command in commands] for row in APPENDIX_C]
     return np.column_stack([np.array(indicators), [row.closed_pct / 100.0 for row in APPENDIX_C]])
 
 
-def partial_correlation(x: Array, y: Array, given: Array) -> float:
-    """Return the correlation of what is left of `x` and `y`, (n,), after least squares on `given`, (n, k)."""
-    left = [v - given @ np.linalg.lstsq(given, v, rcond=None)[0] for v in (x, y)]
-    return float(np.corrcoef(left[0], left[1])[0, 1])
+def partial_correlation(x: Array, y: Array, controls: Array) -> float:
+    """Compute the correlation of `x` and `y`, (n,), after least squares of both on `controls`, (n, k)."""
+    residuals = [v - controls @ np.linalg.lstsq(controls, v, rcond=None)[0] for v in (x, y)]
+    return float(np.corrcoef(residuals[0], residuals[1])[0, 1])
 
 
 def left_out_r2(columns: Array, y: Array) -> float:
-    """Return R^2 of least squares on `columns`, (n, k), with each test predicted from the others.
+    """Compute R^2 of least squares on `columns`, (n, k), with each test predicted from the others.
 
     ``1 - sum (r_i/(1 - h_i))^2 / sum (y_i - mean y)^2`` with residuals r and leverages h. Source: Allen,
     Technometrics 16 (1974) 125-127, doi 10.1080/00401706.1974.10489157.
@@ -148,7 +148,7 @@ def left_out_r2(columns: Array, y: Array) -> float:
 
 
 def change_columns(sheet: DataSheet) -> Array:
-    """Return a column of ones and the six log changes of Table 5.1, (n, 7)."""
+    """Build a column of ones and the six log changes of Table 5.1, (n, 7)."""
     changes = [sheet.log_change(chamber, name) for chamber in CHAMBERS for name in SENSITIVE]
     return np.column_stack([np.ones_like(changes[0]), *changes])
 

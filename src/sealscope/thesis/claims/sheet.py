@@ -1,4 +1,4 @@
-"""What chapter 5, the abstract and the conclusions say of leaks, details and success rates, judged by the sheet."""
+"""Claims of chapter 5, the abstract and the conclusions on leaks, details and success rates, judged by the sheet."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from sealscope.thesis.claims.evidence import (
     moves_beyond_chance,
 )
 from sealscope.thesis.engine.products import Claim
-from sealscope.thesis.engine.texts import judged, texts_of
+from sealscope.thesis.engine.texts import judge_claim, texts_of
 from sealscope.thesis.sheet import APPENDIX_C, DataSheet, mean_leaks
 
 _N = len(APPENDIX_C)
@@ -39,7 +39,7 @@ _A_D3, _, _A_BOTH, _, _, _B_BOTH, _TOGETHER = CLAIMED
 
 
 def _past_noise(sheet: DataSheet, chamber: str, name: str) -> np.ndarray:
-    """Return the tests whose change moves in the chamber's direction beyond what d1 does one time in twenty."""
+    """Select the tests whose change moves in the chamber's direction beyond d1's of one time in twenty."""
     return np.asarray(sheet.log_change(chamber, name) * DIRECTION[chamber] > d1_threshold(sheet, chamber))
 
 
@@ -51,12 +51,12 @@ def _controls(evidence: ClaimEvidence, rule: Rule) -> str:
 
 
 def _cell(rule: Rule, where: str) -> SheetClaim:
-    chance, printed = 0.5 ** len(rule.details), [int(of) for of in re.findall(r"\d+", rule.printed)]
+    chance, printed = 0.5 ** len(rule.details), [int(rate) for rate in re.findall(r"\d+", rule.printed)]
 
     def test(sheet: DataSheet) -> Iterator[Finding]:
         fires = rule.fires(sheet)
         p = at_least(int(fires.sum()), fires.size, chance)
-        near = any(abs(100.0 * float(fires.mean()) - of) <= 1.0 for of in printed)
+        near = any(abs(100.0 * float(fires.mean()) - rate) <= 1.0 for rate in printed)
         yield f"{fired(sheet, rule)}; p = {p:.2g} against chance of {100 * chance:g} %", [near, p < 0.05 / 10]
 
     def values(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, str]:
@@ -68,7 +68,7 @@ def _cell(rule: Rule, where: str) -> SheetClaim:
         return {
             "where": where,
             "name": rule.name,
-            "rates": " or ".join(f"{of} %" for of in printed),
+            "rates": " or ".join(f"{rate} %" for rate in printed),
             "product": product if rule is _TOGETHER else "",
             "controls": _controls(evidence, rule),
         }
@@ -97,7 +97,7 @@ def _levels(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _smallest(rules: tuple[Rule, ...]) -> SheetTest:
-    """Find what the test with the smallest mean leak does by the rules."""
+    """Build the test of the rules on the test with the smallest mean leak."""
 
     def test(sheet: DataSheet) -> Iterator[Finding]:
         row = int(np.argmin(mean_leaks()))
@@ -147,15 +147,15 @@ def _at_5_percent(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
 
 
 def _trend(chamber: str) -> SheetTest:
-    """Find how the changes of a chamber's details go with the mean leak."""
-    leak, given, direction = mean_leaks(), ev.condition_columns(), DIRECTION[chamber]
+    """Build the test of the changes of a chamber's details against the mean leak."""
+    leak, conditions, direction = mean_leaks(), ev.condition_columns(), DIRECTION[chamber]
 
     def test(sheet: DataSheet) -> Iterator[Finding]:
         for name in SENSITIVE:
             change = sheet.log_change(chamber, name)
-            raw, left = float(np.corrcoef(change, leak)[0, 1]), ev.partial_correlation(change, leak, given)
-            beyond = correlated(raw, _N), correlated(left, _N, given.shape[1])
-            parts = [r * direction > 0 and of for r, of in zip((raw, left), beyond, strict=True)]
+            raw, left = float(np.corrcoef(change, leak)[0, 1]), ev.partial_correlation(change, leak, conditions)
+            significant = correlated(raw, _N), correlated(left, _N, conditions.shape[1])
+            parts = [r * direction > 0 and passes for r, passes in zip((raw, left), significant, strict=True)]
             yield f"{name}: {raw:+.2f}, at equal condition {left:+.2f}", parts
 
     return test
@@ -163,7 +163,7 @@ def _trend(chamber: str) -> SheetTest:
 
 def _predicted(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
     columns = {"condition": ev.condition_columns(), "changes": ev.change_columns(sheet)}
-    return {name: ev.left_out_r2(of, mean_leaks()) for name, of in columns.items()}
+    return {name: ev.left_out_r2(design, mean_leaks()) for name, design in columns.items()}
 
 
 def _sensitive(sheet: DataSheet) -> Iterator[Finding]:
@@ -228,12 +228,12 @@ _CLAIMS: dict[str, SheetClaim] = {
 
 
 def claims(evidence: ClaimEvidence) -> Iterator[Claim]:
-    """Judge the claims of the abstract, sections 5.6 and 5.7, Table 5.1, and chapter 6 on what was detected."""
+    """Judge the claims of the abstract, sections 5.6 and 5.7, Table 5.1, and chapter 6 on detection."""
     for number, rule in enumerate(CLAIMED, start=1):
         where = "section 5.6" if rule is _TOGETHER else f"Fig. 5.{89 + number}"
         yield _cell(rule, where).judge(evidence, f"5.4.{number}", "5.4")
-    for id, of in _CLAIMS.items():
-        yield of.judge(evidence, id)
+    for id, claim in _CLAIMS.items():
+        yield claim.judge(evidence, id)
 
 
 #: What is said of a chamber's curves: that they fall, or only that they change.
@@ -243,39 +243,45 @@ Statement = Literal["fall", "change"]
 def levels() -> Iterator[Claim]:
     """Judge claims 5.1.1 to 5.1.3."""
     spans = {level: [row.mean_leak_lpm for row in APPENDIX_C if row.level == level] for level in NOMINAL_LPM}
-    texts = [f"{level} {min(of):.4f} to {max(of):.4f}, mean {np.mean(of):.4f}" for level, of in spans.items()]
-    within = [min(of) <= NOMINAL_LPM[level] <= max(of) for level, of in spans.items()]
-    apart = [min(upper) > max(lower) for upper, lower in itertools.pairwise(spans.values())]
-    yield judged("5.1.1", [*within, *apart], levels="; ".join(texts))
+    texts = [
+        f"{level} {min(values):.4f} to {max(values):.4f}, mean {np.mean(values):.4f}" for level, values in spans.items()
+    ]
+    within = [min(values) <= NOMINAL_LPM[level] <= max(values) for level, values in spans.items()]
+    separate = [min(upper) > max(lower) for upper, lower in itertools.pairwise(spans.values())]
+    yield judge_claim("5.1.1", [*within, *separate], levels="; ".join(texts))
     nominal, real = (
-        (of[1] / of[0], of[2] / of[1], of[3] / of[0])
-        for of in (list(NOMINAL_LPM.values()), [float(np.mean(of)) for of in spans.values()])
+        (values[1] / values[0], values[2] / values[1], values[3] / values[0])
+        for values in (list(NOMINAL_LPM.values()), [float(np.mean(values)) for values in spans.values()])
     )
-    tests = [abs(of / stated - 1.0) < 0.25 for of, stated in zip(nominal, (0.5, 0.5, 1.0 / 16.0), strict=True)]
-    shown = {name: ", ".join(f"{of:.2f}" for of in ratios) for name, ratios in (("nominal", nominal), ("real", real))}
-    yield judged("5.1.2", tests, **shown)
+    tests = [abs(ratio / stated - 1.0) < 0.25 for ratio, stated in zip(nominal, (0.5, 0.5, 1.0 / 16.0), strict=True)]
+    shown = {
+        name: ", ".join(f"{ratio:.2f}" for ratio in ratios) for name, ratios in (("nominal", nominal), ("real", real))
+    }
+    yield judge_claim("5.1.2", tests, **shown)
     named = [row for row in APPENDIX_C if row.level == "large" and row.command == "3 sin(4t)"]
     rows = ", ".join(f"row {row.number}: {row.mean_leak_lpm:g} L/min" for row in named)
     same = [f"{row.number} ({row.command}, {row.level})" for row in APPENDIX_C if row.mean_leak_lpm == 0.0087]
     tests = [any(abs(row.mean_leak_lpm - 0.0087) < 5e-5 for row in named)]
-    yield judged("5.1.3", tests, rows=rows, same=", ".join(same))
+    yield judge_claim("5.1.3", tests, rows=rows, same=", ".join(same))
 
 
 def _on_rows(
     sheet: DataSheet, test: ShownTest, chamber: str, names: Sequence[str], statement: Statement
 ) -> tuple[str, list[bool]]:
-    """Test the changes of the named details in the row taken for the test, and count them over all rows it can be."""
+    """Test the changes of the named details in the row taken for the test, and count them over all possible rows."""
     row, limit = test.condition.number - 1, d1_threshold(sheet, chamber, either_side=statement == "change")
     changes = {name: sheet.log_change(chamber, name) for name in names}
-    beyond = {name: -of > limit if statement == "fall" else np.abs(of) > limit for name, of in changes.items()}
-    changed = ", ".join(f"{name} {in_percent(float(of[row])):+.1f} %" for name, of in changes.items())
+    fires = {
+        name: -change > limit if statement == "fall" else np.abs(change) > limit for name, change in changes.items()
+    }
+    changed = ", ".join(f"{name} {in_percent(float(change[row])):+.1f} %" for name, change in changes.items())
     reach = f"{in_percent(-limit):+.1f} %" + ("" if statement == "fall" else f" or {in_percent(limit):+.1f} %")
     text = f"row {row + 1}: {changed}; noise reaches {reach}"
-    others = [candidate.number - 1 for candidate in test.candidates]
-    if len(others) > 1:
-        counts = ", ".join(f"{name} {np.sum(of[others])}" for name, of in beyond.items())
-        text += f"; of the {len(others)} rows it can be, beyond noise: {counts}"
-    return text, [bool(of[row]) for of in beyond.values()]
+    rows = [candidate.number - 1 for candidate in test.candidates]
+    if len(rows) > 1:
+        counts = ", ".join(f"{name} {np.sum(change[rows])}" for name, change in fires.items())
+        text += f"; of the {len(rows)} rows it can be, beyond noise: {counts}"
+    return text, [bool(change[row]) for change in fires.values()]
 
 
 def curves(evidence: ClaimEvidence) -> Iterator[Claim]:
@@ -287,10 +293,10 @@ def curves(evidence: ClaimEvidence) -> Iterator[Claim]:
         text = NO_SHEET
         if evidence.measured is not None:
             text, parts = _on_rows(evidence.measured, test, chamber, names, statement)
-        beyond = [name for name, part in zip(names, parts, strict=False) if part]
-        sides = {"beyond": beyond, "within": [name for name in names if name not in beyond]}
+        beyond_names = [name for name, part in zip(names, parts, strict=False) if part]
+        sides = {"beyond": beyond_names, "within": [name for name in names if name not in beyond_names]}
         first = test.first + test.inputs + 2 + (0 if chamber == "p_A" else 3)  # the details; their RMS two on
-        yield judged(
+        yield judge_claim(
             f"5.2.{number}",
             parts,
             "5.2",
@@ -305,7 +311,7 @@ def curves(evidence: ClaimEvidence) -> Iterator[Claim]:
             sheet=text,
             simulated=", ".join(f"{name} {100 * (rms[name][1] / rms[name][0] - 1):+.1f} %" for name in names),
             limits=", ".join(f"{in_percent(limit):+.1f} %" for limit in limits),
-            beyond_or_within=" and ".join(f"{_and(of)} {side}" for side, of in sides.items() if of),
+            beyond_or_within=" and ".join(f"{_and(details)} {side}" for side, details in sides.items() if details),
             **({} if parts else {"why": NO_SHEET}),
         )
 

@@ -1,1 +1,1 @@
-"""What can be reproduced, and how items are made, kept and made anew."""
+"""The list of items to reproduce, and their making, storing and remaking."""

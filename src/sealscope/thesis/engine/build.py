@@ -1,4 +1,4 @@
-"""Reproduce chosen items of the thesis into a folder: only what changed, in parallel, and resumable."""
+"""Reproduce chosen items of the thesis into a folder: only changed ones, in parallel, and resumable."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class ItemStatus:
 
 @dataclass(frozen=True)
 class ItemRow:
-    """What a results folder stores of an item, under the `key` of what it rests on; or its `error` with the trace."""
+    """The stored result of an item, under the `key` of its inputs; or its `error` with the trace."""
 
     id: str
     key: str
@@ -66,7 +66,7 @@ class ItemRow:
     trace: str = ""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the row as plain JSON values."""
+        """Convert the row to plain JSON values."""
         return asdict(self)
 
 
@@ -85,7 +85,7 @@ def reproduce(
     publish: Publish | None = None,
     progress: Progress = lambda ended, total, in_work: None,
 ) -> dict[str, ItemStatus]:
-    """Make the chosen items (see `items.select_items`) and what they need, draw them, and return the status of all.
+    """Make and draw the chosen items (`items.select_items`) and their needs; return the status of all items.
 
     `jobs` processes (default: one a core, at most two; 1: in this process); `sheet`: folder of the data sheet (see
     `sheet.find_sheet`); `publish` draws. What was made by an earlier call from the same sources stays. A failed item
@@ -101,8 +101,8 @@ def reproduce(
     keys = _keys(every, sheet_key, quick, publish is not None)
     kept = inner_folder(place, "kept")
     with locked(kept, _WHAT):
-        rows = read_rows(kept, partial(_row, keys), _WHAT, loads)
-        statuses = {item.id: _status(item, data, rows.get(item.id), place) for item in every}
+        made_rows = read_rows(kept, partial(_row, keys), _WHAT, loads)
+        statuses = {item.id: _status(item, data, made_rows.get(item.id), place) for item in every}
         waiting = {item.id: item for item in chosen if statuses[item.id].state == "not made"}
         runs = inner_folder(kept, "runs")
         try:
@@ -110,23 +110,27 @@ def reproduce(
             runs.mkdir()
         except OSError as error:
             raise InputError(f"a folder of runs must be emptied, got: {error.strerror or error} ({runs})") from None
-        task = partial(_made, quick, data, publish, place, runs)
+        task = partial(_make_item, quick, data, publish, place, runs)
         in_work: list[str] = []
         ended = 0
 
-        def begun(ready: Sequence[str]) -> Iterator[_Job]:
+        def start_jobs(ready: Sequence[str]) -> Iterator[_Job]:
             for name in ready:
                 in_work.append(name)
                 progress(ended, len(waiting), in_work)
                 done = {need: statuses[need] for need in waiting[name].needs}
-                yield waiting[name], keys[name], {n: of.products for n, of in done.items() if of.state != "failed"}
+                yield (
+                    waiting[name],
+                    keys[name],
+                    {n: status.products for n, status in done.items() if status.state != "failed"},
+                )
 
         order = TopologicalSorter({name: waiting.keys() & item.needs for name, item in waiting.items()})
         order.prepare()
         while order.is_active():
             ready = sorted(order.get_ready(), key=list(waiting).index)
-            made = _rows(carried_out(task, begun(ready), min(process_count(jobs), len(ready))))
-            for row in stored(kept, made, _WHAT, allow_nan=True):
+            ended_rows = _rows(carried_out(task, start_jobs(ready), min(process_count(jobs), len(ready))))
+            for row in stored(kept, ended_rows, _WHAT, allow_nan=True):
                 state: State = "failed" if row.error else "made"
                 statuses[row.id] = ItemStatus(waiting[row.id], state, row.error, row.products, row.files)
                 in_work.remove(row.id)
@@ -138,27 +142,27 @@ def reproduce(
 
 
 def _keys(items: Sequence[Item], sheet: str, quick: bool, drawn: bool) -> dict[str, str]:
-    """Return the digest of what each item's products and drawings rest on."""
+    """Compute the digest of the inputs of each item's products and drawings."""
     by_id, sources = {item.id: item for item in items}, sources_key()
 
     @cache
     def key(name: str) -> str:
         item = by_id[name]
-        own = [item.id, item.title, item.make.__module__, item.make.__qualname__, item.inputs]
-        return digest([own, [*map(key, item.needs)], sheet if item.of_sheet else "", drawn, quick, sources])
+        identity = [item.id, item.title, item.make.__module__, item.make.__qualname__, item.inputs]
+        return digest([identity, [*map(key, item.needs)], sheet if item.of_sheet else "", drawn, quick, sources])
 
     return {name: key(name) for name in by_id}
 
 
 def _row(keys: Mapping[str, str], tree: Any) -> ItemRow | None:
-    """Return the row of an item as it is now, None for one of other sources."""
+    """Read the stored row of an item, None for one of other sources."""
     if not isinstance(tree, dict):
         raise ValueError("no row")
     return as_type(ItemRow, tree) if keys.get(str(tree.get("id"))) == tree.get("key") else None
 
 
 def _status(item: Item, sheet: DataSheet | None, row: ItemRow | None, folder: Path) -> ItemStatus:
-    """Return the status of an item as the folder has it: kept, left out or not made."""
+    """Determine the status of an item in the folder: kept, left out or not made."""
     if item.needs_sheet and sheet is None:
         return ItemStatus(item, "left out", MISSING)
     if row is None or row.error or not all(names_a_file(folder / name) for name in row.files):
@@ -173,7 +177,7 @@ def _rows(ended: Generator[tuple[_Job, ItemRow | None], None, None]) -> Generato
             yield row or ItemRow(item.id, key, error="the process that made it died")
 
 
-def _made(
+def _make_item(
     quick: bool, sheet: DataSheet | None, publish: Publish | None, folder: Path, runs: Path, job: _Job
 ) -> ItemRow:
     """Make and draw an item; the row holds the reason of a failure."""
@@ -202,15 +206,15 @@ def _thinned(product: Product | Claim) -> Product | Claim:
 
 
 def undrawn(product: Product | Claim) -> Product | Claim:
-    """Leave out what is drawn: the arrays."""
+    """Remove the arrays, which are drawn, from a product."""
     return replace(product, panels=()) if isinstance(product, Figure) else product
 
 
 @cache
 def sources_key() -> str:
-    """Digest of the sources of this package and the versions of the libraries under it: what every result rests on."""
+    """Compute a digest of this package's sources and its libraries' versions, on which all results depend."""
     package = Path(__file__).parents[2]
     kinds = (".py", ".toml", ".csv", ".j2", ".css", ".js")
     sources = files_digest(path for path in sorted(package.rglob("*")) if path.suffix in kinds)
-    versions = {of.name.lower(): of.version for of in metadata.distributions()}
+    versions = {distribution.name.lower(): distribution.version for distribution in metadata.distributions()}
     return digest([sources, [versions.get(name.lower()) for name in _LIBRARIES]])

@@ -1,4 +1,4 @@
-"""What a maker of figures and tables may ask for: simulated runs, the measured sheet, other items, a quick version."""
+"""Inputs of a maker of figures and tables: simulated runs, the measured sheet, other items, a quick version."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class SimulatedRun:
 
 
 def simulated_run(experiment: Experiment, prove: bool) -> SimulatedRun:
-    """Simulate a run, and `prove` it: halve its step, too; one that diverged or is not resolved says so."""
+    """Simulate a run, and `prove` it at half the step; a diverged or unresolved run is marked so."""
     try:
         simulated = simulate_experiment(replace(experiment, allow_unresolved=True), prove=prove)
     except SimulationFailed as error:
@@ -60,7 +60,7 @@ def simulated_run(experiment: Experiment, prove: bool) -> SimulatedRun:
 
 @dataclass(frozen=True)
 class Context:
-    """Handed to the maker of the item of that name.
+    """The inputs handed to an item's maker.
 
     `sheet`: the measured sheet, None where it was not given or the item does not use it; `products`: those of the items
     that it needs, by id, without those that failed; `runs`: folder of this call's runs, which its processes share.
@@ -74,7 +74,7 @@ class Context:
     runs: Path
 
     def run(self, experiment: Experiment, *, prove: bool = True) -> SimulatedRun:
-        """Return the run of an experiment, simulated once while other processes that want it wait."""
+        """Return the run of an experiment, simulated once while other processes that need it wait."""
         path = self.runs / f"{experiment.key()}{'-proved' if prove else ''}.run"
         with locked(path.with_suffix(".lock"), None):
             if not path.exists():
@@ -84,7 +84,7 @@ class Context:
         return run
 
     def product(self, name: str) -> Products:
-        """Return the products of an item among the needs, () where it is left out."""
+        """Return the products of a needed item, () where it is left out."""
         if name not in self.needs:
             raise InputError(f"{self.name} must name {name} among its needs to ask for its products")
         if name not in self.products:

@@ -1,4 +1,4 @@
-"""The list of cases, figures, tables and claims under the thesis's own numbers (`items.toml`), and how each is made."""
+"""The list of cases, figures, tables and claims under the thesis's own numbers (`items.toml`), with their makers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sealscope.thesis.engine.texts import texts_of
 
 @dataclass(frozen=True)
 class Item:
-    """One thing that can be reproduced.
+    """One case, figure, table or claim that can be reproduced.
 
     `id`: the thesis's own number, such as "fig-4.22"; `make`: the function that makes its products; `inputs`: what the
     maker reads, by name; `uses_sheet`: it shows the thesis's data sheet where that is given, `needs_sheet`: it cannot
@@ -47,7 +47,7 @@ class Item:
     def figure(
         self, panels: Iterable[Panel], numbers: Iterable[Number] = (), resolved: bool | None = None, notes: str = ""
     ) -> Figure:
-        """Return the item's figure of these panels."""
+        """Make the item's figure of these panels."""
         return Figure(self.id, self.title, tuple(panels), tuple(numbers), self.claims, resolved, notes)
 
     def table(
@@ -60,19 +60,19 @@ class Item:
         title: str = "",
         resolved: bool | None = None,
     ) -> ThesisTable:
-        """Return the item's table of these rows; `tail`, `title`, `columns` of a further one beside it."""
+        """Make the item's table of these rows; `tail`, `title`, `columns` of a further one."""
         heads = tuple(columns) or self.columns
         return ThesisTable(
             self.id + tail, title or self.title, heads, tuple(rows), self.claims, resolved=resolved, notes=notes
         )
 
 
-_FIELDS = {of.name for of in fields(Item)}
+_FIELDS = {declared.name for declared in fields(Item)}
 
 
 @cache
 def collect() -> tuple[Item, ...]:
-    """Return the items of `items.toml`, in its order."""
+    """Read the items of `items.toml`, in its order."""
     return tuple(
         item for chapter, rows in texts_of("items.toml").items() for name, row in rows.items()
         for item in _items(name, int(chapter), row)
@@ -80,13 +80,15 @@ def collect() -> tuple[Item, ...]:
 
 
 def _items(name: str, chapter: int, row: Mapping[str, Any]) -> Iterator[Item]:
-    """Yield the item of a row, or each that the function named by `each` gives as id, title and inputs."""
-    given: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in row.items()}
-    known: dict[str, Any] = {key: given.pop(key) for key in row if key in _FIELDS}
+    """Yield the item of a row, or the items of the function named by `each` (id, title and inputs)."""
+    inputs_read: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else value for key, value in row.items()
+    }
+    known: dict[str, Any] = {key: inputs_read.pop(key) for key in row if key in _FIELDS}
     known["make"] = _function(known["make"])
     known["claims"] = tuple(f"claim-{claim}" for claim in known.get("claims", ()))
-    each = _function(given["each"])() if "each" in given else [(name, known.pop("title"), given)]
-    for id, title, inputs in each:
+    variants = _function(inputs_read["each"])() if "each" in inputs_read else [(name, known.pop("title"), inputs_read)]
+    for id, title, inputs in variants:
         yield Item(**{"kind": "figure", "chapter": chapter, **known, "id": id, "title": title, "inputs": inputs})
 
 
@@ -122,8 +124,8 @@ def select_items(items: Sequence[Item], patterns: Sequence[str]) -> tuple[Item, 
 
 
 def with_needed(items: Sequence[Item], chosen: Iterable[Item]) -> tuple[Item, ...]:
-    """Return the chosen items and all that they need, in the order of the list."""
-    by_id, wanted = {item.id: item for item in items}, {item.id for item in chosen}
-    while more := {needed for name in wanted for needed in by_id[name].needs} - wanted:
-        wanted |= more
-    return tuple(item for item in items if item.id in wanted)
+    """Add the items that the chosen ones need, in the order of the list."""
+    by_id, names = {item.id: item for item in items}, {item.id for item in chosen}
+    while more := {needed for name in names for needed in by_id[name].needs} - names:
+        names |= more
+    return tuple(item for item in items if item.id in names)

@@ -1,4 +1,4 @@
-"""What a reproduction gives: figures and tables as plain data, which `reporting` draws and prints."""
+"""Products of a reproduction: figures and tables as plain data, which `pages` draws and prints."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tu
         inner_folder(folder, name)
     files: list[str] = []
 
-    def put(name: str, content: bytes) -> None:
+    def put_file(name: str, content: bytes) -> None:
         with atomic_write(folder / name) as temporary:
             temporary.write_bytes(content)
         files.append(name)
@@ -43,16 +43,16 @@ def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tu
             raise ValueError(f"an id must be of a-z, 0-9, '.' and '-', got {product.id!r} ({item.id})")
         if isinstance(product, Figure):
             svg, png = draw(product)
-            put(f"figures/{product.id}.svg", svg)
-            put(f"figures/{product.id}.png", png)
+            put_file(f"figures/{product.id}.svg", svg)
+            put_file(f"figures/{product.id}.png", png)
             put_rows(f"tables/{product.id}.csv", figure_rows(product))
         elif isinstance(product, ThesisTable):
             put_rows(f"tables/{product.id}.csv", (product.columns, *product.rows))
     claims = [product for product in products if isinstance(product, Claim)]
     if claims:
-        taken = f"tables/{item.id}.csv" in files
+        has_table = f"tables/{item.id}.csv" in files
         heads = [field.name for field in fields(Claim)]
-        put_rows(f"tables/{item.id}{'-claims' if taken else ''}.csv", (heads, *map(astuple, claims)))
+        put_rows(f"tables/{item.id}{'-claims' if has_table else ''}.csv", (heads, *map(astuple, claims)))
     return tuple(files)
 
 

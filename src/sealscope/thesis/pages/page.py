@@ -76,7 +76,9 @@ def write_thesis_page(
         scripts=["templates/thesis.js"],
         title="The thesis reproduced",
         thesis=THESIS,
-        chapters=[(number, CHAPTERS.get(number, f"Chapter {number}"), of) for number, of in chapters.items()],
+        chapters=[
+            (number, CHAPTERS.get(number, f"Chapter {number}"), products) for number, products in chapters.items()
+        ],
         claims=list(claims.values()),
         bearing=bearing,
         counts=[(verdict, sum(claim.verdict == verdict for claim in claims.values())) for verdict in VERDICTS],
@@ -99,12 +101,14 @@ def write_thesis_page(
 def _page_product(
     status: ItemStatus, product: Figure | ThesisTable, picture: str, claims: dict[str, Claim]
 ) -> PageProduct:
-    about = [claims[name] for name in product.claims if name in claims]
+    its_claims = [claims[name] for name in product.claims if name in claims]
     links = [(Path(name).suffix[1:].upper(), name) for name in status.files if f"/{product.id}." in f"/{name}"]
     heading = caption(product.id, product.title)
     numbers = [number.name for number in product.numbers] if isinstance(product, Figure) else list(product.columns)
-    text = " ".join([product.id, heading, product.notes, *numbers, *(f"{claim.id} {claim.claim}" for claim in about)])
-    return PageProduct(product.id, heading, product, picture, links, about, text.casefold())
+    text = " ".join(
+        [product.id, heading, product.notes, *numbers, *(f"{claim.id} {claim.claim}" for claim in its_claims)]
+    )
+    return PageProduct(product.id, heading, product, picture, links, its_claims, text.casefold())
 
 
 def _picture(folder: Path, name: str) -> str:
@@ -118,7 +122,7 @@ def _picture(folder: Path, name: str) -> str:
 
 
 def cell(value: Any) -> str:
-    """Return a table's value as text: numbers to five digits, a dash for none."""
+    """Format a table's value: numbers to five digits, a dash for none."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "–"
     if isinstance(value, float):

@@ -1,4 +1,4 @@
-"""How thesis figures look: a style for each role, and labels with the thesis's symbols."""
+"""The look of thesis figures: a style for each role, and labels with the thesis's symbols."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sealscope.thesis.engine.products import Role
 
 
 class Style(NamedTuple):
-    """How a role is drawn: colour, dashes, width [pt], marker."""
+    """Line style of a role: colour, dashes, width [pt], marker."""
 
     colour: str
     dashes: tuple[float, ...] = ()
@@ -22,7 +22,7 @@ class Style(NamedTuple):
 
 _TABLES = tomllib.loads(Path(__file__).with_name("styles.toml").read_text(encoding="utf-8"))
 STYLES: dict[Role, Style] = {
-    role: Style(**{**own, "dashes": tuple(own.get("dashes", ()))}) for role, own in _TABLES["roles"].items()
+    role: Style(**{**row, "dashes": tuple(row.get("dashes", ()))}) for role, row in _TABLES["roles"].items()
 }
 #: Line styles that tell curves of one role in one panel apart.
 SAME_ROLE = tuple(map(tuple, _TABLES["again"]["dashes"]))
@@ -31,7 +31,7 @@ SETTINGS = Path(__file__).with_name("thesis.mplstyle")
 
 
 def caption(figure_id: str, title: str) -> str:
-    """Return the thesis's number and the title, such as "Fig. 4.22. Pressures in the chambers"."""
+    """Format the thesis's number and the title, such as "Fig. 4.22. Pressures in the chambers"."""
     kind, _, number = figure_id.partition("-")
     prefix = {"fig": "Fig.", "table": "Table", "eq": "Eq."}.get(kind)
     title = title.rstrip(".")

@@ -76,7 +76,7 @@ def _svg(canvas: Canvas, figure: Figure) -> bytes:
 
 
 def _png(canvas: Canvas, *, greys: bool) -> bytes:
-    """Few colours make the file small; a picture of greys keeps as many as a palette holds."""
+    """Draw as PNG with few colours, which makes the file small; a picture of greys keeps as many as a palette holds."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image as Picture
 
@@ -92,7 +92,7 @@ def _png(canvas: Canvas, *, greys: bool) -> bytes:
 
 
 def grid_of(panels: int) -> tuple[int, int]:
-    """Rows and columns of a figure's panels: one column up to five panels, two up to twelve, then three."""
+    """Choose rows and columns of a figure's panels: one column up to five panels, two up to twelve, then three."""
     columns = 1 if panels <= 5 else 2 if panels <= 12 else 3
     return -(-panels // columns), columns
 
@@ -106,12 +106,12 @@ def _canvas(figure: Figure) -> Canvas:
     from matplotlib.figure import Figure as Canvas
 
     rows, columns = grid_of(max(1, len(figure.panels)))
-    each = {1: 3.4, 2: 2.35, 3: 1.85, 4: 1.6}.get(rows, 1.35 if columns == 1 else 1.7)
+    row_height = {1: 3.4, 2: 2.35, 3: 1.85, 4: 1.6}.get(rows, 1.35 if columns == 1 else 1.7)
     shared = _shared_legend(figure.panels)
     lines = textwrap.wrap(caption(figure.id, figure.title), 122)
     mark = 0.34 if figure.resolved is False else 0.0
     foot, head = 0.16 * len(lines) + 0.14, 0.03 + mark + (0.24 if shared else 0.0)
-    height = rows * each + foot + head
+    height = rows * row_height + foot + head
     canvas = Canvas(figsize=(_WIDTH, height), dpi=DPI, layout="constrained")
     FigureCanvasAgg(canvas)
     engine: Any = canvas.get_layout_engine()
@@ -129,8 +129,8 @@ def _canvas(figure: Figure) -> Canvas:
     _hide_repeated_x_labels(axes, figure.panels)
     if shared:
         handles, labels = axes.flat[0].get_legend_handles_labels()
-        at = (0.5, 1 - (0.03 + mark) / height)
-        _plain(canvas.legend(handles, labels, loc="upper center", bbox_to_anchor=at, ncols=len(labels)))
+        anchor = (0.5, 1 - (0.03 + mark) / height)
+        _plain(canvas.legend(handles, labels, loc="upper center", bbox_to_anchor=anchor, ncols=len(labels)))
     canvas.text(
         0.012, 0.06 / height, "\n".join(map(typeset, lines)), va="bottom", ha="left", fontsize=8.2, linespacing=1.25
     )
@@ -182,7 +182,7 @@ def _panel(canvas: Canvas, ax: Axes, panel: Panel, *, mark_words: bool) -> None:
 
 
 def _plain_numbers(axis: Axis) -> None:
-    """Numbers such as 0.2, 1, 50 on a logarithmic axis; powers of ten over many decades."""
+    """Label a logarithmic axis with numbers such as 0.2, 1, 50, with powers of ten over many decades."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axis.set_minor_formatter(NullFormatter())
@@ -193,7 +193,7 @@ def _plain_numbers(axis: Axis) -> None:
 
 
 def visible(curve: FigureCurve, x_range: tuple[float, float] | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points of a curve as drawn: in the range with a neighbour on each side, a long line thinned."""
+    """Select the points of a curve as drawn: in the range with a neighbour on each side, a long line thinned."""
     x, y = np.asarray(curve.x, dtype=np.float64), np.asarray(curve.y, dtype=np.float64)
     if x_range is not None and x.size > _POINTS and np.all(np.diff(x) >= 0):
         first, last = np.searchsorted(x, sorted(x_range))
@@ -227,7 +227,7 @@ def _curve(ax: Axes, curve: FigureCurve, again: int, x_range: tuple[float, float
 
 
 def _shared_legend(panels: Sequence[Panel]) -> bool:
-    """Whether all panels show the same curves, so that one legend serves them."""
+    """Return whether all panels show the same curves, so that one legend serves them."""
     keys = {tuple((curve.label, curve.role, curve.kind) for curve in panel.curves) for panel in panels}
     labels = [curve.label for curve in panels[0].curves] if panels else []
     short = sum(map(len, labels)) + 6 * len(labels) <= 100
@@ -235,7 +235,7 @@ def _shared_legend(panels: Sequence[Panel]) -> bool:
 
 
 def _legend(ax: Axes, panel: Panel) -> None:
-    """Above the axes where it fits in a line, else beside them; a single curve that the axis names needs none."""
+    """Place the legend above the axes where it fits in a line, else beside them; none for a single named curve."""
     labels = [curve.label for curve in panel.curves if curve.label]
     if not labels or (len(panel.curves) == 1 and (not panel.title or labels[0] in panel.y_label)):
         return
@@ -248,13 +248,13 @@ def _legend(ax: Axes, panel: Panel) -> None:
 
 
 def _plain(legend: Legend) -> None:
-    """Lines in a legend as thick as an eye needs, however thin they are drawn."""
+    """Draw the lines in a legend thick enough to see, however thin the curves are."""
     for line in legend.get_lines():
         line.set_linewidth(max(1.3, line.get_linewidth()))
 
 
 def _hide_repeated_x_labels(axes: Any, panels: Sequence[Panel]) -> None:
-    """Where all panels share the x axis only the lowest of each column names it."""
+    """Label the x axis in the lowest panel of each column alone, where all panels share it."""
     shown = [ax for ax in axes.flat if ax.axison]
     same = {(ax.get_xlabel(), tuple(round(end, 9) for end in ax.get_xlim())) for ax in shown}
     if len(same) != 1 or any(panel.image is not None for panel in panels):

@@ -1,4 +1,4 @@
-"""The twelve cases of Tables 4.2 and 4.3, the readings of the equations, and the numbers that claims are judged by.
+"""The twelve cases of Tables 4.2 and 4.3, the readings of the equations, and the numbers behind the claims.
 
 A case is run with the thesis's own method and step ("literal") and converged; the equations are the same in both.
 """
@@ -59,7 +59,7 @@ CASES: dict[str, tuple[str, float | None]] = {
 
 @dataclass(frozen=True)
 class Reading:
-    """How the throttles' equations are read where the thesis contradicts itself or is silent.
+    """A reading of the throttles' equations where the thesis contradicts itself or is silent.
 
     `metering` "meter-out" (the text: throttled return on both sides) or "literal" (eqs. 4.11, 4.12 as printed);
     `closed_means` "area" (eq. 4.8) or "diameter" (the text's 3.75 mm of 5 mm); `d_line_mm` 7 (Table 4.1) or 5 (the
@@ -79,7 +79,7 @@ class Reading:
         return text if self.V_line_cm3 == Reading.V_line_cm3 else f"{text}, V_1 = {self.V_line_cm3:g} cm3"
 
     def values(self, closed_pct: float | None) -> tuple[tuple[str, str | float], ...]:
-        """Return the rig's parameters by name for throttles closed by `closed_pct` [%] (0: open; None: absent)."""
+        """Build the rig's parameters by name for throttles closed by `closed_pct` [%] (0: open; None: absent)."""
         sampling: tuple[tuple[str, str | float], ...] = (("daq.sample_rate", SAMPLE_RATE),)
         if closed_pct is None:
             return sampling
@@ -113,14 +113,14 @@ def spec(
     duration: float = DURATION,
     changed: Mapping[str, str | float] = MappingProxyType({}),
 ) -> Experiment:
-    """Return the run of a command with throttles closed by `closed_pct` [%] (None: absent); `changed` parameters."""
+    """Build the run of a command with throttles closed by `closed_pct` [%] (None: absent); `changed` parameters."""
     values = {**dict(reading.values(closed_pct)), **changed}
     run = Experiment.of(command=command, duration=duration, set=values)
     return replace(run, method="rk4", step=THESIS_STEP) if solver == "literal" else run
 
 
 def drift_spec(reading: Reading, closed_pct: float | None, solver: Solver, **changed: str | float) -> Experiment:
-    """Return a long run of section 4.3's command for the drift of the piston."""
+    """Build a long run of section 4.3's command for the drift of the piston."""
     return spec(COMMAND, closed_pct, reading, solver, _DRIFT_DURATION, {"daq.sample_rate": _DRIFT_RATE, **changed})
 
 
@@ -135,12 +135,12 @@ def resolved(runs: Runs) -> bool:
 
 
 def finished(runs: Runs) -> list[tuple[Solver, str, SimulatedRun]]:
-    """Return solver, label and run of those that did not diverge."""
+    """List solver, label and run of those that did not diverge."""
     return [(solver, LABELS[solver], run) for solver, run in runs.items() if not run.diverged]
 
 
 def steady(run: SimulatedRun) -> np.ndarray:
-    """Return which samples lie in the whole periods that numbers are taken from, (n,) truth values."""
+    """Select the samples in the whole periods that numbers are taken from, (n,) truth values."""
     return np.asarray((run.t >= STEADY[0]) & (run.t < STEADY[1]))
 
 
@@ -150,34 +150,34 @@ def steady_output(run: SimulatedRun, name: str) -> Array:
 
 
 def span(run: SimulatedRun, name: str) -> float:
-    """Return the range (greatest less least) of an output over the whole periods."""
+    """Compute the range (greatest less least) of an output over the whole periods."""
     return float(np.ptp(steady_output(run, name)))
 
 
 def mean_difference(run: SimulatedRun, first: str, second: str) -> float:
-    """Return the mean of one output less another over the whole periods."""
+    """Compute the mean of one output less another over the whole periods."""
     return float(np.mean(steady_output(run, first) - steady_output(run, second)))
 
 
 def numbers_of(run: SimulatedRun) -> dict[str, float]:
-    """Return ranges, peaks and least value of the pressures, mean and largest drop at the orifices [Pa], by name.
+    """Compute ranges, peaks and least value of the pressures, mean and largest drop at the orifices [Pa], by name.
 
     `flows differ`: rms of Q_A - Q_B over that of Q_A. All nan where the run diverged.
     """
-    of = {name: steady_output(run, name) for name in (*PRESSURES, "Q_A", "Q_B")}
-    drops = {"p_1 - p_A": of["p_1"] - of["p_A"], "p_2 - p_B": of["p_2"] - of["p_B"]}
+    outputs = {name: steady_output(run, name) for name in (*PRESSURES, "Q_A", "Q_B")}
+    drops = {"p_1 - p_A": outputs["p_1"] - outputs["p_A"], "p_2 - p_B": outputs["p_2"] - outputs["p_B"]}
     return {
-        **{f"range of {name}": float(np.ptp(of[name])) for name in PRESSURES},
-        **{f"peak of {name}": float(of[name].max()) for name in PRESSURES},
-        "least pressure": min(float(of[name].min()) for name in PRESSURES),
+        **{f"range of {name}": float(np.ptp(outputs[name])) for name in PRESSURES},
+        **{f"peak of {name}": float(outputs[name].max()) for name in PRESSURES},
+        "least pressure": min(float(outputs[name].min()) for name in PRESSURES),
         **{f"mean of {name}": float(np.mean(drop)) for name, drop in drops.items()},
         "largest drop": max(float(np.abs(drop).max()) for drop in drops.values()),
-        "flows differ": float(np.sqrt(np.mean((of["Q_A"] - of["Q_B"]) ** 2) / np.mean(of["Q_A"] ** 2))),
+        "flows differ": float(np.sqrt(np.mean((outputs["Q_A"] - outputs["Q_B"]) ** 2) / np.mean(outputs["Q_A"] ** 2))),
     }
 
 
 def piston_drift(run: SimulatedRun) -> float:
-    """Return how far [m] a period's mean position moves from the first to the last whole one; nan if it diverged."""
+    """Compute the shift [m] of a period's mean position from the first to the last whole one; nan if it diverged."""
     if run.diverged:
         return math.nan
     t, x = run.t, run.outputs["x"]
@@ -187,6 +187,6 @@ def piston_drift(run: SimulatedRun) -> float:
 
 
 def visible_pressure() -> float:
-    """Return the least pressure difference [Pa] that a transducer of the rig shows: its noise (standard deviation)."""
+    """Compute the least pressure difference [Pa] that a transducer of the rig shows: its noise (standard deviation)."""
     sensors = load_rig("thesis").sensors
     return math.hypot(sensors.p_A.noise, sensors.common_noise)

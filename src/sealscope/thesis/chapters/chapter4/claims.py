@@ -35,7 +35,7 @@ from sealscope.thesis.chapters.chapter4.friction import falls_up_to, jumps_at_th
 from sealscope.thesis.engine.context import Context, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, Claim, ThesisTable
-from sealscope.thesis.engine.texts import judged, note
+from sealscope.thesis.engine.texts import judge_claim, note
 from sealscope.thesis.sines import sine_fit
 
 #: Share of the drift without orifices that a change of drift must reach to count.
@@ -46,7 +46,7 @@ Rows = list[dict[str, float]]
 
 
 def ringing(run: SimulatedRun, window: float = 0.05, after: float = 0.3) -> float:
-    """Return the median peak-to-peak [Pa] of p_A's fast part within `after` [s] of the pump's reversals.
+    """Compute the median peak-to-peak [Pa] of p_A's fast part within `after` [s] of the pump's reversals.
 
     The fast part is p_A less its mean over `window` [s]; there is no noise in it.
     """
@@ -61,7 +61,7 @@ def ringing(run: SimulatedRun, window: float = 0.05, after: float = 0.3) -> floa
 
 
 def _without_orifices(context: Context) -> Iterator[Claim]:
-    """Judge what is said of cases 4.2 a) to c)."""
+    """Judge the claims on cases 4.2 a) to c)."""
     runs = {command: context.run(spec(command, None)) for command in COMMANDS}
     fits, tests = [], []
     for name, run in runs.items():
@@ -73,22 +73,25 @@ def _without_orifices(context: Context) -> Iterator[Claim]:
         share = amplitude / (command.amplitude * thesis_rig().motor.omega_per_volt)
         fits.append(f"{name}: {rest * 100:.2f} % beside the sine, {share * 100:.0f} % of the commanded speed")
         tests.append(rest < 0.05)
-    yield judged("4.2", tests, fits="; ".join(fits))
+    yield judge_claim("4.2", tests, fits="; ".join(fits))
     spans = "; ".join(f"{name}: {cases.span(run, 'x') * 1e3:.1f} mm peak to peak" for name, run in runs.items())
-    yield judged("4.4", [None], spans=spans)
+    yield judge_claim("4.4", [None], spans=spans)
     noise, rings = cases.visible_pressure(), {name: ringing(run) for name, run in runs.items()}
     text = ", ".join(f"{ring * 1e-3:.1f} kPa ({name})" for name, ring in rings.items())
-    yield judged("4.5", [ring < noise for ring in rings.values()], rings=text, noise=noise * 1e-3)
+    yield judge_claim("4.5", [ring < noise for ring in rings.values()], rings=text, noise=noise * 1e-3)
     changed: tuple[dict[str, str | float], ...] = ({}, {"F_pr": 0.0, "F_cfr": 0.0}, {"K_i": 0.0})
-    drifts = [cases.piston_drift(context.run(cases.drift_spec(OURS, None, "converged", **of))) * 1e3 for of in changed]
+    drifts = [
+        cases.piston_drift(context.run(cases.drift_spec(OURS, None, "converged", **overrides))) * 1e3
+        for overrides in changed
+    ]
     usual, smooth, unintegrated = drifts
     tests = [abs(usual - smooth) > DRIFT_SHARE * abs(usual)]
-    yield judged("4.6", tests, usual=usual, smooth=smooth, unintegrated=unintegrated)
+    yield judge_claim("4.6", tests, usual=usual, smooth=smooth, unintegrated=unintegrated)
 
 
 def _step_and_gains(context: Context) -> Iterator[Claim]:
-    """Judge what is said of the method, its step, and the gains of the speed loop."""
-    runs = {of: context.run(spec(*of, solver="literal")) for of in cases.CASES.values()}
+    """Judge the claims on the method, its step, and the gains of the speed loop."""
+    runs = {case: context.run(spec(*case, solver="literal")) for case in cases.CASES.values()}
 
     def worst(throttles: bool) -> str:
         proofs = [run.proof for (_, closed), run in runs.items() if (closed is not None) == throttles]
@@ -96,7 +99,7 @@ def _step_and_gains(context: Context) -> Iterator[Claim]:
         return f"{max(moved):.3g} Pa rms" if moved else "diverged"
 
     tests = [run.resolved is True for run in runs.values()]
-    yield judged("4.1", tests, plain=worst(False), throttled=worst(True), passed=sum(tests), cases=len(tests))
+    yield judge_claim("4.1", tests, plain=worst(False), throttled=worst(True), passed=sum(tests), cases=len(tests))
     gains, texts, tests = {"motor.k_p": 50000.0, "motor.K_i": 100.0}, [], []
     for name, limits in (
         ("with the drive's voltage and current limits", {}),
@@ -106,26 +109,26 @@ def _step_and_gains(context: Context) -> Iterator[Claim]:
         moved = f"halving the step moves the speed by {run.proof.get('omega', math.nan):.3g} rad/s rms"
         texts.append(f"{name}: {run.diverged or moved}")
         tests.append(run.resolved is True)
-    own = runs[COMMANDS[0], None].proof.get("omega", math.nan)
-    yield judged("4.3", tests, runs="; ".join(texts), own=own)
+    moved_speed = runs[COMMANDS[0], None].proof.get("omega", math.nan)
+    yield judge_claim("4.3", tests, runs="; ".join(texts), own=moved_speed)
 
 
 def _printed(context: Context) -> Iterator[Claim]:
-    """Judge what the equations and tables themselves decide."""
+    """Judge the claims that the equations and tables themselves decide."""
     rig = thesis_rig()
     charge, run = rig.fluid.p_charge * 1e-6, context.run(spec(COMMANDS[0], 25.0))
     peaks = [float(steady_output(run, name).max()) * 1e-6 for name in PRESSURES]
     low, high = min(peaks), max(peaks)
-    yield judged("4.7", [None], low=low, high=high, charge=charge, needed=charge + 0.4 - high, lift=high - charge)
+    yield judge_claim("4.7", [None], low=low, high=high, charge=charge, needed=charge + 0.4 - high, lift=high - charge)
     area, d_line = (3.75 / 5.0) ** 2, rig.line.d_line
     tests = [math.isclose(area, 0.75, rel_tol=0.01), math.isclose(d_line, 5e-3)]
-    yield judged("4.13", tests, area=area, closed=1 - area, d_line=d_line * 1e3)
-    yield from (judged("4.17", [None]), judged("4.22", [None]))
+    yield judge_claim("4.13", tests, area=area, closed=1 - area, d_line=d_line * 1e3)
+    yield from (judge_claim("4.17", [None]), judge_claim("4.22", [None]))
     F_pr = rig.friction.F_pr
     jumps = jumps_at_threshold(F_pr)
-    tests = [math.isclose(at, above, rel_tol=1e-6) for at, above in jumps.values()]
-    texts = [f"{name} bracket: {at:.1f} N at v_th, {above:.1f} N above" for name, (at, above) in jumps.items()]
-    yield judged("4.20", tests, jumps="; ".join(texts), falls=falls_up_to(F_pr))
+    tests = [math.isclose(force, above, rel_tol=1e-6) for force, above in jumps.values()]
+    texts = [f"{name} bracket: {force:.1f} N at v_th, {above:.1f} N above" for name, (force, above) in jumps.items()]
+    yield judge_claim("4.20", tests, jumps="; ".join(texts), falls=falls_up_to(F_pr))
     texts, free = [], {}
     for metering, name in (("literal", "as printed"), ("meter-out", "with the areas of side B swapped")):
         half = rig.with_overrides({"orifices": "present", "closed_A": 0.5, "closed_B": 0.5, "metering": metering})
@@ -133,7 +136,7 @@ def _printed(context: Context) -> Iterator[Claim]:
         free[metering] = (A_in > A_out, B_in > B_out)
         A, B = ("free to the cylinder" if side else "throttled to the cylinder" for side in free[metering])
         texts.append(f"{name}: side A {A}, side B {B}")
-    yield judged("4.23", free["literal"], sides="; ".join(texts))
+    yield judge_claim("4.23", free["literal"], sides="; ".join(texts))
 
 
 def passed(tests: Mapping[Reading, tuple[bool, ...]]) -> str:
@@ -153,13 +156,13 @@ def _over(
     text: Callable[[list[_T]], str],
 ) -> Claim:
     """Judge a claim by the tests of its numbers under both readings; the converged runs decide."""
-    tests = {solver: {r: tuple(test(of)) for r, of in numbers[solver].items()} for solver in SOLVERS}
+    tests = {solver: {r: tuple(test(row_numbers)) for r, row_numbers in numbers[solver].items()} for solver in SOLVERS}
     simulation = "; ".join(
         f"{cases.SOLVER_TEXT[solver]}: {text(list(numbers[solver].values()))}, {passed(tests[solver])}"
         for solver in SOLVERS
     )
     every = [test for row in tests["converged"].values() for test in row]
-    return judged(f"4.{number}", every, simulation=simulation, noise=cases.visible_pressure() * 1e-3)
+    return judge_claim(f"4.{number}", every, simulation=simulation, noise=cases.visible_pressure() * 1e-3)
 
 
 def _range(values: Iterable[float], unit: str = "kPa", factor: float = 1e-3) -> str:
@@ -172,20 +175,20 @@ def _ranges(head: str, values: Callable[[Rows], Iterable[float]]) -> Callable[[l
 
 
 def _changes(rows: Rows, kind: str, names: Iterable[str] = PRESSURES) -> list[float]:
-    """Return by how much each later row exceeds the first, in the `kind` of number of the named pressures."""
+    """Compute the change of each later row against the first, in the `kind` of number of the named pressures."""
     keys = [f"{kind} of {name}" for name in names]
     return [row[key] - rows[0][key] for row in rows[1:] for key in keys]
 
 
 def _orifices(context: Context) -> Iterator[Claim]:
-    """Judge what is said of the orifices under several commands and closings."""
+    """Judge the claims on the orifices under several commands and closings."""
     limit = cases.visible_pressure()
 
-    def under(*of: tuple[str, float]) -> dict[Solver, dict[Reading, Rows]]:
+    def numbers_under(*cases_to_run: tuple[str, float]) -> dict[Solver, dict[Reading, Rows]]:
         """Compute the numbers of each command and closing, under both readings and solvers."""
         return {
             solver: {
-                reading: [cases.numbers_of(context.run(spec(*case, reading, solver))) for case in of]
+                reading: [cases.numbers_of(context.run(spec(*case, reading, solver))) for case in cases_to_run]
                 for reading in READINGS
             }
             for solver in SOLVERS
@@ -211,9 +214,9 @@ def _orifices(context: Context) -> Iterator[Claim]:
     def most_unlike(every: list[Rows]) -> str:
         return f"rms of Q_A - Q_B over rms of Q_A at most {100 * max(rows[1][flows] for rows in every):.2f} %"
 
-    opened = under((COMMANDS[0], 0.0), (COMMANDS[0], 25.0))
-    commands = under(*((command, 50.0) for command in COMMANDS))
-    seven, five = (under(*((command, closed) for closed in CLOSINGS)) for command in (COMMANDS[2], COMMAND))
+    opened = numbers_under((COMMANDS[0], 0.0), (COMMANDS[0], 25.0))
+    commands = numbers_under(*((command, 50.0) for command in COMMANDS))
+    seven, five = (numbers_under(*((command, closed) for closed in CLOSINGS)) for command in (COMMANDS[2], COMMAND))
     p_1, p_2, flows = "mean of p_1 - p_A", "mean of p_2 - p_B", "flows differ"
     text = _ranges("25 % against open, peaks and ranges", both)
     yield _over(8, opened, lambda rows: (abs(change) < limit for change in both(rows)), text)
@@ -233,7 +236,7 @@ def _orifices(context: Context) -> Iterator[Claim]:
 
 
 def _drift(context: Context) -> Iterator[Claim]:
-    """Judge what is said of the piston's drift."""
+    """Judge the claims on the piston's drift."""
 
     def drift(reading: Reading, closed: float | None, solver: Solver) -> float:
         return cases.piston_drift(context.run(cases.drift_spec(reading, closed, solver)))

@@ -49,19 +49,19 @@ _VOLUMES, _QUICK_VOLUMES = (10.0, 20.0, 44.0, 100.0, 234.0, 500.0), (10.0, 44.0,
 
 
 def reading_of(item: Item) -> Reading:
-    """Return the reading of the equations that an item asks for."""
+    """Return the reading of the equations that an item names."""
     return Reading(**item.inputs.get("reading", {}))
 
 
 def _case_of(context: Context, item: Item) -> tuple[Runs, str]:
-    """Run the case of Table 4.2 or 4.3 that an item shows; return it with the notes on it."""
+    """Run the case of Table 4.2 or 4.3 that an item shows; return it with its notes."""
     (command, closed_pct), reading = CASES[item.inputs["case"]], reading_of(item)
     runs = both_runs(context, command, closed_pct, reading)
     return runs, _notes(runs, reading if closed_pct is not None else None)
 
 
 def _notes(runs: Runs, reading: Reading | None) -> str:
-    """Return the notes on a figure of both runs; `reading`: None without orifices."""
+    """Write the notes on a figure of both runs; `reading`: None without orifices."""
     notes = [note("measured-curve")]
     if reading is not None:
         notes.append(f"Reading: {reading.title}.")
@@ -98,7 +98,7 @@ def _both_solvers(runs: Runs, name: str) -> tuple[FigureCurve, ...]:
 
 
 def _difference(runs: Runs, name: str) -> float:
-    """Rms of the difference between the two runs over the steady periods, in the figure's unit; nan if one diverged."""
+    """Compute the rms difference of the two runs over the steady periods, in the figure's unit; nan if one diverged."""
     gap = steady_output(runs["literal"], name) - steady_output(runs["converged"], name)
     return float(np.sqrt(np.mean(gap**2)) * OUTPUTS[name][1])
 
@@ -111,7 +111,7 @@ def case_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
         row: list[Cell] = [_label(name)]
         for run in runs.values():
             values = steady_output(run, name) * OUTPUTS[name][1]
-            row += [None if run.diverged else float(of(values)) for of in (np.min, np.max, np.std)]
+            row += [None if run.diverged else float(statistic(values)) for statistic in (np.min, np.max, np.std)]
         rows.append((*row, _difference(runs, name)))
     heads = [f"{what}, {SOLVER_TEXT[solver]}" for solver in runs for what in ("least", "greatest", "rms about mean")]
     columns = ("quantity", *heads, "rms of the difference")
@@ -154,10 +154,10 @@ def across_orifice(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def _both_ends(run: SimulatedRun, pump: str, chamber: str) -> tuple[FigureCurve, ...]:
-    """Both pressures over time; the pump's as marks where it lies on the chamber's."""
+    """Draw both pressures over time; the pump's as marks where it lies on the chamber's."""
     at_chamber = _line(run, chamber, chamber, "A" if chamber == "p_A" else "B")
-    apart = float(np.sqrt(np.mean((steady_output(run, pump) - steady_output(run, chamber)) ** 2)))
-    if apart >= _ALIKE * span(run, chamber):
+    difference = float(np.sqrt(np.mean((steady_output(run, pump) - steady_output(run, chamber)) ** 2)))
+    if difference >= _ALIKE * span(run, chamber):
         return _line(run, pump, pump, "reference"), at_chamber
     return at_chamber, _marks(run, pump, pump, "reference")
 
@@ -165,13 +165,13 @@ def _both_ends(run: SimulatedRun, pump: str, chamber: str) -> tuple[FigureCurve,
 def _swept(
     name: str, swept: Mapping[float, Runs], measure: Callable[[SimulatedRun], float], solvers: Sequence[Solver]
 ) -> tuple[tuple[FigureCurve, ...], list[Number]]:
-    """Draw a measure [Pa] over what was varied, in MPa, with its numbers; `name` has a place for what was varied."""
+    """Draw a measure [Pa] over the varied quantity, in MPa, with its numbers; `name` has a place for its value."""
     curves, numbers = [], []
     for solver in solvers:
         values = [measure(runs[solver]) * 1e-6 for runs in swept.values()]
         curves.append(FigureCurve(np.array(list(swept)), np.array(values), LABELS[solver], solver))
-        of = zip(swept, values, strict=True)
-        numbers += [Number(f"{name.format(at)}, {LABELS[solver]}", value, "MPa") for at, value in of]
+        pairs = zip(swept, values, strict=True)
+        numbers += [Number(f"{name.format(varied)}, {LABELS[solver]}", value, "MPa") for varied, value in pairs]
     return tuple(curves), numbers
 
 

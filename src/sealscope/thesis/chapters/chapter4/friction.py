@@ -19,19 +19,19 @@ _AXES = ("v [m/s]", "F_f [N]")
 
 
 def thesis_rig() -> Rig:
-    """Return the rig of the thesis."""
+    """Load the rig of the thesis."""
     return load_rig("thesis")
 
 
 def stribeck(v: Array, F_C: float, *, literal_bracket: bool = False) -> Array:
-    """Return the rig's friction [N] at `v` [m/s] (n,) under the Coulomb force `F_C` [N], eqs. (4.21), (4.22)."""
+    """Compute the rig's friction [N] at `v` [m/s] (n,) under the Coulomb force `F_C` [N], eqs. (4.21), (4.22)."""
     f = thesis_rig().friction
     plain = getattr(stribeck_friction, "py_func", stribeck_friction)
     return np.array([plain(float(value), F_C, f.K_brk, f.C_c, f.F_v, f.v_th, literal_bracket) for value in v])
 
 
 def jumps_at_threshold(F_C: float) -> dict[str, tuple[float, float]]:
-    """Return friction [N] at and just above v_th for both bracketings of eq. (4.22), "continuous" and "literal"."""
+    """Compute friction [N] at and just above v_th for both bracketings of eq. (4.22), "continuous" and "literal"."""
     v_th = thesis_rig().friction.v_th
     sides = np.array([v_th, math.nextafter(v_th, 1.0)])
     jumps = {}
@@ -42,7 +42,7 @@ def jumps_at_threshold(F_C: float) -> dict[str, tuple[float, float]]:
 
 
 def falls_up_to(F_C: float) -> float:
-    """Return the velocity [m/s] up to which friction falls with it: where F_v = F_C (K_brk - 1) C_c exp(-C_c v)."""
+    """Compute the velocity [m/s] up to which friction falls: where F_v = F_C (K_brk - 1) C_c exp(-C_c v)."""
     f = thesis_rig().friction
     return max(0.0, math.log(F_C * (f.K_brk - 1.0) * f.C_c / f.F_v) / f.C_c)
 
