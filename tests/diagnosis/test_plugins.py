@@ -100,6 +100,16 @@ def test_one_change_with_its_chance_is_a_report(
     assert evidence.onset_s == (9.0 if verdict == "leak" else None)
 
 
+def test_one_that_sees_nothing_takes_no_verdict_away(install: Install, short: Recording) -> None:
+    """It states no bound; the change of RMS judges as without it."""
+    alone = diagnose(short)
+    install("fine", ONE_CHANGE.replace("CHANCE", "0.5"), {"good": "fine:Good"})
+    beside = diagnose(short)
+    assert alone.verdict == "no leak"
+    assert (beside.verdict, beside.detector, beside.reason) == (alone.verdict, alone.detector, alone.reason)
+    assert "good sees no change" in next(part.reason for part in beside.parts if part.detector == "good")
+
+
 def test_it_is_made_for_the_rig_that_is_assumed(install: Install, short: Recording) -> None:
     from sealscope.parameters import load_rig
 

@@ -9,7 +9,11 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.diagnose import diagnose
+from sealscope.diagnosis.rms_change.detector import RmsChange
+from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.recording import Recording
+
+from .judging import judge
 
 pytestmark = pytest.mark.usefixtures("rms_change_alone")
 
@@ -19,6 +23,11 @@ def few_and_all(few: int, count: int) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("count", [few, pytest.param(count, marks=[pytest.mark.slow, pytest.mark.long])])
 
 
+def judge_ringing(recording: Recording) -> Evidence:
+    """Decide by the thesis's own rule, whatever else changed."""
+    return judge(RmsChange(), recording)
+
+
 def altered(recording: Recording, p_A: np.ndarray, p_B: np.ndarray) -> Recording:
     return replace(recording, channels={**recording.channels, "p_A": p_A, "p_B": p_B})
 
@@ -26,7 +35,7 @@ def altered(recording: Recording, p_A: np.ndarray, p_B: np.ndarray) -> Recording
 @few_and_all(4, 10)
 def test_smallest_leak_with_throttles_half_closed(count: int, records) -> None:  # type: ignore[no-untyped-def]
     """0.0042 L/min, the thesis's smallest, from second 90: found in ten of ten, nine within 10 s."""
-    result = [diagnose(records(seed, leak="0.0042 L/min from 90 s", throttled=True)) for seed in range(count)]
+    result = [judge_ringing(records(seed, leak="0.0042 L/min from 90 s", throttled=True)) for seed in range(count)]
     assert [one.verdict for one in result] == ["leak"] * count
     assert sum(abs(one.onset_s - 90.0) <= 10.0 for one in result) >= count - 1
     for one in result:
@@ -34,13 +43,13 @@ def test_smallest_leak_with_throttles_half_closed(count: int, records) -> None: 
         assert one.onset_interval_s[0] <= one.onset_s <= one.onset_interval_s[1]
         assert one.onset_interval_s[0] <= 90.0 <= one.onset_interval_s[1]
         assert one.leak_lpm is None
-    assert "RMS of d3 of p_A fell" in result[1].reason  # leakage damps the ringing
+    assert all("fall of d" in one.reason for one in result)  # leakage damps the ringing
 
 
 @pytest.mark.slow
 def test_larger_leak_without_throttles(records) -> None:  # type: ignore[no-untyped-def]
     """0.015 L/min; of these eight at most three are missed."""
-    result = [diagnose(records(seed, leak="0.015 L/min from 90 s")) for seed in range(8)]
+    result = [judge_ringing(records(seed, leak="0.015 L/min from 90 s")) for seed in range(8)]
     alarms = [one for one in result if one.verdict == "leak"]
     assert len(alarms) >= 5
     assert sum(one.onset_interval_s[0] <= 90.0 <= one.onset_interval_s[1] for one in alarms) >= len(alarms) - 1
@@ -67,7 +76,7 @@ def test_a_step_of_the_noise_is_no_leak(kind: str, count: int, records) -> None:
         other = {"p_A alone": 0.0 * noise[1], "common": noise[0]}.get(kind, noise[1])
         result = diagnose(altered(recording, recording["p_A"] + late * noise[0], recording["p_B"] + late * other))
         assert result.verdict != "leak"
-        assert "the noise (d1) changed" in result.reason
+        assert result.cause == "sensor fault"
 
 
 @pytest.mark.slow
@@ -77,7 +86,7 @@ def test_a_leak_is_found_beyond_a_step_of_the_noise(records) -> None:  # type: i
         recording = records(seed, leak="0.0042 L/min from 60 s", duration=120.0, throttled=True)
         random = np.random.default_rng(seed)
         noise = (recording.t >= 30.0) * 4e3 * random.standard_normal((2, len(recording)))
-        result.append(diagnose(altered(recording, recording["p_A"] + noise[0], recording["p_B"] + noise[1])))
+        result.append(judge_ringing(altered(recording, recording["p_A"] + noise[0], recording["p_B"] + noise[1])))
     alarms = [one for one in result if one.verdict == "leak"]
     assert len(alarms) >= 4
     for one in alarms:

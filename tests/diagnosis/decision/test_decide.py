@@ -144,6 +144,14 @@ def test_a_method_judges_by_its_own_rule() -> None:
     assert verdicts == {True: "cannot tell", False: "leak"}
 
 
+@pytest.mark.parametrize("chance", [0.05, 0.006, 0.003, 1e-9])
+def test_healthy_recordings_move_score_and_chance_alike(chance: float) -> None:
+    null = HealthyNull({"details: against": [1.0, 0.2, 0.0, 0.4]})
+    report = Observed("rms change", (observable("details: fall of d3 of p_A", chance, onset=None),))
+    evidence = decide(report, (), null, Context(false_alarm_probability=ALLOWED, is_weighed=False))
+    assert (evidence.score > evidence.threshold) == (evidence.chance < ALLOWED) == (evidence.verdict == "leak")
+
+
 def test_a_leak_makes_the_ringing_fall() -> None:
     context = Context(false_alarm_probability=ALLOWED, is_weighed=False)
     for way, verdict in (("fall", "leak"), ("rise", "cannot tell")):

@@ -18,7 +18,7 @@ from sealscope.diagnosis.decision.explanations import (
     explain,
     probability_of,
 )
-from sealscope.diagnosis.decision.null import HealthyNull
+from sealscope.diagnosis.decision.null import HealthyNull, key_of
 from sealscope.diagnosis.inference.observable import LeakMeasure, Observable, Observed
 from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.evidence import Cause
@@ -158,6 +158,7 @@ def _change_questions(case: Case) -> tuple[Question, ...]:
     if rarest is None:
         return ()
     allowed, chance = case.context.false_alarm_probability, case.null.chance(rarest)
-    threshold = rarest.score * np.log(allowed) / np.log(min(max(rarest.chance, 1e-300), 1.0 - 1e-9))
+    law = case.null.law_chance(key_of(rarest), allowed)
+    threshold = rarest.score * np.log(law) / np.log(min(max(rarest.chance, 1e-300), 1.0 - 1e-9))
     where = WITHIN if rarest.onset is not None else AGAINST
     return (Question(where, rarest.score, max(float(threshold), 0.0), chance, allowed),)

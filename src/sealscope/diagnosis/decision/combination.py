@@ -39,8 +39,9 @@ def combine(decisions: Sequence[Evidence], context: Context) -> Evidence:
     """
     ranked = sorted(decisions, key=lambda own: rank(own.detector))
     usable = [own for own in ranked if own.usable]
-    measuring = [own for own in usable if own.detector != RMS_CHANGE]
-    judge = next((own for own in measuring or usable if not own.abstains), None)
+    measuring = any(own.detector in ORDER for own in usable)
+    judging = [own for own in usable if not (measuring and own.detector == RMS_CHANGE)]
+    judge = next((own for own in judging if not own.abstains), None)
     if judge is None:
         return _undecided(ranked, usable)
     reasons, doubts = [judge.reason], []

@@ -33,7 +33,9 @@ def reason_of(case: Case, evidence: Evidence, alarm: Question | None, bound: flo
 
 
 def _leak_text(case: Case, evidence: Evidence, alarm: Question | None) -> str:
-    key = {"within the recording": "within", "against the baseline": "against"}.get(alarm.name if alarm else "", "level")
+    key = {"within the recording": "within", "against the baseline": "against"}.get(
+        alarm.name if alarm else "", "level"
+    )
     total = evidence.total_leakage
     if case.leak is None:
         shown = min(case.judge.observables, key=lambda own: own.chance)
@@ -69,7 +71,7 @@ def _bound_text(case: Case, evidence: Evidence, bound: float) -> str:
 
 def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) -> str:
     if ringing is None:
-        return f"{provider}: {text_of('bound', 'any')}"
+        return text_of("bound", "unseen", provider=provider)
     fast: float = priors("rms_change")["rate"]["ringing"]
     percent = -100.0 * np.expm1(-ringing.bound)
     key = "ringing_hidden" if evidence.verdict == CANNOT_TELL else "ringing"
