@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.decision.case import Case, Context, OtherEvent
+from sealscope.diagnosis.decision.case import Case, DecisionContext, OtherEvent
 from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.inference.changes.levels import level_tests, levels
@@ -39,7 +39,7 @@ def machine(**changed: np.ndarray) -> Recording:
 def other_event(recording: Recording) -> OtherEvent | None:
     """Return the event that the signals alone name, as beside a detector that sees nothing."""
     report = observe_signals(recording)
-    return Case(report, report.observables, HealthyNull(), Context(false_alarm_probability=CHANCE)).other_event
+    return Case(report, report.observables, HealthyNull(), DecisionContext(false_alarm_probability=CHANCE)).other_event
 
 
 def onset_of(event: OtherEvent) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from sealscope.diagnosis.decision.case import Context
+from sealscope.diagnosis.decision.case import DecisionContext
 from sealscope.diagnosis.decision.decide import decide
 from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.diagnose import diagnose
@@ -47,7 +47,7 @@ def blocks_of(values: np.ndarray, cycle: float | None = 1.5, duty: np.ndarray | 
 
 def judge_blocks(blocks: RmsBlocks, probability: float) -> Evidence:
     """Decide by the change of RMS within blocks at 500 Hz, by its own rule."""
-    context = Context(false_alarm_probability=probability, is_weighed=False)
+    context = DecisionContext(false_alarm_probability=probability, is_weighed=False)
     return decide(observe_within(blocks, 500.0), (), HealthyNull(), context)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.decision.case import Context
+from sealscope.diagnosis.decision.case import DecisionContext
 from sealscope.diagnosis.decision.combination import ORDER, combine, is_decided, rank
 from sealscope.diagnosis.decision.decide import decide
 from sealscope.diagnosis.decision.null import HealthyNull
@@ -94,7 +94,7 @@ class Examination:
 
     def evidence(self, name: str) -> Evidence:
         """Decide by one detector alone; the change of RMS by its own rule, whatever else changed."""
-        context = Context(
+        context = DecisionContext(
             false_alarm_probability=self.false_alarm_probability,
             refusal=self.refusal,
             is_weighed=name != RMS_CHANGE,
@@ -106,7 +106,7 @@ class Examination:
 
         Where one that measures the leak fails, nobody else may say that there is none.
         """
-        context = Context(false_alarm_probability=self.false_alarm_probability, refusal=self.refusal)
+        context = DecisionContext(false_alarm_probability=self.false_alarm_probability, refusal=self.refusal)
         names = sorted(detectors(), key=rank)
         judged = dict[str, Evidence]()
         reports = [self.signals, *(self.report(name) for name in names if name not in ORDER)]
@@ -116,7 +116,7 @@ class Examination:
         failed = next((self.report(name).lack for name in ORDER if name in judged and self.report(name).has_failed), None)
         return combine(list(judged.values()), replace(context, refusal=self.refusal or failed))
 
-    def _decide(self, name: str, reports: Sequence[Observed], context: Context) -> Evidence:
+    def _decide(self, name: str, reports: Sequence[Observed], context: DecisionContext) -> Evidence:
         report = self.report(name)
         with np.errstate(all="ignore"):
             evidence = decide(report, reports, self.null, context)

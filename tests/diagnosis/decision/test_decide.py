@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.decision.case import AGAINST, LEVEL, WITHIN, Case, Context
+from sealscope.diagnosis.decision.case import AGAINST, LEVEL, WITHIN, Case, DecisionContext
 from sealscope.diagnosis.decision.decide import decide
 from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.inference.observable import Observable, Observed
@@ -19,7 +19,7 @@ from sealscope.diagnosis.verdict.evidence import Evidence
 from .cases import DRIVING, LITRES, MeasuredLeak, observable, step
 
 ALLOWED = 0.01
-CONTEXT = Context(false_alarm_probability=ALLOWED)
+CONTEXT = DecisionContext(false_alarm_probability=ALLOWED)
 SOURCE = Path(__file__).resolve().parents[3] / "src" / "sealscope" / "diagnosis"
 
 
@@ -137,7 +137,7 @@ def test_a_method_judges_by_its_own_rule() -> None:
             report,
             [signals],
             HealthyNull(),
-            Context(false_alarm_probability=ALLOWED, is_weighed=is_weighed),
+            DecisionContext(false_alarm_probability=ALLOWED, is_weighed=is_weighed),
         ).verdict
         for is_weighed in (True, False)
     }
@@ -148,12 +148,12 @@ def test_a_method_judges_by_its_own_rule() -> None:
 def test_healthy_recordings_move_score_and_chance_alike(chance: float) -> None:
     null = HealthyNull({"details: against": [1.0, 0.2, 0.0, 0.4]})
     report = Observed("rms change", (observable("details: fall of d3 of p_A", chance, onset=None),))
-    evidence = decide(report, (), null, Context(false_alarm_probability=ALLOWED, is_weighed=False))
+    evidence = decide(report, (), null, DecisionContext(false_alarm_probability=ALLOWED, is_weighed=False))
     assert (evidence.score > evidence.threshold) == (evidence.chance < ALLOWED) == (evidence.verdict == "leak")
 
 
 def test_a_leak_makes_the_ringing_fall() -> None:
-    context = Context(false_alarm_probability=ALLOWED, is_weighed=False)
+    context = DecisionContext(false_alarm_probability=ALLOWED, is_weighed=False)
     for way, verdict in (("fall", "leak"), ("rise", "cannot tell")):
         report = Observed("rms change", (observable(f"details: {way} of d3 of p_A", 1e-9),))
         assert decide(report, (), HealthyNull(), context).verdict == verdict

@@ -49,7 +49,7 @@ class OtherEvent(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Context:
+class DecisionContext:
     """What a decision is made under.
 
     Parameters
@@ -74,7 +74,7 @@ class Case:
     judge: Observed
     observables: Sequence[Observable]
     null: HealthyNull
-    context: Context
+    context: DecisionContext
 
     @property
     def leak(self) -> LeakMeasure | None:
@@ -119,7 +119,7 @@ class Case:
             causes = dict.fromkeys(event.cause for event in moving if event.name not in LEAK_EVENTS)
             for cause in (own for own in causes if own is not None):
                 sure = probability_of(self.explanations, cause=cause, data=observable.data)
-                if sure > _PRIORS["explanation"]["sure"]:
+                if sure > _PRIORS["explanation"]["named"]:
                     words = max((e for e in moving if e.cause == cause), key=lambda e: e.probability).words
                     return OtherEvent(cause, words, sure, observable, chances[id(observable)])
         return None

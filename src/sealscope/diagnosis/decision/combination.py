@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from sealscope.diagnosis.decision.case import Context
+from sealscope.diagnosis.decision.case import DecisionContext
 from sealscope.diagnosis.decision.texts import text_of
 from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, LEAK, NO_LEAK, RMS_CHANGE, Evidence
 
@@ -31,7 +31,7 @@ def is_decided(evidence: Evidence) -> bool:
     return evidence.usable and not evidence.abstains
 
 
-def combine(decisions: Sequence[Evidence], context: Context) -> Evidence:
+def combine(decisions: Sequence[Evidence], context: DecisionContext) -> Evidence:
     """Choose the decision that stands, with all others beside it as `parts`.
 
     A recording that cannot be compared with the healthy ones it was given, or of which a part is missing, is not

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sealscope.diagnosis.decision.case import WITHIN, Case, Context, Question, step_key
+from sealscope.diagnosis.decision.case import WITHIN, Case, DecisionContext, Question, step_key
 from sealscope.diagnosis.decision.explanations import probability_of
 from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.decision.reasons import reason_of
@@ -26,7 +26,7 @@ from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, LEAK, NO_LEAK, RAR
 _PRIORS = priors("decision")
 
 
-def decide(judge: Observed, reports: Sequence[Observed], null: HealthyNull, context: Context) -> Evidence:
+def decide(judge: Observed, reports: Sequence[Observed], null: HealthyNull, context: DecisionContext) -> Evidence:
     """Decide on a recording by the report of one provider, all others' observables competing.
 
     Parameters
@@ -37,7 +37,7 @@ def decide(judge: Observed, reports: Sequence[Observed], null: HealthyNull, cont
         All reports, that of `judge` among them or not.
     null : HealthyNull
         What healthy recordings of the machine show.
-    context : Context
+    context : DecisionContext
 
     Returns
     -------

@@ -62,6 +62,12 @@ def _sensors(recording: Recording) -> Iterator[Observable]:
 
 
 def _levels(recording: Recording) -> Iterator[Observable]:
-    for level in level_tests(recording):
+    """Yield the patterns of the levels; rivals of the likeliest one are rarer by twice what their rank lacks.
+
+    Ranks hold half the price of a coefficient more, how rare it is to be needed the other half.
+    """
+    levels = level_tests(recording)
+    for level in levels:
         reach = Interval(level.onset, level.onset - level.block, level.onset + level.block)
-        yield Observable(name=level.name, data="levels", score=level.rank, chance=level.chance, onset=reach)
+        chance = min(1.0, levels[0].chance * float(np.exp(min(levels[0].rank - level.rank, 700.0))))
+        yield Observable(name=level.name, data="levels", score=level.rank, chance=chance, onset=reach)
