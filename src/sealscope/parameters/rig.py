@@ -280,7 +280,7 @@ class Rig(Part):
 
         The dead volume beside the stroke and the accumulator's gas are scaled with the larger area, an assumption.
         """
-        entries, old = self._given(), self.cylinder
+        entries, old = self._stated_entries(), self.cylinder
         scale = max(A_A, A_B) / max(old.A_A, old.A_B)
         fitted: dict[str, float] = {}
         if old.volumes == "position":

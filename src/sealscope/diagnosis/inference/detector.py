@@ -17,7 +17,7 @@ from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.inference.recorded import RecordedBalance
 from sealscope.diagnosis.inference.regimes import shut_without_rests
 from sealscope.diagnosis.inference.rivals import rival_rises
-from sealscope.diagnosis.inference.scatter import RecordingSums, Rise, motion_change, rise
+from sealscope.diagnosis.inference.scatter import RecordingSums, Rise, leave_one_out, motion_change, rise
 from sealscope.diagnosis.inference.terms import (
     CYLINDER,
     LOCKED,
@@ -43,6 +43,8 @@ _NO_BALANCE = {
     "that what leaks moves it: record its position x",
 }
 _AGES = 1e11  # seconds
+#: Fewest healthy recordings whose scatter tells one hypothesis of rests from the other.
+FEWEST_THAT_SCATTER = 3
 #: Fewest samples between neighbouring test functions.
 RESOLVED = 2
 
@@ -136,13 +138,30 @@ class VolumeBalance:
 
     def next_rise(self, lessons: Sequence[Lesson], channels: frozenset[str], repeated: int = 1) -> Rise:
         """Return the rise of a healthy recording like these on a later day, as after `repeated` times as many days."""
-        shut = _odds_of(lessons) > 0.0
+        shut = self._odds_of(lessons, channels) > 0.0
         healthy = [_sums_of(lesson, shut) for lesson in lessons]
         later = [own._replace(start_s=_later(own, k)) for k in range(repeated) for own in healthy]
         flow, pressure = (float(np.median([lesson[of] for lesson in lessons])) for of in ("flow", "pressure"))
         middle = RecordingSums(healthy[0].sums, flow, pressure, oil_degC=healthy[0].oil_degC)
         dated = next((own for own in healthy if own.start_s is not None), middle)
         return rise(middle._replace(start_s=_later(dated, repeated)), later, self._columns(channels, shut))
+
+    def _odds_of(self, lessons: Sequence[Lesson], channels: frozenset[str]) -> float:
+        """Compute the log odds, by healthy recordings, that the pump is cut off at rest.
+
+        Of enough recordings by how far their leakage scatters under either hypothesis, the ratio of the likelihoods of
+        an unknown scale: that under which healthy recordings agree also shows the smaller leak. Of fewer by the sum of
+        what each says of itself.
+        """
+        known = [lesson for lesson in lessons if "shut_sums" in lesson]
+        if len(known) < FEWEST_THAT_SCATTER:
+            return float(sum(lesson.get("shut_odds", 0.0) for lesson in lessons))
+        scatter = []
+        for shut in (False, True):
+            sums = [_sums_of(lesson, shut) for lesson in known]
+            values = leave_one_out(sums, self._columns(channels, shut))
+            scatter.append(max(float(values.std(ddof=1)), np.finfo(float).tiny))
+        return (len(known) - 1) * float(np.log(scatter[0] / scatter[1]))
 
     def _columns(self, channels: frozenset[str], shut: bool) -> list[Columns]:
         balances = equations(self.rig, channels)
@@ -151,7 +170,7 @@ class VolumeBalance:
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
         """Return the steps of the balance's terms, and the leak against healthy recordings."""
         lessons = lessons_of(self, baseline)
-        balance = self.balance(recording, _odds_of(lessons))
+        balance = self.balance(recording, self._odds_of(lessons, frozenset(recording.channels)))
         if balance is None:
             return Observed(self.name, lack=_NO_BALANCE["x" in recording].format(recording.duration))
         names = [name for name in balance.columns[0].names if name != TURNING]
@@ -195,11 +214,6 @@ def _motion_observable(balance: RecordedBalance, healthy: Sequence[RecordingSums
 def _later(recorded: RecordingSums, times: int) -> float | None:
     """Return the date of a recording as many times later as no recordings of one machine are apart."""
     return None if recorded.start_s is None else recorded.start_s + times * _AGES
-
-
-def _odds_of(lessons: Sequence[Lesson]) -> float:
-    """Add up the log odds of healthy recordings that the pump is cut off at rest."""
-    return float(sum(lesson.get("shut_odds", 0.0) for lesson in lessons))
 
 
 def _sums_of(lesson: Lesson, shut: bool = False) -> RecordingSums:

@@ -76,14 +76,9 @@ def shut_odds(blocks: Blocks, columns: Columns) -> float:
     scores = left - each @ coefficients
     inverse = solve(total, np.eye(len(chosen)))
     covariance = inverse @ (scores.T @ scores) @ inverse * (len(blocks) / (len(blocks) - 1.0))
-    # under a steady load leak and zero of the flow are one: what passes at the pressure of the rests is compared
-    pressure = gram[:, at_rest, bias].sum() / gram[:, bias, bias].sum()
-    in_motion, beyond = np.zeros((2, len(chosen)))
-    in_motion[[chosen.index(columns.leak), chosen.index(columns.names.index(BIAS))]] = pressure, 1.0
-    beyond[[chosen.index(at_rest), chosen.index(bias)]] = pressure, 1.0
-    motion, more = float(in_motion @ coefficients), float(beyond @ coefficients)
-    resting = float((in_motion + beyond) @ covariance @ (in_motion + beyond))
-    differing = float(beyond @ covariance @ beyond)
+    both = [chosen.index(columns.leak), chosen.index(at_rest)]
+    motion, more = coefficients[both]
+    resting, differing = float(covariance[np.ix_(both, both)].sum()), float(covariance[both[1], both[1]])
     if not (resting > 0.0 and differing > 0.0):
         return 0.0
     shut = _log_normal(motion + more, resting + (believed["shut"] * motion) ** 2)

@@ -170,6 +170,13 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
     )
 
 
+def leave_one_out(recordings: Sequence[RecordingSums], columns: Sequence[Columns]) -> Array:
+    """Compute the rise (n,) of each recording beyond the n - 1 others, by what is believed of their differences."""
+    everything = np.sum([recording.sums for recording in recordings], axis=0)
+    rises = [_rises(own.sums, everything - own.sums, columns, np.ones(1))[0] for own in recordings]
+    return np.array(rises) * ((len(recordings) - 1) / len(recordings))
+
+
 class Population:
     """Values that are normal about an unknown mean, the last of them the judged one.
 

@@ -149,7 +149,8 @@ class Signals:
     def stands(self, left: Callable[[Signals], Array]) -> Array:
         """Return 1 for each interval in which the pump, by its volume, or the piston stands still, else 0."""
         if self._stands is None:
-            self._stands = find_rests(left(self), self.rate, self._still[0]).astype(float)
+            pump = find_rests(left(self), self.rate, self._still[0])
+            self._stands = (pump | find_rests(self.step("x"), self.rate, self._still[1])).astype(float)
         return self._stands
 
     def acceleration_step(self) -> Array:
