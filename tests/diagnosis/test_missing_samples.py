@@ -238,3 +238,10 @@ def test_a_folder_is_watched_by_the_samples_that_a_recording_is_judged_by(polled
     estimates = own.update(samples)
     assert "gap" not in own.counters
     assert sum(estimate.total_lpm is not None for estimate in estimates) > 10
+
+
+def test_a_joystick_in_percent_beside_the_speed_takes_no_size_away(late_leak: Recording) -> None:
+    in_percent = replace(late_leak, units={**late_leak.units, "u": "count"})
+    own, other = diagnose(late_leak, rig="thesis"), diagnose(in_percent, rig="thesis")
+    assert own.leak_lpm is not None
+    assert other.leak_lpm == pytest.approx(own.leak_lpm)

@@ -249,3 +249,9 @@ def test_no_name_is_cut_in_its_middle() -> None:
 
     name = "Zylinder 4 Druck Kolbenseite nach Ventil Y12 [bar]"
     assert listed([name, "x" * 100]) == f"{name}, {'x' * 77}..."
+
+
+@pytest.mark.parametrize("head", ["flow_A_Lpm", "flow_A_lpm", "Flow A [LPM]"])
+def test_litres_a_minute_are_a_flow_however_they_are_written(tmp_path: Path, head: str) -> None:
+    recording = read(table(tmp_path, f"t [s];p_A [bar];p_B [bar];{head}"), map="auto")
+    assert recording["q_pump"] == pytest.approx(COLUMNS[:, 2] / 60e3)

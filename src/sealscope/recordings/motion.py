@@ -23,6 +23,7 @@ _HOLD = priors_of("sealscope.recordings")["hold"]
 _SHORTEST_STUCK = 5
 _NEIGHBOURHOOD = 100
 _STUCK_CHANCE = 1e-6
+_LEVELS = 2**15
 
 
 def constant(values: Array) -> bool:
@@ -89,6 +90,11 @@ def spacing(levels: Array) -> float:
     steps = np.diff(levels)
     steps = steps[steps > ROUNDING * (levels[-1] - levels[0])]
     return float(steps.min()) if steps.size else 0.0
+
+
+def quantum(values: Array) -> float:
+    """Estimate the finest step of a channel (n,) from at most `_LEVELS` of its samples."""
+    return spacing(np.unique(values[:: max(1, values.size // _LEVELS)]))
 
 
 def stuck(values: Array) -> NDArray[np.intp]:

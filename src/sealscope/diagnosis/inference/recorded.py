@@ -167,7 +167,8 @@ def _size(balance: RecordedBalance) -> Size:
     """
     column, rig, meter = balance.columns[0], balance.rig, measures_flow(balance.recording.units)
     believed = priors("inference")["size"]
-    with_unit = (flow_source(balance.recording.channels), "count") not in balance.units
+    source = flow_source(balance.recording.channels)  # a meter's unit follows from the area
+    with_unit = source == "q_pump" or (source, "count") not in balance.units
     pressures = not {("p_A", "count"), ("p_B", "count")} & balance.units
     states_displacement = rig.states("pump.q_b") and with_unit
     if len(balance.columns) > 1:  # behind a valve the area sizes the flow

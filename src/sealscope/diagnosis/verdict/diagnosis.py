@@ -64,7 +64,9 @@ class Diagnosis(Evidence):
     start : str, optional
         When the recording began, as ISO 8601, where the file says so.
     unused : tuple of str
-        Recorded pressures, positions and speeds that no channel is made of.
+        Recorded pressures, positions, speeds and flows that no channel is made of.
+    pressure_unit : str
+        Unit in which pressures are shown: that of the log, else bar.
 
     Examples
     --------

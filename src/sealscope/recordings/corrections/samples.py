@@ -49,12 +49,12 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
         findings += found
     part = filled(bridge(part, needed), needed)
     if part.bridged is not None:
-        rows = np.flatnonzero(part.bridged)
+        lost = np.flatnonzero(part.bridged)
         text = (
-            f"{counted(rows.size, 'missing sample')} in {counted(len(runs_of(part.bridged)), 'gap')} bridged: what a "
+            f"{counted(lost.size, 'missing sample')} in {counted(len(runs_of(part.bridged)), 'gap')} bridged: what a "
             "long one touches counts less"
         )
-        findings.append(Finding("gaps_bridged", "note", None, rows.size, float(part.t[rows[0]]), text))
+        findings.append(Finding("gaps_bridged", "note", None, lost.size, float(part.t[lost[0]]), text))
     rows = np.flatnonzero(np.all([np.isfinite(part[name]) for name in needed], axis=0)) if needed else None
     if rows is not None and rows.size < len(part):
         part = part.samples(slice(int(rows[0]), int(rows[-1]) + 1) if rows.size else slice(0, 0))

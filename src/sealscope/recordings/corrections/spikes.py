@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.recordings.channels import SLOW, Array
-from sealscope.recordings.motion import spacing
+from sealscope.recordings.motion import quantum
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
 from sealscope.storage.toml_file import priors_of
@@ -21,6 +21,8 @@ _PRIORS = priors_of("sealscope.recordings")["spike"]
 #: Samples on either side whose changes a spike is compared with, and the fewest of a channel.
 _AROUND, _FEWEST = 10, 50
 _QUANTA = 10.0
+#: Changes that tell how large a channel's changes are.
+_TOLD = 2**15
 
 
 def without_spikes(recording: Recording) -> tuple[Recording, list[Finding]]:
@@ -46,7 +48,8 @@ def spike_rows(values: Array) -> NDArray[np.intp]:
     steps = np.diff(values[known])
     size = np.abs(steps)
     leap = np.where(steps[:-1] * steps[1:] < 0.0, np.minimum(size[:-1], size[1:]), 0.0)
-    least = _PRIORS["times"] * float(np.quantile(size, 0.9)) + _QUANTA * spacing(np.unique(values[known]))
+    usual = float(np.quantile(size[:: max(1, size.size // _TOLD)], 0.9))
+    least = _PRIORS["times"] * usual + _QUANTA * quantum(values[known])
     rows = []
     for k in np.flatnonzero(leap > least).tolist():
         around = np.r_[size[max(k - _AROUND, 0) : k], size[k + 2 : k + 2 + _AROUND]]

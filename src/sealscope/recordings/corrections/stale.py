@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.channels import SLOW, Array
-from sealscope.recordings.motion import spacing, stuck
+from sealscope.recordings.motion import quantum, stuck
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
 from sealscope.storage.toml_file import priors_of
@@ -24,6 +24,8 @@ _PRIORS = priors_of("sealscope.recordings")["stale"]
 MOST_STUCK: float = _PRIORS["stuck"]
 #: A jump of fewer quantisation steps may be a slow change.
 _JUMP = 1.5
+#: Samples at the beginning that tell how long a channel repeats its own.
+_TOLD = 2**18
 #: Longest run of repeated rows.
 _LONGEST_REPEAT = 3
 
@@ -79,12 +81,13 @@ def _moves_in(values: Array, rows: NDArray[np.intp]) -> bool:
 def _runs(values: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """Return the first index of each run of equal values (n,), and which runs jump at both ends."""
     starts = np.flatnonzero(np.r_[True, values[1:] != values[:-1]])
-    jumps = np.abs(np.diff(values)[starts[1:] - 1]) > _JUMP * spacing(np.unique(values))
+    jumps = np.abs(np.diff(values)[starts[1:] - 1]) > _JUMP * quantum(values)
     return starts, np.r_[False, jumps] & np.r_[jumps, False]
 
 
 def holding_period(t: Array, values: Array) -> float | None:
     """Estimate how long [s] a channel (n,) repeats each sample; None where it is nothing to mend."""
+    t, values = t[:_TOLD], values[:_TOLD]
     known = np.isfinite(values) & np.isfinite(t)
     if np.count_nonzero(known) < _PRIORS["runs"]:
         return None
@@ -126,7 +129,7 @@ def _repeated_rows(channels: list[Array]) -> NDArray[np.bool_]:
     first, stop = first[inner], stop[inner]
     jumps = np.zeros(first.size, dtype=bool)
     for values in moving:
-        least = _JUMP * spacing(np.unique(values[np.isfinite(values)]))
+        least = _JUMP * quantum(values[np.isfinite(values)])
         jumps |= (np.abs(values[first - 1] - values[first - 2]) > least) & (
             np.abs(values[stop] - values[stop - 1]) > least
         )
