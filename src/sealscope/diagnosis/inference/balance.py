@@ -243,9 +243,9 @@ class _Cut(NamedTuple):
 
 
 def _in_deviations(products: Array) -> float:
-    """Return the sum of products of two numbers a row over its deviation; sums over `LONGEST` are independent."""
-    sums = np.add.reduceat(products, np.arange(0, len(products), round(LONGEST / STRIDE)))
-    return float(sums.sum()) / max(float(np.linalg.norm(sums)), float(np.finfo(float).tiny))
+    """Return the sum of products of two numbers a row over its deviation, were they independent."""
+    size = float(np.linalg.norm(products) * np.sqrt(OVERLAP))
+    return float(products.sum()) / max(size, float(np.finfo(float).tiny))
 
 
 def _odds(z: float, what: str) -> float:
