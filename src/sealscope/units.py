@@ -58,7 +58,7 @@ class Unit(NamedTuple):
         powers = dict(self.powers)
         for base, exponent in other.powers:
             powers[base] = powers.get(base, Fraction(0)) + exponent * power
-        return Unit(factor, pi_power, tuple(sorted((base, power) for base, power in powers.items() if power)))
+        return Unit(factor, pi_power, tuple(sorted((base, total) for base, total in powers.items() if total)))
 
 
 def _unit(row: Mapping[str, Any]) -> Unit:

@@ -87,7 +87,7 @@ class RecordingPlan(NamedTuple):
 
     @property
     def finds(self) -> bool:
-        """Whether the chosen recording finds the target."""
+        """True if the chosen recording finds the target."""
         return self.target is None or self.chosen.conductance <= self.target
 
     def lpm(self, conductance: float) -> float | None:
@@ -140,8 +140,10 @@ class RecordingPlan(NamedTuple):
             ),
             f"  {'other duties, ' + f'{self.compared[0].duration:g} s':<34}{'found':>14}{'separable':>18}",
         ]
-        able = [row for row in self.compared if not row.note]
-        lines += [f"  {row.duty!s:<34}{self._size(row.conductance):>14}{self._size(row.separable):>18}" for row in able]
+        comparable = [row for row in self.compared if not row.note]
+        lines += [
+            f"  {row.duty!s:<34}{self._size(row.conductance):>14}{self._size(row.separable):>18}" for row in comparable
+        ]
         notes = [row for row in self.compared if row.note]
         lines += [f"  left out: {row.duty}: {row.note}"[:120] for row in notes[:1]]
         return "\n".join(lines)

@@ -186,7 +186,7 @@ def rig_numbers(rig: Rig) -> RigNumbers:
         *values[: len(PARAMETERS)],
         *derived_numbers(values, *throttle_readings(rig)),
         **choices,
-        **{name: (True,) if there else () for name, there in laws.items()},
+        **{name: (True,) if is_present else () for name, is_present in laws.items()},
     )
 
 

@@ -30,8 +30,8 @@ def spool_acceleration(x_s: float, v_s: float, x_d: float, omega_s: float, zeta_
     Source: Merritt, Hydraulic Control Systems, 1967, chapter 7: a servo valve as a second-order lag.
     """
     a = omega_s * omega_s * (x_d - x_s) - 2.0 * zeta_s * omega_s * v_s
-    held = ((v_s >= v_max) & (a > 0.0)) | ((v_s <= -v_max) & (a < 0.0))
-    return select(held, 0.0, a)  # type: ignore[no-any-return]
+    at_limit = ((v_s >= v_max) & (a > 0.0)) | ((v_s <= -v_max) & (a < 0.0))
+    return select(at_limit, 0.0, a)  # type: ignore[no-any-return]
 
 
 @contracted

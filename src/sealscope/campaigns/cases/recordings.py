@@ -34,10 +34,10 @@ def _files(plan: RecordedPlan, folder: Path) -> Iterator[tuple[RecordingSet, Pat
     for recordings in plan.sets:
         files = (path for path in folder.glob(recordings.files) if path.is_file())
         paths = sorted(files, key=lambda path: by_numbers(path.name))
-        chosen = paths[recordings.first - 1 : recordings.end - 1]
-        if not chosen:
+        selected = paths[recordings.first - 1 : recordings.end - 1]
+        if not selected:
             raise InputError(f"a set's files must be there, got none for {recordings.files!r} ({folder})")
-        yield from ((recordings, path) for path in chosen)
+        yield from ((recordings, path) for path in selected)
 
 
 def recorded_rows(plan: RecordedPlan, folder: Path, progress: ProgressCallback | None = None) -> list[CaseRow]:

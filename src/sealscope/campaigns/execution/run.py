@@ -80,8 +80,8 @@ def run(
     return store.progress_of(plan, place)
 
 
-def _rows(ended: Generator[tuple[CampaignCase, CaseRow | None], None, None]) -> Generator[CaseRow, None, None]:
+def _rows(results: Generator[tuple[CampaignCase, CaseRow | None], None, None]) -> Generator[CaseRow, None, None]:
     """Yield the rows of the cases as they end."""
-    with closing(ended):
-        for case, row in ended:
+    with closing(results):
+        for case, row in results:
             yield row or CaseRow.from_case(case, error="the process that carried it out died")

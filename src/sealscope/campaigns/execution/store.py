@@ -56,7 +56,7 @@ class CampaignProgress:
 
     @property
     def complete(self) -> bool:
-        """Whether every record has its row."""
+        """True if every record has its row."""
         return self.done == self.records
 
 

@@ -71,10 +71,10 @@ def _between(values: Iterable[float]) -> str:
 def _shown_tests(evidence: ClaimEvidence) -> Iterator[Claim]:
     """Judge the claims on the ten tests shown."""
     tests = evidence.shown
-    moved = {name: abs(_change(test.speed)) for name, test in tests.items()}
-    worst = max(moved, key=lambda name: moved[name])
-    small = [change < 1.0 for change in moved.values()]
-    yield judge_claim("5.7.1", small, moved=moved[worst], worst=worst, tests=len(moved))
+    speed_changes = {name: abs(_change(test.speed)) for name, test in tests.items()}
+    worst = max(speed_changes, key=lambda name: speed_changes[name])
+    small = [change < 1.0 for change in speed_changes.values()]
+    yield judge_claim("5.7.1", small, moved=speed_changes[worst], worst=worst, tests=len(speed_changes))
     drifts = [[1e3 * drift for drift in test.drift] for test in (tests["5.2a"], evidence.control)]
     fell, fell_anyway = (abs(before) - abs(after) for before, after in drifts)
     more = fell - fell_anyway > 0.1 * abs(fell_anyway)
@@ -131,10 +131,10 @@ def _similar(evidence: ClaimEvidence) -> Claim:
         for c in CHAMBERS
         for name in ("d1", "d2", "d3", "d4")
     }
-    same = np.sign(leak.log_change("p_A", "d3")) == np.sign(measured.log_change("p_A", "d3"))
+    same_sign = np.sign(leak.log_change("p_A", "d3")) == np.sign(measured.log_change("p_A", "d3"))
     text = (
         f"leak-free RMS over the sheet's: {', '.join(f'{name} {ratio:.2f}' for name, ratio in ratios.items())}; "
-        f"d3 of P_A moves the same way in {int(same.sum())} of {same.size}"
+        f"d3 of P_A moves the same way in {int(same_sign.sum())} of {same_sign.size}"
     )
-    parts = [1 / 1.25 <= ratio <= 1.25 for ratio in ratios.values()] + [bool(same.sum() >= 39)]
+    parts = [1 / 1.25 <= ratio <= 1.25 for ratio in ratios.values()] + [bool(same_sign.sum() >= 39)]
     return judge_claim("6.1.4", parts, compared=text, sheet="the reference")

@@ -246,23 +246,23 @@ def levels() -> Iterator[Claim]:
     texts = [
         f"{level} {min(values):.4f} to {max(values):.4f}, mean {np.mean(values):.4f}" for level, values in spans.items()
     ]
-    within = [min(values) <= NOMINAL_LPM[level] <= max(values) for level, values in spans.items()]
+    contains = [min(values) <= NOMINAL_LPM[level] <= max(values) for level, values in spans.items()]
     separate = [min(upper) > max(lower) for upper, lower in itertools.pairwise(spans.values())]
-    yield judge_claim("5.1.1", [*within, *separate], levels="; ".join(texts))
+    yield judge_claim("5.1.1", [*contains, *separate], levels="; ".join(texts))
     nominal, real = (
         (values[1] / values[0], values[2] / values[1], values[3] / values[0])
         for values in (list(NOMINAL_LPM.values()), [float(np.mean(values)) for values in spans.values()])
     )
     tests = [abs(ratio / stated - 1.0) < 0.25 for ratio, stated in zip(nominal, (0.5, 0.5, 1.0 / 16.0), strict=True)]
-    shown = {
+    ratio_texts = {
         name: ", ".join(f"{ratio:.2f}" for ratio in ratios) for name, ratios in (("nominal", nominal), ("real", real))
     }
-    yield judge_claim("5.1.2", tests, **shown)
-    named = [row for row in APPENDIX_C if row.level == "large" and row.command == "3 sin(4t)"]
-    rows = ", ".join(f"row {row.number}: {row.mean_leak_lpm:g} L/min" for row in named)
-    same = [f"{row.number} ({row.command}, {row.level})" for row in APPENDIX_C if row.mean_leak_lpm == 0.0087]
-    tests = [any(abs(row.mean_leak_lpm - 0.0087) < 5e-5 for row in named)]
-    yield judge_claim("5.1.3", tests, rows=rows, same=", ".join(same))
+    yield judge_claim("5.1.2", tests, **ratio_texts)
+    large_rows = [row for row in APPENDIX_C if row.level == "large" and row.command == "3 sin(4t)"]
+    rows = ", ".join(f"row {row.number}: {row.mean_leak_lpm:g} L/min" for row in large_rows)
+    same_leaks = [f"{row.number} ({row.command}, {row.level})" for row in APPENDIX_C if row.mean_leak_lpm == 0.0087]
+    tests = [any(abs(row.mean_leak_lpm - 0.0087) < 5e-5 for row in large_rows)]
+    yield judge_claim("5.1.3", tests, rows=rows, same=", ".join(same_leaks))
 
 
 def _on_rows(

@@ -130,7 +130,7 @@ def both_runs(context: Context, command: str, closed_pct: float | None, reading:
 
 
 def resolved(runs: Runs) -> bool:
-    """Return whether all of the runs passed the halving test."""
+    """Return True if all of the runs passed the halving test."""
     return all(run.resolved for run in runs.values())
 
 
