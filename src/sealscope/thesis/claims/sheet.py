@@ -305,16 +305,18 @@ def curves(evidence: ClaimEvidence) -> Iterator[Claim]:
             last=first + 2,
             level=f"{'an' if test.level[0] in 'aeiou' else 'a'} {test.level} leak",
             command=test.command,
-            names=_and(names),
+            names=_join_words(names),
             chamber=chamber,
             does="falls" if statement == "fall" else "changes",
             sheet=text,
             simulated=", ".join(f"{name} {100 * (rms[name][1] / rms[name][0] - 1):+.1f} %" for name in names),
             limits=", ".join(f"{in_percent(limit):+.1f} %" for limit in limits),
-            beyond_or_within=" and ".join(f"{_and(details)} {side}" for side, details in sides.items() if details),
+            beyond_or_within=" and ".join(
+                f"{_join_words(details)} {side}" for side, details in sides.items() if details
+            ),
             **({} if parts else {"why": NO_SHEET}),
         )
 
 
-def _and(names: Sequence[str]) -> str:
+def _join_words(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

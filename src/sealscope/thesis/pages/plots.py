@@ -42,7 +42,7 @@ def require_drawing() -> None:
 
 
 def draw(figure: Figure) -> tuple[bytes, bytes]:
-    """Draw the figure as SVG, its text as text, and as PNG with a palette at 200 dpi.
+    """Draw the figure: an SVG whose text stays text, and a PNG with a palette at 200 dpi.
 
     Raises MissingExtra where matplotlib is not installed.
     """
