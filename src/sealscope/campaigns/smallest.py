@@ -57,8 +57,9 @@ USUAL = PlannedDuty(COMMANDS[0])
 class Findable(NamedTuple):
     """The smallest leak that recordings of a duty and a `duration` [s] find.
 
-    `conductance` of the smallest step of the leak that is found, and of that which is separable from the pump's [m^3/(s
-    Pa)], infinite where none is; `pressure`: mean |p_A - p_B| [Pa]; `note`: why there are no figures.
+    `conductance`: the smallest step of the leak that is found, `separable`: the smallest that can be told from a step
+    of the pump's, both [m^3/(s Pa)] and infinite where there is none; `pressure`: mean |p_A - p_B| [Pa]; `note`: the
+    reason for missing figures.
     """
 
     duty: PlannedDuty

@@ -37,13 +37,13 @@ OBSERVER = layout_of(
 
 
 @law
-def observed(m: Any, theta: float, x: float, p_A: float, p_B: float) -> None:
+def update_observer(m: Any, theta: float, x: float, p_A: float, p_B: float) -> None:
     """Take a sample into the observer `m` (`OBSERVER`): angle [rad], position [m], pressures [Pa].
 
     A Kalman filter of the conductance between the chambers, a block of `BLOCK` seconds at a time. Over a block, on the
     side with the higher pressure (the other may be fed by its check valve):
     D dtheta - A dx - (V(x)/K) dp_side - (|p_A - p_B|/K) D dtheta_in = G integral of (p_A - p_B) dt, with signs turned
-    for side B; dtheta_in is what the pump turned towards that side, whose oil it draws at the other pressure. Beside G
+    for side B; dtheta_in is the pump's turn towards that side, with oil drawn at the other pressure. Besides G
     the filter holds the errors of 1/K and of the area, as shares. Friction and load do not enter.
     """
     sample, mean = (theta, x, p_A, p_B), m.averaged

@@ -1,7 +1,7 @@
 """Changes within a run: numbers of the machine over time, constant within short blocks, and instrument readings.
 
-Drifts (here) and faults (`faults`) say which: an `Effect` is a number of the compiled laws or a parameter of an
-instrument that changes, a `Hold` a reading that repeats itself.
+An `Effect` is a changing number of the compiled laws, or a changing parameter of an instrument; a `Hold` is a reading
+that repeats itself. Drifts (here) and faults (`faults`) list theirs.
 """
 
 from __future__ import annotations

@@ -125,7 +125,7 @@ def cases_of(plan: SimulatedPlan) -> list[CampaignCase]:
     return cases
 
 
-def interleaved(cases: Sequence[CampaignCase]) -> list[CampaignCase]:
+def interleave_cases(cases: Sequence[CampaignCase]) -> list[CampaignCase]:
     """Order the cases so that each kind (use, leak, law, fault) is spread evenly.
 
     A campaign that is ended early then has every kind in its proportion, each with its cells in turn.

@@ -19,7 +19,7 @@ import numpy as np
 from sealscope.campaigns.cases.case import CampaignCase, digest, world
 from sealscope.campaigns.cases.machines import sized_once, sizing_run, unsized
 from sealscope.campaigns.cases.row import CaseRow, error_text
-from sealscope.campaigns.cases.scoring import scored
+from sealscope.campaigns.cases.scoring import score_sides
 from sealscope.campaigns.plans.detectors import plan_detector
 from sealscope.campaigns.plans.duty import fault_of
 from sealscope.campaigns.plans.model import SimulatedPlan
@@ -116,7 +116,7 @@ def _carried_out(plan: SimulatedPlan, pairs: Sequence[tuple[CampaignCase, Experi
         batch = simulate_batch(experiments, bounds=bounds.ravel() / plan.rig.daq.sample_rate, threads=threads)
         for (case, _), rms, flow in zip(pairs, batch.rms, batch.mean_leak_lpm, strict=True):
             sides = Sides.from_squares(dict(zip(CHAMBERS, rms[:, [0, 2]] ** 2, strict=True)), bounds)
-            scores = scored(sides, plan.detectors, plan.views)
+            scores = score_sides(sides, plan.detectors, plan.views)
             rows.append(CaseRow.from_case(case, flow_lpm=float(flow) if case.leak_lpm else 0.0, scores=scores))
         return rows
     except Exception as error:
@@ -145,7 +145,7 @@ def _sized(experiments: Sequence[Experiment], threads: int) -> list[Experiment]:
         numbers = numbers_under(experiment.rig, experiment.load)
         limit = longest_step(numbers, size if laminar else 0.0, 0.0 if laminar else size)
         if experiment.step is not None and experiment.step > limit:
-            experiment = replace(experiment, step=stepped(experiment.rate * oversampling(experiment), limit))
+            experiment = replace(experiment, step=dividing_step(experiment.rate * oversampling(experiment), limit))
         sized[k] = experiment
     return sized
 
@@ -178,12 +178,12 @@ def step_chooser(plan: SimulatedPlan, profile: Profile | None = None) -> Callabl
         method = choose_method(experiment.rig, experiment.method)
         step = of_cell(*case.levels.items()).get(method) or _choose_method(experiment)[1]
         limit = max(longest_step(numbers_under(experiment.rig, experiment.load)), LONGEST_STEP / FINEST)
-        return step if step <= limit else stepped(experiment.rate * oversampling(experiment), limit)
+        return step if step <= limit else dividing_step(experiment.rate * oversampling(experiment), limit)
 
     return step_of
 
 
-def stepped(rate: float, limit: float) -> float:
+def dividing_step(rate: float, limit: float) -> float:
     """Compute the longest step [s] within `limit` [s] that divides the interval of outputs at `rate` [Hz]."""
     return 1.0 / (rate * steps_per_output(rate, limit))
 

@@ -87,7 +87,7 @@ class SheetClaim:
         return judge_claim(id, parts, kind, sheet=result, simulation=findings(evidence.leak)[0], **values)
 
 
-def fired(sheet: DataSheet, rule: Rule) -> str:
+def fired_share(sheet: DataSheet, rule: Rule) -> str:
     """Format `k/n = share %` of the tests that a rule fires in, with its exact 95 % interval."""
     return counted_share(rule.fires(sheet))
 

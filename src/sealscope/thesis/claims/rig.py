@@ -13,7 +13,7 @@ from sealscope.signals.filters import decomposition_filters, reach
 from sealscope.signals.windows import WINDOW_SIZE
 from sealscope.thesis.chapters.appendix_c_runs import column
 from sealscope.thesis.chapters.success_rates import CLAIMED
-from sealscope.thesis.claims.evidence import NO_SHEET, ClaimEvidence, counted_share, fired
+from sealscope.thesis.claims.evidence import NO_SHEET, ClaimEvidence, counted_share, fired_share
 from sealscope.thesis.engine.products import Claim
 from sealscope.thesis.engine.texts import judge_claim
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG
@@ -100,7 +100,7 @@ def _shown_tests(evidence: ClaimEvidence) -> Iterator[Claim]:
 def _leak(evidence: ClaimEvidence) -> Iterator[Claim]:
     """Judge whether the fall of d3 on P_A is the sign of a leak."""
     controls = [float(CLAIMED[0].fires(sheet).mean()) < 0.05 for sheet in (evidence.still, evidence.drift)]
-    counts = {name: fired(getattr(evidence, name), CLAIMED[0]) for name in ("leak", "still", "drift")}
+    counts = {name: fired_share(getattr(evidence, name), CLAIMED[0]) for name in ("leak", "still", "drift")}
     yield judge_claim("5.7.6", controls, **counts)
 
 

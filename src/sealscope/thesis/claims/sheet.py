@@ -26,7 +26,7 @@ from sealscope.thesis.claims.evidence import (
     corrected_p,
     correlated,
     counted_share,
-    fired,
+    fired_share,
     in_percent,
     moves_beyond_chance,
 )
@@ -45,8 +45,8 @@ def _past_noise(sheet: DataSheet, chamber: str, name: str) -> np.ndarray:
 
 def _controls(evidence: ClaimEvidence, rule: Rule) -> str:
     return (
-        f"In simulation the rule fires in {fired(evidence.still, rule)} with no leak and in "
-        f"{fired(evidence.drift, rule)} with drift alone"
+        f"In simulation the rule fires in {fired_share(evidence.still, rule)} with no leak and in "
+        f"{fired_share(evidence.drift, rule)} with drift alone"
     )
 
 
@@ -57,7 +57,7 @@ def _cell(rule: Rule, where: str) -> SheetClaim:
         fires = rule.fires(sheet)
         p = at_least(int(fires.sum()), fires.size, chance)
         near = any(abs(100.0 * float(fires.mean()) - rate) <= 1.0 for rate in printed)
-        yield f"{fired(sheet, rule)}; p = {p:.2g} against chance of {100 * chance:g} %", [near, p < 0.05 / 10]
+        yield f"{fired_share(sheet, rule)}; p = {p:.2g} against chance of {100 * chance:g} %", [near, p < 0.05 / 10]
 
     def values(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, str]:
         a, b = (float(part.fires(sheet).mean()) for part in (_A_BOTH, _B_BOTH))
@@ -86,7 +86,7 @@ def _before_table(sheet: DataSheet) -> Iterator[Finding]:
 
 def _over_80(sheet: DataSheet) -> Iterator[Finding]:
     for rule in CLAIMED:
-        yield f"{rule.name} {fired(sheet, rule)}", [bool(rule.fires(sheet).mean() > 0.8)]
+        yield f"{rule.name} {fired_share(sheet, rule)}", [bool(rule.fires(sheet).mean() > 0.8)]
 
 
 def _levels(sheet: DataSheet) -> Iterator[Finding]:
@@ -218,7 +218,7 @@ _CLAIMS: dict[str, SheetClaim] = {
     "5.6.2": SheetClaim(_levels, "d3 of P_A falls beyond noise: "),
     "5.6.3": SheetClaim(_smallest(CLAIMED[:6]), _SMALLEST),
     "6.1.1": SheetClaim(_passes_both, "smallest test that passes d3d4 on both chambers: "),
-    "5.5.1": SheetClaim(_sensitive, values=lambda evidence, sheet: {"d2": fired(sheet, UNCLAIMED[1])}),
+    "5.5.1": SheetClaim(_sensitive, values=lambda evidence, sheet: {"d2": fired_share(sheet, UNCLAIMED[1])}),
     "5.5.2": SheetClaim(_amplified, "mean over scatter of the log change, "),
     "5.5.3": SheetClaim(_trend("p_A"), _CORRELATION, values=_predicted),
     "5.5.4": SheetClaim(_trend("p_B"), _CORRELATION, values=_predicted),

@@ -134,7 +134,7 @@ def resolved(runs: Runs) -> bool:
     return all(run.resolved for run in runs.values())
 
 
-def finished(runs: Runs) -> list[tuple[Solver, str, SimulatedRun]]:
+def finished_runs(runs: Runs) -> list[tuple[Solver, str, SimulatedRun]]:
     """List solver, label and run of those that did not diverge."""
     return [(solver, LABELS[solver], run) for solver, run in runs.items() if not run.diverged]
 
