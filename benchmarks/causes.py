@@ -17,7 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import sealscope as ss
-from sealscope.campaigns.cases.case import CampaignCase, cases_of, interleaved
+from sealscope.campaigns.cases.case import CampaignCase, cases_of, interleave_cases
 from sealscope.campaigns.cases.machines import experiment_of
 from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.campaigns.plans.reader import load_plan
@@ -47,7 +47,7 @@ def machines(name: str, count: int, skip: int) -> Iterator[tuple[SimulatedPlan, 
     """Yield machines of a plan, healthy as they are."""
     plan = load_plan(name)
     assert isinstance(plan, SimulatedPlan)
-    cases = [case for case in interleaved(cases_of(plan)) if not case.leak_lpm and not case.fault]
+    cases = [case for case in interleave_cases(cases_of(plan)) if not case.leak_lpm and not case.fault]
     for case in cases[skip : skip + count]:
         yield plan, case
 

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from sealscope.campaigns.cases.case import CampaignCase, cases_of, interleaved
+from sealscope.campaigns.cases.case import CampaignCase, cases_of, interleave_cases
 from sealscope.campaigns.cases.machines import experiment_of
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.diagnosis.inference.balance import blocks_of
@@ -35,7 +35,7 @@ def chosen(plan_name: str, count: int) -> Iterator[tuple[CampaignCase, Recording
     """Yield cases of a plan, the same number of each kind, with their recordings and true mean flows [L/min]."""
     plan = load_plan(plan_name)
     taken: dict[tuple[float, str], int] = defaultdict(int)
-    for case in interleaved(cases_of(plan)):
+    for case in interleave_cases(cases_of(plan)):
         kind = case.leak_lpm, case.fault
         if taken[kind] == count:
             continue

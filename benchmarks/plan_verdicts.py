@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sealscope.campaigns.cases.case import cases_of, interleaved
+from sealscope.campaigns.cases.case import cases_of, interleave_cases
 from sealscope.campaigns.cases.machines import experiment_of
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.diagnosis.diagnose import diagnose
@@ -40,7 +40,7 @@ def judged(plan_name: str, records: int, false_alarm: float, channels: str) -> d
     """Return what is said of the first records of a plan, by leak [L/min] and fault."""
     plan = load_plan(plan_name)
     kinds: dict[tuple[float, str], Kind] = defaultdict(Kind)
-    for case in interleaved(cases_of(plan))[:records]:
+    for case in interleave_cases(cases_of(plan))[:records]:
         simulated = simulate_experiment(experiment_of(plan, case))
         kind, started = kinds[case.leak_lpm, case.fault], time.process_time()
         viewed = simulated.recording.only(channels.split(",")) if channels else simulated.recording

@@ -50,7 +50,7 @@ _log = logging.getLogger(__name__)
 
 
 def knows_version(version: str) -> bool:
-    """Return whether the private names of a version of numba are known."""
+    """Return True for a version of numba with known private names."""
     first, after = KNOWN_VERSIONS
     return first <= tuple(int(digits) for digits in re.findall(r"\d+", version)[:3]) < after
 

@@ -58,7 +58,7 @@ class Unit(NamedTuple):
         powers = dict(self.powers)
         for base, exponent in other.powers:
             powers[base] = powers.get(base, Fraction(0)) + exponent * power
-        return Unit(factor, pi_power, tuple(sorted((base, power) for base, power in powers.items() if power)))
+        return Unit(factor, pi_power, tuple(sorted((base, total) for base, total in powers.items() if total)))
 
 
 def _unit(row: Mapping[str, Any]) -> Unit:
@@ -175,7 +175,7 @@ def _product(tokens: list[str]) -> Unit:
 
 
 def _marked_pressure(text: str) -> Unit | None:
-    """Find the unit of a pressure marked as absolute, which has an offset, or as gauge; None for other texts."""
+    """Find the unit of a pressure marked as absolute, with its offset, or as gauge; None for other texts."""
     marked = _MARKED.fullmatch(text)
     if marked is None:
         return None
@@ -221,7 +221,7 @@ def _expected(si_unit: str) -> str:
 
 
 def same_dimension(unit: str, other: str) -> bool:
-    """Return whether values can be converted from one unit to the other; False also for a text that is no unit."""
+    """Return True for two units whose values can be converted; False also for a text that is no unit."""
     try:
         return parse_unit(unit).powers == parse_unit(other).powers
     except InputError:
@@ -229,7 +229,7 @@ def same_dimension(unit: str, other: str) -> bool:
 
 
 def is_familiar(unit: str) -> bool:
-    """Return whether a unit is made of those known without pint, as `bar`, `psig` and `cm3/s`.
+    """Return True for a unit made of those known without pint, such as `bar`, `psig` and `cm3/s`.
 
     Of pint's thousands of names many are plain words: a rod is 5 m long.
     """

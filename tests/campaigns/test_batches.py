@@ -12,7 +12,7 @@ from scipy import stats
 
 from sealscope.campaigns.cases.case import cases_of
 from sealscope.campaigns.cases.machines import sized_once, unsized
-from sealscope.campaigns.cases.scoring import judged_record
+from sealscope.campaigns.cases.scoring import judge_record
 from sealscope.campaigns.cases.work import work
 from sealscope.campaigns.execution import batches, store
 from sealscope.campaigns.execution import run as campaign
@@ -58,7 +58,7 @@ def alone(plan, case):
     experiment = unsized(plan, case)
     experiment = replace(experiment, step=step_chooser(plan)(case, experiment))
     made = simulate_experiment(replace(experiment, leaks=sized_once(experiment)))
-    return judged_record(made.recording, plan.onset_s, plan, plan.rig)[0], made.truth
+    return judge_record(made.recording, plan.onset_s, plan, plan.rig)[0], made.truth
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from sealscope.campaigns.cases.case import cases_of, interleaved
+from sealscope.campaigns.cases.case import cases_of, interleave_cases
 from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.campaigns.plans.reader import load_plan, plan_names
 from sealscope.errors import InputError
@@ -56,7 +56,7 @@ def test_a_plan_is_read_with_its_units(tiny):
 def test_kinds_of_records_take_turns(tiny):
     """However early a campaign ends, each kind has its share, within one record."""
     cases = cases_of(load_plan(tiny))
-    order = interleaved(cases)
+    order = interleave_cases(cases)
     assert sorted(order, key=cases.index) == cases
     kinds = [(case.use, case.leak_lpm) for case in order]
     for done in range(len(cases)):

@@ -3,7 +3,7 @@
 import pytest
 
 import sealscope as ss
-from sealscope.campaigns.cases.scoring import watched
+from sealscope.campaigns.cases.scoring import run_watch
 from sealscope.campaigns.plans.detectors import check_detector, plan_detector
 
 
@@ -13,7 +13,7 @@ def recording():
 
 
 def test_a_machine_that_is_watched_raises_the_alarm_of_the_record(recording):
-    evidence = watched(recording, "thesis", 0.01)
+    evidence = run_watch(recording, "thesis", 0.01)
     assert evidence.verdict == "leak"
     assert evidence.onset_s == pytest.approx(60.0, abs=1.0)
     low, high = evidence.leak_interval_lpm
@@ -24,11 +24,11 @@ def test_a_machine_that_is_watched_raises_the_alarm_of_the_record(recording):
 
 
 def test_before_the_leak_nothing_is_raised(recording):
-    assert watched(recording.between(0.0, 60.0), "thesis", 0.01).verdict == "no leak"
+    assert run_watch(recording.between(0.0, 60.0), "thesis", 0.01).verdict == "no leak"
 
 
 def test_a_machine_without_its_channels_cannot_be_watched(recording):
-    evidence = watched(recording.only(["x", "p_A"]), "thesis", 0.01)
+    evidence = run_watch(recording.only(["x", "p_A"]), "thesis", 0.01)
     assert evidence.verdict == "cannot tell"
     assert "p_B" in evidence.reason
 

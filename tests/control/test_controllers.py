@@ -13,7 +13,7 @@ import pytest
 import sealscope as ss
 from sealscope.control import CONTROLLERS, Drive, FaultTolerant, Flatness, PositionPI, controller_named
 from sealscope.control.leak_observer import conductance as estimate_of
-from sealscope.control.leak_observer import observed, observer_of
+from sealscope.control.leak_observer import observer_of, update_observer
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.simulation.experiment import Experiment
@@ -68,7 +68,7 @@ def test_the_observer_returns_the_conductance_of_a_balance_that_holds(sign):
     area = balance.area_A if sign > 0 else balance.area_B
     theta = (area * x + G * np.cumsum(p_A - p_B) / rate) / balance.D
     for sample in zip(theta, x, p_A, p_B, strict=True):
-        observed(observer, *sample)
+        update_observer(observer, *sample)
     estimate, sd, blocks = estimate_of(observer)
     # left out above: oil is drawn at the low side's pressure, a share of dp/K of what the pump turns
     assert abs(estimate - G) < max(4.0 * sd, 0.02 * G)
@@ -83,7 +83,7 @@ def test_a_leak_that_opens_at_once_is_followed_within_three_blocks_and_an_outlie
     theta[2500:2600] += 1.0  # a slip of the encoder across the end of a block
     estimates = []
     for angle in theta:
-        observed(observer, angle, 0.0, 4e6, 1e6)
+        update_observer(observer, angle, 0.0, 4e6, 1e6)
         estimates.append(estimate_of(observer)[0])
     assert np.abs(estimates[:5000]).max() < 1e-14
     assert estimates[5000 + 3 * 250] == pytest.approx(2.6e-12, rel=0.1)

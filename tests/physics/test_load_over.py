@@ -99,7 +99,7 @@ def test_the_work_of_the_pressures_is_in_piston_friction_and_load(check_rig, dri
 def test_words_and_tables_that_cannot_be(tmp_path):
     force = parse_force("500 N sin(2t) + 100 N - 20 N/m over x from -1 cm + 2 kN s/m over v")
     assert (force.over_x, force.over_v) == (((0.0, 0.0), (-0.01, -20.0)), ((0.0, 2000.0),))
-    assert force.at(np.array([0.0])) == 100.0
+    assert force.value_at(np.array([0.0])) == 100.0
     falling = parse_force(table(tmp_path / "v.csv", "v [mm/s],F [N]", (10, 5.0), (0, 1.0)))
     assert falling.over_v == ((1.0, 0.0), (0.0, 400.0), (0.01, -400.0))
     with pytest.raises(InputError, match="load must be like"):

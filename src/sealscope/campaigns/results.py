@@ -42,15 +42,15 @@ def prior_knowledge(plan: SimulatedPlan | RecordedPlan) -> dict[str, PriorKnowle
     """
     simulated = isinstance(plan, SimulatedPlan)
     rig = "" if plan.assumed is None else plan.assumed.name
-    known = {}
+    knowledge = {}
     for name in plan.detectors:
         detector = plan_detector(name)
-        known[name] = PriorKnowledge(
+        knowledge[name] = PriorKnowledge(
             onset=simulated and detector.scorer is not None and detector.scorer.split,
             channels=tuple(plan.views.get(detector.view, ALL_CHANNELS)),
             rig=rig if detector.scorer is None else "",
         )
-    return known
+    return knowledge
 
 
 def _judge(

@@ -58,8 +58,9 @@ USUAL = PlannedDuty(COMMANDS[0])
 class Findable(NamedTuple):
     """The smallest leak that recordings of a duty and a `duration` [s] find.
 
-    `conductance` of the smallest step of the leak that is found, and of that which is separable from the pump's [m^3/(s
-    Pa)], infinite where none is; `pressure`: mean |p_A - p_B| [Pa]; `note`: why there are no figures.
+    `conductance`: the smallest step of the leak that is found, `separable`: the smallest that can be told from a step
+    of the pump's, both [m^3/(s Pa)] and infinite where there is none; `pressure`: mean |p_A - p_B| [Pa]; `note`: the
+    reason for missing figures.
     """
 
     duty: PlannedDuty
@@ -88,7 +89,7 @@ class RecordingPlan(NamedTuple):
 
     @property
     def finds(self) -> bool:
-        """Whether the chosen recording finds the target."""
+        """True if the chosen recording finds the target."""
         return self.target is None or self.chosen.conductance <= self.target
 
     def lpm(self, conductance: float) -> float | None:
@@ -141,8 +142,10 @@ class RecordingPlan(NamedTuple):
             ),
             f"  {'other duties, ' + f'{self.compared[0].duration:g} s':<34}{'found':>14}{'separable':>18}",
         ]
-        able = [row for row in self.compared if not row.note]
-        lines += [f"  {row.duty!s:<34}{self._size(row.conductance):>14}{self._size(row.separable):>18}" for row in able]
+        comparable = [row for row in self.compared if not row.note]
+        lines += [
+            f"  {row.duty!s:<34}{self._size(row.conductance):>14}{self._size(row.separable):>18}" for row in comparable
+        ]
         notes = [row for row in self.compared if row.note]
         lines += [paragraph(f"left out: {row.duty}: {row.note}", "  ", 4) for row in notes[:1]]
         return "\n".join(lines)

@@ -37,9 +37,9 @@ class CompiledLaw(NamedTuple):
     """A controller's law in machine code, for one run from its beginning.
 
     `address` of a function ``double law(double *memory, double *measured)`` that returns the voltage [V] (numba.cfunc
-    gives one, as C does); `memory` (n,): what it remembers, and its numbers, of which the first is the leakage flow
-    that it makes good [m^3/s], NaN where it makes none good. `measured` is given in the order of `Measured`. `kept` is
-    what must live as long as the law.
+    gives one, as C does); `memory` (n,): its state and its numbers. The first of them is the compensated leakage flow
+    [m^3/s], NaN for a controller without one. `measured` holds the numbers of `Measured` in their order. `kept`: an
+    object that must live as long as the law.
     """
 
     address: int

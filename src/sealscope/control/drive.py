@@ -47,7 +47,7 @@ def drive_voltage(m: Any, flow: float, dp: float) -> float:
 
 
 @kernel
-def lagged(values: np.ndarray, fading: float, first: float, out: np.ndarray) -> None:
+def write_lag(values: np.ndarray, fading: float, first: float, out: np.ndarray) -> None:
     """Write the first-order lag of values (n,) into `out` (n,); `fading` of the difference remains after a sample."""
     for sample in range(values.size):
         out[sample] = first
@@ -123,9 +123,9 @@ class Drive(_Invertible):
         commanded_and_lift, late = commanded + lift, np.empty_like(commanded)
         decay, first = -1.0 / (self.lag * rate), float(lift[0])
         if settling and decay < 0.0:
-            lagged(commanded_and_lift[: settling + 1], math.exp(decay), 0.0, late[: settling + 1])
+            write_lag(commanded_and_lift[: settling + 1], math.exp(decay), 0.0, late[: settling + 1])
             first = float(late[settling]) / -math.expm1(settling * decay)
-        lagged(commanded_and_lift, math.exp(decay), first, late)
+        write_lag(commanded_and_lift, math.exp(decay), first, late)
         return np.asarray(self.displacement * (commanded + self.shortfall * (late - lift)) / (1.0 + self.shortfall))
 
     def numbers(self, rate: float, dead: float = 0.0) -> Any:

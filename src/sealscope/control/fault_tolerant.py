@@ -12,7 +12,7 @@ import numpy as np
 from sealscope.compiled import address_of, call_at, entry, layout_of, record_at, record_of
 from sealscope.control.controller import CompiledLaw, Controller, Measured, Started, law_of, measured_at
 from sealscope.control.drive import DRIVE, Drive, check_numbers, drive_voltage
-from sealscope.control.leak_observer import OBSERVER, SHUT, Balance, conductance, observed, observer_of
+from sealscope.control.leak_observer import OBSERVER, SHUT, Balance, conductance, observer_of, update_observer
 from sealscope.control.position import PositionPI
 from sealscope.errors import InputError
 
@@ -50,7 +50,7 @@ def _tolerant_law(memory: Any, sample: Any) -> Any:
     over = m.mean_A - m.mean_B
     if m.known == 0.0:
         o = m.observer
-        observed(o, measured.theta, measured.x, measured.p_A, measured.p_B)
+        update_observer(o, measured.theta, measured.x, measured.p_A, measured.p_B)
         G, sd, blocks = conductance(o)
         above = G - m.G_assumed
         target_G = 0.0
@@ -73,10 +73,10 @@ def _tolerant_law(memory: Any, sample: Any) -> Any:
 class FaultTolerant:
     """A controller that makes good the leakage across the piston: u = u_inner + inverse of (G dp).
 
-    `inner` is any controller; G [m^3/(s Pa)] comes from a Kalman filter (`observed`) on the controller's own signals,
-    less the pump's `G_assumed`, and is 0 until it stands out of its own deviation and of a count of the encoder:
-    without a leak the voltages are those of `inner`, to the last bit. `known` [m^3/(s Pa)], not negative, is taken
-    instead (the ideal that knows the leak). The flow that is made good is reported as `compensated` [m^3/s].
+    `inner` is any controller; G [m^3/(s Pa)] comes from a Kalman filter (`update_observer`) on the controller's own
+    signals, less the pump's `G_assumed`. It is 0 until it exceeds its own deviation and a count of the encoder: without
+    a leak the voltages are those of `inner`, to the last bit. `known` [m^3/(s Pa)], not negative, takes its place (an
+    ideal controller that knows the leak). The compensated flow is reported as `compensated` [m^3/s].
     """
 
     inner: Controller

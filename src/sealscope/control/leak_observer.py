@@ -37,22 +37,22 @@ OBSERVER = layout_of(
 
 
 @law
-def observed(m: Any, theta: float, x: float, p_A: float, p_B: float) -> None:
+def update_observer(m: Any, theta: float, x: float, p_A: float, p_B: float) -> None:
     """Take a sample into the observer `m` (`OBSERVER`): angle [rad], position [m], pressures [Pa].
 
     A Kalman filter of the conductance between the chambers, a block of `BLOCK` seconds at a time. Over a block, on the
     side with the higher pressure (the other may be fed by its check valve):
     D dtheta - A dx - (V(x)/K) dp_side - (|p_A - p_B|/K) D dtheta_in = G integral of (p_A - p_B) dt, with signs turned
-    for side B; dtheta_in is what the pump turned towards that side, whose oil it draws at the other pressure. Beside G
+    for side B; dtheta_in is the pump's turn towards that side, with oil drawn at the other pressure. Besides G
     the filter holds the errors of 1/K and of the area, as shares. Friction and load do not enter.
     """
-    now, mean = (theta, x, p_A, p_B), m.averaged
+    sample, mean = (theta, x, p_A, p_B), m.averaged
     if m.count == 0.0:
         for k in range(4):
-            mean[k] = m.begin[k] = now[k]
+            mean[k] = m.begin[k] = sample[k]
     before = mean[0]
     for k in range(4):
-        mean[k] = mean[k] + m.share * (now[k] - mean[k])
+        mean[k] = mean[k] + m.share * (sample[k] - mean[k])
     dp, turned = mean[2] - mean[3], mean[0] - before
     m.low, m.high = min(m.low, dp), max(m.high, dp)
     m.sum_dp += dp
@@ -75,16 +75,16 @@ def _close(m: Any, total: float) -> None:
     if min(abs(m.low), abs(m.high)) < m.shut:
         return
     begin, end, state, P = m.begin, m.averaged, m.state, m.P
-    turned, moved = m.D * (end[0] - begin[0]), end[1] - begin[1]
+    turned, travel = m.D * (end[0] - begin[0]), end[1] - begin[1]
     middle = 0.5 * (end[1] + begin[1])
     if integral > 0.0:
-        area_of, drawn = m.area_A, m.forward
+        area_of, intake = m.area_A, m.forward
         V, change = m.V_A + area_of * middle, end[2] - begin[2]
     else:
-        area_of, drawn = m.area_B, m.back
+        area_of, intake = m.area_B, m.back
         V, change = m.V_B - area_of * middle, begin[3] - end[3]
-    area = area_of * moved
-    pressed = (V * change + m.D * drawn * integral * m.rate / m.length) / m.K
+    area = area_of * travel
+    pressed = (V * change + m.D * intake * integral * m.rate / m.length) / m.K
     measured = turned - area - pressed
     # a count of the encoder at both ends, the pressures' noise over the average, and what the laws leave out
     noise = (area_of * m.x_step) ** 2 / 6.0 + 0.1 * (V / m.K * m.noise) ** 2

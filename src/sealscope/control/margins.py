@@ -117,10 +117,10 @@ def _linearised(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array
 
         _, speed_at_rest = find_moving_state(0.0)  # the load may move a piston whose drive gives way
         for _ in range(5):  # the drive falls short of its command
-            state, reached = find_moving_state(min(max(u, -limit), limit))
-            gained = reached - speed_at_rest
-            u *= min(max((speed - speed_at_rest) / gained, 0.2), 5.0) if gained * speed > 0.0 else 1.5
-        if not abs(reached - speed) < 0.2 * abs(speed):
+            state, mean_speed = find_moving_state(min(max(u, -limit), limit))
+            speed_gain = mean_speed - speed_at_rest
+            u *= min(max((speed - speed_at_rest) / speed_gain, 0.2), 5.0) if speed_gain * speed > 0.0 else 1.5
+        if not abs(mean_speed - speed) < 0.2 * abs(speed):
             raise InputError(f"speed must be one that the drive can give, got {speed:g} m/s")
         y = state
         y[VELOCITY], y[POSITION] = speed, 0.0

@@ -44,7 +44,7 @@ def _installed() -> Mapping[str, EntryPoint]:
 
 
 def is_installed(name: str) -> bool:
-    """Return whether a controller of this name is built in or installed, and no program of the name's own."""
+    """Return True for the name of a controller that is built in or installed, False for a user's own."""
     return name in CONTROLLERS or name in _installed()
 
 
@@ -52,10 +52,10 @@ def check_name(name: str) -> None:
     """Raise InputError where no controller can have this name; nothing is imported."""
     place, mark, attribute = name.rpartition(":")
     if not is_installed(name) and not (mark and place and attribute):
-        known = (*CONTROLLERS, *_installed())
+        names = (*CONTROLLERS, *_installed())
         raise InputError(
-            f"controller must be one of {', '.join(known)}, or MODULE:NAME or FILE.py:NAME of your own, got {name!r}"
-            f"{closest(name, known)}"
+            f"controller must be one of {', '.join(names)}, or MODULE:NAME or FILE.py:NAME of your own, got {name!r}"
+            f"{closest(name, names)}"
         )
 
 

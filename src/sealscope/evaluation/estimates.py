@@ -83,9 +83,9 @@ def mean_of(values: npt.ArrayLike, confidence: float = 0.95) -> IntervalEstimate
 def _coverage(low: npt.ArrayLike | None, high: npt.ArrayLike | None, truth: Array, confidence: float) -> Proportion:
     """Compute the proportion of stated intervals that hold the truth."""
     low, high = _as_many(low, truth.size, "lower limits"), _as_many(high, truth.size, "upper limits")
-    stated = ~(np.isnan(low) | np.isnan(high))
-    covered = (low <= truth) & (truth <= high) & stated
-    return proportion(int(np.count_nonzero(covered)), int(stated.sum()), confidence)
+    has_interval = ~(np.isnan(low) | np.isnan(high))
+    covered = (low <= truth) & (truth <= high) & has_interval
+    return proportion(int(np.count_nonzero(covered)), int(has_interval.sum()), confidence)
 
 
 def _as_many(values: npt.ArrayLike | None, n: int, what: str) -> Array:
@@ -110,10 +110,10 @@ def estimate_errors(
     """
     true = numbers(truth, "true values")
     stated = _as_many(estimates, true.size, "estimates")
-    known = np.isfinite(stated)
-    if not known.any():
+    has_estimate = np.isfinite(stated)
+    if not has_estimate.any():
         raise InputError(f"errors need at least one estimate, got none in {true.size} records")
-    error = stated[known] - true[known]
+    error = stated[has_estimate] - true[has_estimate]
     square, size = mean_of(error**2, confidence), np.abs(error)
     roots = [math.sqrt(max(x, 0.0)) for x in (square.value, square.low, square.high)]
     return EstimateErrors(

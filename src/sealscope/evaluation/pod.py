@@ -39,8 +39,8 @@ def by_size(leaks: npt.ArrayLike, hits: npt.ArrayLike, confidence: float = 0.95)
     hit = flags(hits, leak.size, "hits")
     rows = []
     for size in np.unique(leak):
-        here = hit[leak == size]
-        k, n = int(here.sum()), int(here.size)
+        hits_at_size = hit[leak == size]
+        k, n = int(hits_at_size.sum()), int(hits_at_size.size)
         rows.append(SizeDetection(float(size), proportion(k, n, confidence), lower_bound(k, n, confidence)))
     return rows
 
@@ -99,7 +99,7 @@ def _fitted(design: Array, n: Array, k: Array, firth: bool) -> Array:
 
 
 def _is_separated(n: Array, k: Array) -> bool:
-    """Return whether misses and hits of rising sizes overlap in one size at most: no maximum at a finite slope."""
+    """Return True if misses and hits of rising sizes overlap in one size at most: no maximum at a finite slope."""
     hits = k / n
     mixed = np.count_nonzero((hits > 0.0) & (hits < 1.0))
     steps = np.diff(hits)
@@ -243,9 +243,9 @@ def fit_hit_miss(leaks: npt.ArrayLike, hits: npt.ArrayLike) -> HitMiss:
     centre, spread = float(values.mean()), float(np.ptp(values)) / 2.0
     design = np.column_stack([np.ones(values.size), (values - centre) / spread])
     beta = _fitted(design, n, k, firth)
-    back = np.array([[1.0, -centre / spread], [0.0, 1.0 / spread]])
-    covariance = back @ np.linalg.inv(_information(design, n, design @ beta)) @ back.T
-    intercept, slope = (float(b) for b in back @ beta)
+    unscale = np.array([[1.0, -centre / spread], [0.0, 1.0 / spread]])
+    covariance = unscale @ np.linalg.inv(_information(design, n, design @ beta)) @ unscale.T
+    intercept, slope = (float(b) for b in unscale @ beta)
     plain = np.column_stack([np.ones(values.size), values])
     more = 1.0 if firth else 0.0  # with slope 0 Firth's penalty is ln(p(1 - p)) and a constant: a hit and a miss more
     level = np.full(n.size, _log_odds((k.sum() + more) / (n.sum() + 2.0 * more)))

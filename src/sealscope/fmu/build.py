@@ -235,8 +235,8 @@ def write_fmu(
     path, chosen_platforms = Path(path), _checked(path, fmi, platforms)
     machine = _pump_controlled(rig)
     if step is None:
-        step, reached = chosen_step(machine, error)
-        accuracy = f"steps of at most {step:.3g} s, by which pressures are off by {reached:.2g} Pa rms"
+        step, error_found = chosen_step(machine, error)
+        accuracy = f"steps of at most {step:.3g} s, by which pressures are off by {error_found:.2g} Pa rms"
     elif step > 0:
         accuracy = f"steps of at most {step:.3g} s"
     else:
@@ -344,8 +344,8 @@ def _checked(path: str | os.PathLike[str], fmi: int, platforms: Sequence[str] | 
     chosen_platforms = tuple(dict.fromkeys(platforms or (this_platform(),)))
     for name in chosen_platforms:
         if name not in PLATFORMS or fmi not in PLATFORMS[name].folders:
-            known = ", ".join(key for key, platform in PLATFORMS.items() if fmi in platform.folders)
-            raise InputError(f"a platform of FMI {fmi} must be one of {known}, got {name!r}")
+            platform_names = ", ".join(key for key, platform in PLATFORMS.items() if fmi in platform.folders)
+            raise InputError(f"a platform of FMI {fmi} must be one of {platform_names}, got {name!r}")
         if name != this_platform() and not compiler()[1]:
             raise InputError(f"a unit for {name} needs a compiler for it: pip install 'sealscope[fmu]'")
     return chosen_platforms

@@ -105,8 +105,8 @@ def record_fmu(
     volts = experiment.commanded.volts(t[: n * factor : factor])
     everything = {name: outputs.get(name, np.zeros(t.size)) for name in _MEASURED}
     recorded = record(experiment.rig, everything, volts, factor, experiment.seed, experiment.readings())
-    kept = {"u", *measured} | ({"omega"} if "theta" in measured else set())
-    channels = {name: values for name, values in recorded.channels.items() if name in kept}
+    recorded_names = {"u", *measured} | ({"omega"} if "theta" in measured else set())
+    channels = {name: values for name, values in recorded.channels.items() if name in recorded_names}
     channels |= {name: outputs[name][: n * factor : factor] for name in _AS_GIVEN if name in outputs}
     source = {"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "name": description.modelName}
     provenance: dict[str, Any] = {"origin": "fmu", "unit": source, "experiment": experiment.describe()}
@@ -148,13 +148,15 @@ def _description(path: Path) -> Any:
 
 def _names(path: Path, variables: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, str]:
     """Find the unit's own name of each channel and input that it has."""
-    known = {*_DRIVING, *_MEASURED}
+    wanted_names = {*_DRIVING, *_MEASURED}
     for channel, variable in names.items():
-        if channel not in known:
-            raise InputError(f"--map must name a channel or an input, got {channel!r}{closest(channel, sorted(known))}")
+        if channel not in wanted_names:
+            raise InputError(
+                f"--map must name a channel or an input, got {channel!r}{closest(channel, sorted(wanted_names))}"
+            )
         if variable not in variables:
             raise InputError(f"{path} has no variable {variable!r}{closest(variable, sorted(variables))}")
-    return {name: names.get(name, name) for name in known if names.get(name, name) in variables}
+    return {name: names.get(name, name) for name in wanted_names if names.get(name, name) in variables}
 
 
 def _driven(

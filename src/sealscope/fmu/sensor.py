@@ -194,8 +194,8 @@ def _sample(choice: SensorChoice) -> Callable[..., Any]:
     @law
     def sample(m: Any, displacement: float, p_A: float, p_B: float, theta: float, x: float) -> None:
         count, width = int(m.sample_count), m.ring.shape[1]
-        slot = count % width
-        m.ring[0, slot], m.ring[1, slot], m.ring[2, slot], m.ring[3, slot] = p_A, p_B, theta, x
+        newest = count % width
+        m.ring[0, newest], m.ring[1, newest], m.ring[2, newest], m.ring[3, newest] = p_A, p_B, theta, x
         m.sample_count += 1.0
         k = count - half - 1  # the interval from sample k on, which half a difference is known after
         if k < 0:
@@ -217,11 +217,11 @@ def _sample(choice: SensorChoice) -> Callable[..., Any]:
         row = piece - SPAN + 1
         if inside < stride - 1 or row < 0:
             return
-        whole, place = True, int(m.row_count)
+        finite, place = True, int(m.row_count)
         for j in range(_WIDTH):
             m.rows[place, j] = m.opened[row % SPAN, j]
-            whole = whole and abs(m.rows[place, j]) < LARGEST
-        m.row_count += whole
+            finite = finite and abs(m.rows[place, j]) < LARGEST
+        m.row_count += finite
         if row % strides == strides - 1:
             close(m, m.rows[: int(m.row_count)], m.ends[: int(m.pending) + 1], row // strides)
 
@@ -232,8 +232,8 @@ def _sample(choice: SensorChoice) -> Callable[..., Any]:
 def _increments(ring: Any, k: int, half: int, rate: float, displacement: float, out: Any) -> None:
     """Write the increments of the interval from sample k on, in the order of `COLUMNS`, into `out`."""
     width = ring.shape[1]
-    here, there = k % width, (k + 1) % width
-    dx, x = ring[3, there] - ring[3, here], 0.5 * (ring[3, there] + ring[3, here])
+    slot, next_slot = k % width, (k + 1) % width
+    dx, x = ring[3, next_slot] - ring[3, slot], 0.5 * (ring[3, next_slot] + ring[3, slot])
     out_A, outward, by_A = 0.0, 0.0, 0.0
     for i in range(k, k + 2):
         moves = 0.5 * (ring[3, (i + half) % width] >= ring[3, max(i - half, 0) % width])
@@ -242,7 +242,7 @@ def _increments(ring: Any, k: int, half: int, rate: float, displacement: float, 
     out[0], out[1] = out_A * dx, (outward - out_A) * dx
     out[2], out[3] = (by_A - out_A) * dx, (1.0 - outward - by_A + out_A) * dx
     for side in range(2):
-        before, after = ring[side, here], ring[side, there]
+        before, after = ring[side, slot], ring[side, next_slot]
         low, high = max(before + P_ATM, LEAST_ABSOLUTE), max(after + P_ATM, LEAST_ABSOLUTE)
         column = 4 + 4 * side
         out[column], out[column + 1] = after - before, x * (after - before)
@@ -252,8 +252,8 @@ def _increments(ring: Any, k: int, half: int, rate: float, displacement: float, 
     slope -= ring[3, (earlier + 1) % width] - ring[3, earlier % width]
     out[12] = rate * slope / (later - earlier)
     out[13] = 1.0 / rate
-    out[14] = 0.5 * (ring[0, here] + ring[0, there] - ring[1, here] - ring[1, there]) / rate
-    out[15] = displacement * (ring[2, there] - ring[2, here])
+    out[14] = 0.5 * (ring[0, slot] + ring[0, next_slot] - ring[1, slot] - ring[1, next_slot]) / rate
+    out[15] = displacement * (ring[2, next_slot] - ring[2, slot])
 
 
 @law
@@ -271,9 +271,9 @@ def _orient(m: Any, count: int) -> None:
 def _show(m: Any, error: float, rows: float, size: float, adds: bool) -> None:
     """Append the result of the block `known.own` to the last ones."""
     known = m.known
-    moved = motion(known.own[-1, -1], rows, known.numbers)
+    movement = motion(known.own[-1, -1], rows, known.numbers)
     precision, lead, shift, leaning = says(known, rows, adds)
-    if not precision > (TELLS * m.precision if moved < STANDSTILL else 0.0):
+    if not precision > (TELLS * m.precision if movement < STANDSTILL else 0.0):
         return
     total, last, k = lead / precision, m.last, int(m.blocks) % WINDOW
     g = total - shift / precision
@@ -312,8 +312,8 @@ def _take(m: Any, error: float, b: int, rows: float, size: float) -> None:
     """Take the sums of a block: the first `LEARNED` blocks are learnt from together, the others one by one."""
     known = m.known
     if m.precision > 0.0:
-        moved = motion(m.gram[b, _LEFT, _LEFT], rows, known.numbers)
-        m.woken = m.woken + 1.0 if moved > 1.0 / STANDSTILL else 0.0
+        movement = motion(m.gram[b, _LEFT, _LEFT], rows, known.numbers)
+        m.woken = m.woken + 1.0 if movement > 1.0 / STANDSTILL else 0.0
         if m.woken >= WAKES:  # all before were of a machine at standstill: nothing is compared with them
             known.sums[:, :] = 0.0
             known.along[:] = 0.0

@@ -46,7 +46,7 @@ class Cylinder(Part):
 
     @property
     def single_rod(self) -> bool:
-        """Whether the areas differ by more than makers' tolerances do."""
+        """True if the areas differ by more than makers' tolerances do."""
         return self.unevenness > _UNEVEN
 
 

@@ -113,8 +113,8 @@ def _collect(
     path: Path, place: str, visited: tuple[Path, ...]
 ) -> tuple[dict[str, str], dict[str, ParameterEntry], dict[str, str]]:
     """Read head, entries and map of columns of a file, over those of the rig it extends."""
-    here = path.resolve()
-    if here in visited or len(visited) >= _DEEPEST:
+    file = path.resolve()
+    if file in visited or len(visited) >= _DEEPEST:
         raise InputError(f"extends must end at a rig of its own, got a circle or more than {_DEEPEST} files ({place})")
     tree = read_toml(path, "a rig file", place)
     if "machine" in tree:
@@ -140,9 +140,9 @@ def _collect(
     columns: dict[str, str] = {}
     base = head.get("extends")
     if base in rig_names():
-        _, entries, columns = _collect(_PACKAGED / f"{base}.toml", f"rigs/{base}.toml", (*visited, here))
+        _, entries, columns = _collect(_PACKAGED / f"{base}.toml", f"rigs/{base}.toml", (*visited, file))
     elif base is not None and "\0" not in base and _is_path(base):
-        _, entries, columns = _collect(path.parent / base, os.fspath(Path(place).parent / base), (*visited, here))
+        _, entries, columns = _collect(path.parent / base, os.fspath(Path(place).parent / base), (*visited, file))
     elif base is not None:
         raise InputError(
             f"extends must be a packaged rig ({', '.join(rig_names())}) or a .toml file, got {base!r} ({place})"

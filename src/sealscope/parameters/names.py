@@ -29,11 +29,11 @@ def resolve(name: str, dotted: Sequence[str]) -> str:
     if len(matches) == 1:
         return matches[0]
     if matches:
-        shown = ", ".join(matches[:6]) + (", ..." if len(matches) > 6 else "")
-        raise InputError(f"parameter {name} is not unique, give one of {shown}")
-    other = _OTHER_NAMES.get(name.casefold().replace("_", "").replace(" ", ""))
-    if other in dotted:
-        raise InputError(f"{name!r} is not a parameter; did you mean {other}?")
+        listed_names = ", ".join(matches[:6]) + (", ..." if len(matches) > 6 else "")
+        raise InputError(f"parameter {name} is not unique, give one of {listed_names}")
+    synonym = _OTHER_NAMES.get(name.casefold().replace("_", "").replace(" ", ""))
+    if synonym in dotted:
+        raise InputError(f"{name!r} is not a parameter; did you mean {synonym}?")
     bare = [full.rpartition(".")[2] for full in dotted]
     raise InputError(f"{name!r} is not a parameter{closest(name, dotted if '.' in name else [*dict.fromkeys(bare)])}")
 

@@ -241,7 +241,7 @@ class Rig(Part):
         return self._stated_entries()[resolve(name, declared_names())]
 
     def states(self, *names: str) -> bool:
-        """Return whether these parameters are stated: a source that begins with `assumed:` states nothing."""
+        """Return True if these parameters are stated: a source that begins with `assumed:` states nothing."""
         return not any(self.entry(name).source.startswith(ASSUMED) for name in names)
 
     def as_assumed(self, reason: str) -> Rig:
@@ -351,16 +351,16 @@ class Rig(Part):
         One that is not stated has the value at which it is absent; `place` is named where it has none such.
         """
         entries = {**_absent_entries(place), **entries}
-        known = declared_names()
+        names = declared_names()
         for full in entries:
             if full not in declared():
-                raise InputError(f"{full} is not a parameter{closest(full, known)} ({entries[full].place})")
-        for full in known:
+                raise InputError(f"{full} is not a parameter{closest(full, names)} ({entries[full].place})")
+        for full in names:
             if full not in entries:
                 raise InputError(f"{full} is missing ({place})")
         rig = _built(cls, "", entries, place)
         rig._name, rig._title = name, title
-        rig._entries = tuple((full, entries[full]) for full in known)
+        rig._entries = tuple((full, entries[full]) for full in names)
         return rig
 
 
@@ -420,26 +420,26 @@ def _si_value(full: str, field: FieldInfo, entry: ParameterEntry) -> Value:
 
     Raises InputError for a blank source, a wrong type or a wrong unit.
     """
-    shown, place = _short_name(full), entry.place
+    short_name, place = _short_name(full), entry.place
     if not isinstance(entry.source, str) or not entry.source.strip():
-        raise InputError(f"{shown} must have a source, got none ({place})")
+        raise InputError(f"{short_name} must have a source, got none ({place})")
     if allowed := choices_of(field):
         if entry.value not in allowed:
-            raise InputError(f"{shown} must be one of {', '.join(allowed)}, got {entry.value!r} ({place})")
+            raise InputError(f"{short_name} must be one of {', '.join(allowed)}, got {entry.value!r} ({place})")
         if entry.unit:
-            raise InputError(f"{shown} is a choice and must have no unit, got {entry.unit!r} ({place})")
+            raise InputError(f"{short_name} is a choice and must have no unit, got {entry.unit!r} ({place})")
         return entry.value
     if isinstance(entry.value, bool) or not isinstance(entry.value, int | float):
-        raise InputError(f"{shown} must be a number, got {entry.value!r} ({place})")
+        raise InputError(f"{short_name} must be a number, got {entry.value!r} ({place})")
     si_unit = unit_of(field)
     if not entry.unit:
-        raise InputError(f"{shown} must have a unit, such as {si_unit}, got none ({place})")
+        raise InputError(f"{short_name} must have a unit, such as {si_unit}, got none ({place})")
     try:
-        number = to_si(float(entry.value), entry.unit, si_unit, name=shown, place=place)
+        number = to_si(float(entry.value), entry.unit, si_unit, name=short_name, place=place)
     except OverflowError:
         number = math.inf
     if not math.isfinite(number):
-        raise InputError(f"{shown} must be finite, got {entry.value} ({place})")
+        raise InputError(f"{short_name} must be finite, got {entry.value} ({place})")
     return int(number) if field.annotation is int and number.is_integer() else number
 
 
@@ -471,14 +471,14 @@ def flatten(tree: Iterable[tuple[str, Any]], place: str, prefix: str = "") -> di
 def _entry(full: str, item: Any, place: str) -> ParameterEntry:
     if full not in declared():
         raise InputError(f"{full} is not a parameter{closest(full, declared_names())} ({place})")
-    shown = _short_name(full)
+    short_name = _short_name(full)
     if not isinstance(item, dict):
-        raise InputError(f"{shown} must be {{ value = ..., unit = ..., source = ... }}, got {item!r} ({place})")
+        raise InputError(f"{short_name} must be {{ value = ..., unit = ..., source = ... }}, got {item!r} ({place})")
     if unknown := sorted(set(item) - {"value", "unit", "source"}):
-        raise InputError(f"{shown} must have value, unit and source only, got {unknown[0]} ({place})")
+        raise InputError(f"{short_name} must have value, unit and source only, got {unknown[0]} ({place})")
     if "value" not in item:
-        raise InputError(f"{shown} must have a value, got none ({place})")
+        raise InputError(f"{short_name} must have a value, got none ({place})")
     for key in ("unit", "source"):
         if not isinstance(item.get(key, ""), str):
-            raise InputError(f"{key} of {shown} must be a text, got {item[key]!r} ({place})")
+            raise InputError(f"{key} of {short_name} must be a text, got {item[key]!r} ({place})")
     return ParameterEntry(item["value"], item.get("unit", ""), item.get("source", ""), place)

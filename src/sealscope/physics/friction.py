@@ -1,7 +1,7 @@
 """Friction of piston and rod: Coulomb, Stribeck and viscous, linear near standstill (eqs. 4.20-4.22).
 
-Two other laws stand beside it, for machines that are not the thesis's: Karnopp's, in which the piston sticks, and
-LuGre, in which the contact gives way before it slides.
+Other machines may have one of two other laws. In Karnopp's the piston sticks; in LuGre's the contact gives way before
+it slides.
 """
 
 from __future__ import annotations

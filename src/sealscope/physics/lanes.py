@@ -37,11 +37,11 @@ class Lanes(types.Type):  # type: ignore[misc]
         self.number, self.width = number, width
         super().__init__(name=f"Lanes({number}, {width})")
 
-    def can_convert_from(self, typingctx: Any, other: Any) -> Any:
+    def can_convert_from(self, typingctx: Any, source: Any) -> Any:
         """Allow any number to become lanes."""
         from numba.core.typeconv import Conversion
 
-        return Conversion.safe if isinstance(other, types.Number) else None
+        return Conversion.safe if isinstance(source, types.Number) else None
 
 
 class Mask(types.Type):  # type: ignore[misc]
@@ -261,7 +261,7 @@ def _power_of_two(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
     kind, n = kinds[0], values[0]
     single = kind == SINGLES
     bits = ir.IntType(32 if single else 64)
-    whole = ir.VectorType(bits, kind.width) if isinstance(kind, Lanes) else bits
+    integers = ir.VectorType(bits, kind.width) if isinstance(kind, Lanes) else bits
     places = 23 if single else 52
     if single:
         least, most = _constant(kind, -126.0), _constant(kind, 127.0)
@@ -269,8 +269,8 @@ def _power_of_two(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
         n = builder.select(builder.fcmp_ordered(">", n, most), most, n)
     # the last bits of 1.5 * 2^52 + k (2^23) are those of the whole number k: no conversion, of doubles one by one
     large = _constant(kind, _ROUND_SINGLE + 127.0 if single else _ROUND + 1023.0)
-    biased = builder.bitcast(builder.fadd(n, large), whole)
-    shift = ir.Constant(whole, [places] * kind.width if isinstance(kind, Lanes) else places)
+    biased = builder.bitcast(builder.fadd(n, large), integers)
+    shift = ir.Constant(integers, [places] * kind.width if isinstance(kind, Lanes) else places)
     return builder.bitcast(builder.shl(biased, shift), n.type)
 
 

@@ -24,8 +24,8 @@ def winding_current_rate(
 ) -> float:
     """Compute di/dt [A/s] = (V - R_c i - C_e omega)/L_c, eq. (4.4), with the current held within +-i_max."""
     rate = (voltage - R_c * i - C_e * omega) / L_c
-    held = ((i >= i_max) & (rate > 0.0)) | ((i <= -i_max) & (rate < 0.0))
-    return select(held, 0.0, rate)  # type: ignore[no-any-return]
+    at_limit = ((i >= i_max) & (rate > 0.0)) | ((i <= -i_max) & (rate < 0.0))
+    return select(at_limit, 0.0, rate)  # type: ignore[no-any-return]
 
 
 @contracted

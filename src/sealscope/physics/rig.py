@@ -186,7 +186,7 @@ def rig_numbers(rig: Rig) -> RigNumbers:
         *values[: len(PARAMETERS)],
         *derived_numbers(values, *throttle_readings(rig)),
         **choices,
-        **{name: (True,) if there else () for name, there in laws.items()},
+        **{name: (True,) if is_present else () for name, is_present in laws.items()},
     )
 
 
@@ -377,7 +377,7 @@ def density_ratio(pressure: float, other: float, p: RigNumbers) -> float:
 def volumes_exchanged(Q: float, source: float, sink: float, p: RigNumbers) -> tuple[float, float]:
     """Compute the volume flows [m^3/s] at either end of a flow, each at its own pressure (`source`, `sink` [Pa]).
 
-    `Q` > 0 leaves the first, and is quantize at the pressure it comes from: mass is conserved, rho_in Q_in = rho_out
+    `Q` > 0 leaves the first, and is counted at the pressure it comes from: mass is conserved, rho_in Q_in = rho_out
     Q_out. Where the rig balances volumes, both are Q.
     """
     if len(p.conserving) == 0:
@@ -436,7 +436,7 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
 def outer_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
     """Compute the part of the rates that the rod seals and the make-up add.
 
-    Rates of p_A, p_B, p_1, p_2 [Pa/s], and of the oil fed [m^3/s], quantize at the accumulator's pressure.
+    Rates of p_A, p_B, p_1, p_2 [Pa/s], and of the oil fed [m^3/s], counted at the accumulator's pressure.
     """
     V_A, V_B = volumes_at(y[POSITION], p)
     K_A, K_B = bulk_modulus(y[P_A], p), bulk_modulus(y[P_B], p)

@@ -45,8 +45,8 @@ def pressures_at_standstill(force: float, p: RigNumbers) -> tuple[float, float]:
     if len(p.throttled) > 0:
         V_A, V_B = V_A + p.V_1, V_B + p.V_2
     lack = force - p.p_charge * (p.A_A - p.A_B)  # of force, at the charge pressure
-    add_step = lack / (p.A_A / V_A + p.A_B / V_B)
-    return p.p_charge + add_step / V_A, p.p_charge - add_step / V_B
+    pressed_out = lack / (p.A_A / V_A + p.A_B / V_B)
+    return p.p_charge + pressed_out / V_A, p.p_charge - pressed_out / V_B
 
 
 @law

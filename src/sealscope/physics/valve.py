@@ -30,8 +30,8 @@ def spool_acceleration(x_s: float, v_s: float, x_d: float, omega_s: float, zeta_
     Source: Merritt, Hydraulic Control Systems, 1967, chapter 7: a servo valve as a second-order lag.
     """
     a = omega_s * omega_s * (x_d - x_s) - 2.0 * zeta_s * omega_s * v_s
-    held = ((v_s >= v_max) & (a > 0.0)) | ((v_s <= -v_max) & (a < 0.0))
-    return select(held, 0.0, a)  # type: ignore[no-any-return]
+    at_limit = ((v_s >= v_max) & (a > 0.0)) | ((v_s <= -v_max) & (a < 0.0))
+    return select(at_limit, 0.0, a)  # type: ignore[no-any-return]
 
 
 @contracted
@@ -44,7 +44,7 @@ def spool_within_stroke(x_s: float, v_s: float, x_max: float, v_max: float) -> t
 
 @contracted
 def edge_flow(dp: float, way: float, overlap: float, Q_N: float, dp_N: float, x_max: float, dp_lam: float) -> float:
-    """Compute the flow [m^3/s] through an edge under `dp` [Pa], with the spool add_step `way` [m] to where it opens.
+    """Compute the flow [m^3/s] through an edge under `dp` [Pa], with the spool moved `way` [m] to where it opens.
 
     c = Q_N/sqrt(dp_N) max(way - overlap, 0)/x_max in the orifice law (`orifice_flow`): the area grows evenly beyond
     the overlap, and an edge without one passes `Q_N` at `dp_N` and full stroke. An underlap is an overlap < 0.

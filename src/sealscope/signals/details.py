@@ -139,9 +139,9 @@ def segment_means(values: Array, bounds: ArrayLike) -> Array:
 
 
 def _one_of(value: object, choices: Any, name: str) -> None:
-    known = get_args(choices)
-    if value not in known:
-        raise InputError(f"{name} must be one of {', '.join(known)}, got {value!r}")
+    allowed = get_args(choices)
+    if value not in allowed:
+        raise InputError(f"{name} must be one of {', '.join(allowed)}, got {value!r}")
 
 
 def _stationary(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Array, Array]:

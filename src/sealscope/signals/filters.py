@@ -37,8 +37,8 @@ def decomposition_filters(wavelet: str = "db8") -> tuple[Array, Array]:
     wavelet both have unit l2 norm. Source: Daubechies, Ten Lectures on Wavelets (1992), Table 6.1, as PyWavelets
     holds them.
     """
-    chosen = discrete_wavelet(wavelet)
-    return np.array(chosen.dec_lo, dtype=np.float64), np.array(chosen.dec_hi, dtype=np.float64)
+    filters = discrete_wavelet(wavelet)
+    return np.array(filters.dec_lo, dtype=np.float64), np.array(filters.dec_hi, dtype=np.float64)
 
 
 def checked_levels(levels: int) -> int:

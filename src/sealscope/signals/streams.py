@@ -97,11 +97,11 @@ class DetailStream:
         # the kernels take taps (taps, WIDTH) of low- and high-pass, and the levels' buffers (groups, rows of the table,
         # levels, history and CHUNK, WIDTH)
         self.taps = low, high
-        self.buffers = aligned((groups, self._table[0], self.levels, self._history + CHUNK, WIDTH))
+        self.buffers = aligned_zeros((groups, self._table[0], self.levels, self._history + CHUNK, WIDTH))
         self._fill, self.samples = self._history, 0
         shares = min(self.threads, groups)
         self._shares = list(pairwise(groups * i // shares for i in range(shares + 1)))
-        self._work = [aligned((self.levels, CHUNK, WIDTH)) for _ in self._shares]
+        self._work = [aligned_zeros((self.levels, CHUNK, WIDTH)) for _ in self._shares]
 
     def update(self, block: ArrayLike, out: Array | None = None) -> Array:
         """Take the next block and return its details.
@@ -188,7 +188,7 @@ class DetailStream:
         return stream
 
 
-def aligned(shape: tuple[int, ...]) -> Array:
+def aligned_zeros(shape: tuple[int, ...]) -> Array:
     """Make an array of zeros that begins at a cache line, so that no row of lanes lies on two."""
     values = np.zeros(math.prod(shape) + 8)
     skip = -(values.ctypes.data // 8) % 8

@@ -183,8 +183,8 @@ class RmsStream:
 def _piece_sums(x: Array, piece: int) -> Array:
     """Compute the sum of squares of each full piece, (..., n // piece), pairwise along a contiguous row."""
     pieces = x.shape[-1] // piece
-    whole = np.ascontiguousarray(x[..., : pieces * piece])
-    return np.asarray(np.add.reduce(np.square(whole.reshape(-1, piece)), axis=-1)).reshape(*x.shape[:-1], pieces)
+    pieces_of_x = np.ascontiguousarray(x[..., : pieces * piece])
+    return np.asarray(np.add.reduce(np.square(pieces_of_x.reshape(-1, piece)), axis=-1)).reshape(*x.shape[:-1], pieces)
 
 
 def _rms_of_pieces(sums: Array, size: int, step: int) -> Array:

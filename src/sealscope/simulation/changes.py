@@ -1,7 +1,7 @@
 """Changes within a run: numbers of the machine over time, constant within short blocks, and instrument readings.
 
-Drifts (here) and faults (`faults`) say which: an `Effect` is a number of the compiled laws or a parameter of an
-instrument that changes, a `Hold` a reading that repeats itself.
+An `Effect` is a changing number of the compiled laws, or a changing parameter of an instrument; a `Hold` is a reading
+that repeats itself. Drifts (here) and faults (`faults`) list theirs.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Effect:
 
     @property
     def of_instrument(self) -> bool:
-        """Whether an instrument changes, not the machine."""
+        """True for a change of an instrument, False for one of the machine."""
         return self.field.startswith("sensors.")
 
 
@@ -95,9 +95,9 @@ def blocks_of(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarray:
     inside = 1e-6 / rate  # so that a jump at a bound is no slope
     parts = np.ones(starts.size)
     for effect in effects:
-        moved = np.abs(effect.change(stops / rate - inside) - effect.change(starts / rate + inside))
+        jumps_of_effect = np.abs(effect.change(stops / rate - inside) - effect.change(starts / rate + inside))
         most = np.maximum(1, (stops - starts) // max(1, round(effect.shortest * rate)))
-        parts = np.maximum(parts, np.minimum(np.ceil(moved / effect.resolution - 1e-9), most))
+        parts = np.maximum(parts, np.minimum(np.ceil(jumps_of_effect / effect.resolution - 1e-9), most))
     cuts = [np.linspace(a, b, int(n), endpoint=False) for a, b, n in zip(starts, stops, parts, strict=True)]
     return np.unique(np.rint(np.concatenate([*cuts, [n_out]])).astype(np.int64))
 
@@ -134,9 +134,9 @@ class Schedule:
             kinds["open_circuit"] = (True,)
         if "air" in values and np.any(values["air"] > 0):
             kinds["aerated"] = (True,)
-        whole = base._replace(**kinds)
+        numbers = base._replace(**kinds)
         rows = table[:, new].T.tolist()
-        self.numbers = [whole._replace(**dict(zip(values, row, strict=True))) for row in rows]
+        self.numbers = [numbers._replace(**dict(zip(values, row, strict=True))) for row in rows]
 
     def blocks_between(self, first: int, last: int) -> Iterator[tuple[int, int, RigNumbers]]:
         """Yield the parts (start, stop, numbers) of the outputs first <= k < last."""
@@ -238,7 +238,7 @@ class Wander:
 
 
 def linear(size: float, duration: float) -> Wander:
-    """Make a linear change of `size` over `duration` [s], which continues as long as the run does."""
+    """Make a linear change of `size` over `duration` [s], with the same slope afterwards."""
     return Wander((), duration, size)
 
 
@@ -247,7 +247,7 @@ _STEPS = {"F_l": 0.2}
 
 
 def drifts_absolutely(parameter: str) -> bool:
-    """Return whether a parameter drifts in its own unit: an error or a load, which may be zero."""
+    """Return True for a parameter that drifts in its own unit: an error or a load, which may be zero."""
     return parameter.rpartition(".")[2] in ("offset", "gain_error", "scale_error", *_STEPS)
 
 

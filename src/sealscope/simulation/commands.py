@@ -16,7 +16,7 @@ from sealscope.units import parse_quantity
 
 
 def number_text(value: float) -> str:
-    """Format a number as the shortest text that reads back as exactly the same."""
+    """Format a number as the shortest text that reads back exactly."""
     return repr(float(value)).removesuffix(".0")
 
 
@@ -145,7 +145,7 @@ class Polyline:
         return tuple(map(float, np.unique(self.t))) if self.t.size < _LONGEST_FOLLOWED else ()
 
     def onset(self) -> float:
-        """Find the time [s] from which it is not 0: 0 for a course that begins so, infinity for one that stays 0."""
+        """Find the time [s] from which it differs from 0: 0 for a start beyond 0, infinity for a course of zeros."""
         first = int(np.argmax(self.y > 0)) if np.any(self.y > 0) else -1
         return math.inf if first < 0 else float(self.t[first - 1]) if first else 0.0
 

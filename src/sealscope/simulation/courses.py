@@ -149,8 +149,8 @@ def _recorded_force(path: str, words: str) -> Force:
     """
     with open_regular(path, "a recorded load") as file:
         head = file.readline(4096).decode("utf-8-sig", "replace")
-        named = [re.fullmatch(r"\s*(\w+)\s*\[([^\]]+)\]\s*", cell) for cell in head.split(",")]
-        columns = {match[1]: (k, match[2]) for k, match in enumerate(named) if match}
+        headings = [re.fullmatch(r"\s*(\w+)\s*\[([^\]]+)\]\s*", cell) for cell in head.split(",")]
+        columns = {match[1]: (k, match[2]) for k, match in enumerate(headings) if match}
         over = [name for name in ("t", "x", "v") if name in columns]
         if "F" not in columns or not over or over == ["x", "v"]:
             raise InputError(

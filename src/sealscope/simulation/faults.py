@@ -80,7 +80,7 @@ class FaultRow:
 
     @property
     def of_sensor(self) -> bool:
-        """Whether it is a fault of a sensor."""
+        """True for a fault of a sensor."""
         return self.kind.startswith("sensor")
 
     def read(self, text: str) -> Fault | None:
@@ -135,7 +135,7 @@ class Fault:
 
     @property
     def row(self) -> FaultRow:
-        """What faults of its kind change."""
+        """The table's row of this kind of fault."""
         return FAULTS[self.name]
 
     @property
@@ -184,7 +184,7 @@ class Fault:
         return ChangedDuty(command, self) if self.name == "duty" else command
 
     def viscosity(self, rig: Rig) -> Callable[[Array], Array] | None:
-        """Build the oil's viscosity over that of the rig, as a function of times [s]; None where it is constant."""
+        """Build the function of times [s] for the oil's viscosity over the rig's; None for a constant one."""
         if self.name != "oil":
             return None
         from sealscope.physics.fluid import kinematic_viscosity, thermal_density
@@ -248,7 +248,7 @@ def _shut_off(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
     if line.orifices == "absent":
         raise InputError(f"a shut-off valve must be in a line (line.orifices = present), got absent ({fault})")
     c_line = orifice_coefficient(line.C_d, math.pi / 4.0 * line.d_line**2, rig.fluid.rho)
-    whole = throttle_coefficients(rig.with_overrides({"line.open_A": 1.0, "line.open_B": 1.0}))
+    open_coefficients = throttle_coefficients(rig.with_overrides({"line.open_A": 1.0, "line.open_B": 1.0}))
     before = line.open_A if fault.at == "A" else line.open_B
 
     def effect(name: str, c: float) -> Effect:
@@ -260,7 +260,7 @@ def _shut_off(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
 
         return Effect(name, change, 1e-6 * c, added=True, jumps=fault.opening.bends(), shortest=_VALVE_BLOCK)
 
-    return tuple(effect(name, c) for name, c in zip(THROTTLES, whole, strict=True) if name[2] == fault.at)
+    return tuple(effect(name, c) for name, c in zip(THROTTLES, open_coefficients, strict=True) if name[2] == fault.at)
 
 
 def _warmer(fault: Fault, rig: Rig) -> tuple[Effect, ...]:

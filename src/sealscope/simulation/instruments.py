@@ -40,9 +40,9 @@ def anti_alias_taps(factor: int, delay: float = 0.0) -> Array:
     if factor == 1 and delay == 0.0:
         return np.ones(1)
     reach = FILTER_REACH * factor
-    off = np.arange(-reach, reach + 1) + delay
-    window = np.i0(_KAISER_BETA * np.sqrt(np.maximum(0.0, 1.0 - (off / reach) ** 2))) / np.i0(_KAISER_BETA)
-    taps = np.sinc((_PASS / factor if factor > 1 else 1.0) * off) * window
+    offsets = np.arange(-reach, reach + 1) + delay
+    window = np.i0(_KAISER_BETA * np.sqrt(np.maximum(0.0, 1.0 - (offsets / reach) ** 2))) / np.i0(_KAISER_BETA)
+    taps = np.sinc((_PASS / factor if factor > 1 else 1.0) * offsets) * window
     return np.asarray(taps / taps.sum())
 
 
@@ -56,11 +56,11 @@ def decimate(values: Array, factor: int, n: int, delay: float = 0.0) -> Array:
     if factor == 1 and delay == 0.0:
         return np.array(values[:n])
     reach = FILTER_REACH * factor
-    whole = math.floor(delay)
-    taps = anti_alias_taps(factor, delay - whole)
+    whole_samples = math.floor(delay)
+    taps = anti_alias_taps(factor, delay - whole_samples)
     if taps.size == 1:  # a whole delay of an unfiltered signal
         taps = np.r_[np.zeros(reach), 1.0, np.zeros(reach)]
-    padded = np.concatenate([np.full(reach + whole, values[0]), values])
+    padded = np.concatenate([np.full(reach + whole_samples, values[0]), values])
     windows = np.lib.stride_tricks.sliding_window_view(padded, taps.size)[::factor]
     return np.asarray(windows[:n] @ taps)
 
@@ -77,8 +77,10 @@ def lagging(values: Array, lag: float, rate: float) -> Array:
 
     decay = math.exp(-1.0 / (lag * rate))
     mean = (1.0 - decay) * lag * rate  # of the exponential over one interval
-    now = 1.0 - mean
-    filtered, _ = lfilter([now, mean - decay], [1.0, -decay], values, zi=[(1.0 - now) * values[0]])
+    weight_of_sample = 1.0 - mean
+    filtered, _ = lfilter(
+        [weight_of_sample, mean - decay], [1.0, -decay], values, zi=[(1.0 - weight_of_sample) * values[0]]
+    )
     return np.asarray(filtered)
 
 
@@ -87,11 +89,11 @@ def at_jittered(sampled: Callable[[Array], Array], values: Array, late: Array | 
 
     `sampled(values)` are the samples of a punctual clock; between the values a parabola is taken.
     """
-    now = sampled(values)
+    punctual = sampled(values)
     if late is None:
-        return now
+        return punctual
     before, after = sampled(np.r_[values[:1], values[:-1]]), sampled(np.r_[values[1:], values[-1:]])
-    return np.asarray(now + 0.5 * late * (after - before) + 0.5 * late**2 * (after - 2.0 * now + before))
+    return np.asarray(punctual + 0.5 * late * (after - before) + 0.5 * late**2 * (after - 2.0 * punctual + before))
 
 
 def convert(pressure: Array, sensor: PressureTransducer, daq: Daq) -> Array:

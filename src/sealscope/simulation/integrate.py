@@ -199,8 +199,8 @@ def sized_run(
 
     def measure(sizes: Array) -> tuple[Array, tuple[tuple[Leak, ...], Trajectory]]:
         nonlocal first
-        now = tuple(replace(leak, coefficient=float(size)) for leak, size in zip(current, sizes, strict=True))
-        run = trajectory(experiment, now)
+        sized = tuple(replace(leak, coefficient=float(size)) for leak, size in zip(current, sizes, strict=True))
+        run = trajectory(experiment, sized)
         pump_flow = float(np.mean(np.abs(run["Q_1"])))
         units = np.zeros(len(leaks))
         for k, leak in enumerate(leaks):
@@ -211,12 +211,12 @@ def sized_run(
                     f"a leak must be smaller than the pump's mean flow, {pump_flow / LITRE_PER_MINUTE:.4g} L/min for "
                     f"this command, got {leak.mean / LITRE_PER_MINUTE:.4g} L/min ({leak})"
                 )
-            (flowing,) = experiment.flowing((replace(now[k], coefficient=1.0),))
+            (flowing,) = experiment.flowing((replace(sized[k], coefficient=1.0),))
             units[k] = mean_while_open(leak, run.t, leak_flow(flowing, run.t, run["p_A"] - run["p_B"], dp_0))
             if not units[k] > 0:
                 raise InputError(f"a leak with a mean flow must be open within the run, got {leak}")
         first = False
-        return units, (now, run)
+        return units, (sized, run)
 
     sizes = np.array([leak.coefficient or 0.0 for leak in current])
     return size_leaks(leaks, sizes, measure, progress)[1]

@@ -67,7 +67,7 @@ class Difference:
 
     @property
     def resolved(self) -> bool:
-        """Whether the difference is within its tolerance."""
+        """True if the difference is within its tolerance."""
         return self.tolerance is None or self.difference <= self.tolerance
 
 
@@ -82,7 +82,7 @@ class Proof:
 
     @property
     def resolved(self) -> bool:
-        """Whether every difference is within its tolerance."""
+        """True if every difference is within its tolerance."""
         return all(difference.resolved for difference in self.differences)
 
     def text(self) -> str:
@@ -97,8 +97,8 @@ class Proof:
 
     def worst(self) -> Difference:
         """Find the difference furthest beyond, or nearest to, its tolerance."""
-        judged = [row for row in self.differences if row.tolerance]
-        return max(judged, key=lambda row: row.difference / (row.tolerance or math.inf))
+        limited = [row for row in self.differences if row.tolerance]
+        return max(limited, key=lambda row: row.difference / (row.tolerance or math.inf))
 
 
 @dataclass(frozen=True)

@@ -37,14 +37,14 @@ def mean_while_open(leak: Leak, t: Array, flow: Array) -> float:
     return float(flow.sum()) / total if total > 0 else 0.0
 
 
-def scaled_size(mean: float, before: tuple[float, float], now: tuple[float, float]) -> float:
+def scaled_size(mean: float, before: tuple[float, float], latest: tuple[float, float]) -> float:
     """Compute the coefficient to try next for a mean flow `mean` [m^3/s].
 
-    `before`, `now`: coefficient and mean flow of the run before and of this run; with a coefficient of 0, the flow is
+    `before`, `latest`: coefficient and mean flow of the former and of this run; with a coefficient of 0, the flow is
     that of a coefficient of 1. The slope d log flow / d log coefficient between the two is kept within what a leak can
     do, and is 1 where they do not tell.
     """
-    (c_0, q_0), (c_1, q_1) = before, now
+    (c_0, q_0), (c_1, q_1) = before, latest
     if c_1 == 0.0:
         return mean / q_1
     slope = 1.0
@@ -75,8 +75,8 @@ def size_leaks(
         if progress is not None:
             progress("sizing the leak", 1.0 - 0.5**attempt)
         units, measured = measure(sizes)
-        got = units * sizes
-        worst = float(np.abs(got[sized] / means[sized] - 1.0).max(initial=0.0))
+        flows = units * sizes
+        worst = float(np.abs(flows[sized] / means[sized] - 1.0).max(initial=0.0))
         if worst < (closest[0] if closest else SCATTERED):
             closest = worst, sizes, measured
         if closest and (worst <= TOLERANCE or attempt == MOST_RUNS - 1):
@@ -85,9 +85,9 @@ def size_leaks(
             return closest[1:]
         following = sizes.copy()
         for k in sized:
-            now = sizes[k], got[k] if sizes[k] > 0.0 else units[k]
-            following[k] = scaled_size(means[k], (before[0, k], before[1, k]), now)
-        before, sizes = np.stack([sizes, got]), following
+            latest = sizes[k], flows[k] if sizes[k] > 0.0 else units[k]
+            following[k] = scaled_size(means[k], (before[0, k], before[1, k]), latest)
+        before, sizes = np.stack([sizes, flows]), following
     raise SimulationFailed(
         f"no leakage coefficient gives the mean asked for within {TOLERANCE:g}: "
         f"{', '.join(str(leak) for leak in leaks)} is more than this "

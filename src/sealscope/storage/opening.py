@@ -27,7 +27,7 @@ _KINDS = (
 
 
 def names_a_file(text: str | os.PathLike[str]) -> bool:
-    """Return whether a text from outside can be the path of a file; too long a text or odd bytes cannot."""
+    """Return True for a text that can be the path of a file; too long a text or odd bytes cannot."""
     return os.path.isfile(text)  # noqa: PTH113 - pathlib raises for these until Python 3.14
 
 

@@ -120,20 +120,22 @@ def recall(owner: Any, names: Iterable[str], state: Any, kinds: Mapping[str, Any
     is there: in its type, or in the shape of an array but for axes that are empty.
     """
     for name in names:
-        plain, there = name.lstrip("_"), getattr(owner, name)
+        plain, present = name.lstrip("_"), getattr(owner, name)
         value = part_of(state, plain, object)
-        if isinstance(there, np.ndarray):
-            value, kind, there = array_of(value, plain), there.dtype, _unnamed(there)
-            if value.ndim != there.ndim or any(b not in (a, 0) for a, b in zip(value.shape, there.shape, strict=True)):
-                raise InputError(f"saved state's {plain} must have the shape {there.shape}, got {value.shape}")
+        if isinstance(present, np.ndarray):
+            value, kind, present = array_of(value, plain), present.dtype, _unnamed(present)
+            if value.ndim != present.ndim or any(
+                b not in (a, 0) for a, b in zip(value.shape, present.shape, strict=True)
+            ):
+                raise InputError(f"saved state's {plain} must have the shape {present.shape}, got {value.shape}")
             if kind.names:
                 value = value.view(kind)[:, 0]
-        elif hasattr(there, "recall"):
-            there.recall(value)
+        elif hasattr(present, "recall"):
+            present.recall(value)
             continue
-        elif value is not None or not isinstance(there, float | None):
-            value = restored(kinds.get(name, type(there)), value, plain)
+        elif value is not None or not isinstance(present, float | None):
+            value = restored(kinds.get(name, type(present)), value, plain)
         if isinstance(owner, tuple):
-            there[:] = value
+            present[:] = value
         elif value is not None:
             setattr(owner, name, value)

@@ -78,7 +78,7 @@ def one_line(error: ValidationError, named: Callable[[str], str] = str, unit: st
     rule.
     """
     errors = error.errors(include_url=False)
-    first = next((error for error in errors if _PLAIN_RULES.get(error["type"]) == "is not known"), errors[0])
+    first = next((detail for detail in errors if _PLAIN_RULES.get(detail["type"]) == "is not known"), errors[0])
     entry, *inner = (str(part) for part in first["loc"] or ("",) if part != "[key]")
     place = "".join([named(entry), *(f"[{int(part) + 1}]" if part.isdigit() else f".{part}" for part in inner)])
     if plain_rule := _PLAIN_RULES.get(first["type"]):

@@ -171,10 +171,10 @@ def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     sheet = context.sheet
     # d2 is shown in the changes only
     changed = [(c, q) for c in CHAMBERS for q in ("d2", "d3", "d4")]
-    shown = [(c, q) for c, q in changed if q != "d2"]
-    heads = ["hypothesis", *(f"{c} {q} simulated / measured, leak-free" for c, q in shown)]
+    columns_shown = [(c, q) for c, q in changed if q != "d2"]
+    heads = ["hypothesis", *(f"{c} {q} simulated / measured, leak-free" for c, q in columns_shown)]
     heads += [f"{c} {q} change with leak [%]" for c, q in changed]
-    heads += [f"{c} {q} sign right [of 41]" for c, q in shown]
+    heads += [f"{c} {q} sign right [of 41]" for c, q in columns_shown]
 
     def signs(sheet: DataSheet, c: str, q: str) -> Array:
         return np.asarray(np.sign(sheet.rms[c][q][:, 1] - sheet.rms[c][q][:, 0]))
@@ -184,8 +184,8 @@ def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     rig = load_rig(BENCH_RIG)
     for hypothesis in HYPOTHESES[:2] if context.quick else HYPOTHESES:
         predicted = predicted_sheet(rig, hypothesis)
-        levels = [np.mean(np.log(predicted.rms[c][q][:, 0] / sheet.rms[c][q][:, 0])) for c, q in shown]
+        levels = [np.mean(np.log(predicted.rms[c][q][:, 0] / sheet.rms[c][q][:, 0])) for c, q in columns_shown]
         changes = [100 * (float(np.exp(np.mean(predicted.log_change(c, q)))) - 1.0) for c, q in changed]
-        same = [int(np.sum(signs(predicted, c, q) == signs(sheet, c, q))) for c, q in shown]
-        rows.append((hypothesis.name, *(float(np.exp(level)) for level in levels), *changes, *same))
+        same_sign = [int(np.sum(signs(predicted, c, q) == signs(sheet, c, q))) for c, q in columns_shown]
+        rows.append((hypothesis.name, *(float(np.exp(level)) for level in levels), *changes, *same_sign))
     return (item.table(rows, note("hypotheses"), heads),)

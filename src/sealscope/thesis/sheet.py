@@ -117,11 +117,11 @@ def find_sheet(folder: str | os.PathLike[str] | None = None) -> Path | None:
 
     Raises InputError where a named folder does not hold both files.
     """
-    named = folder if folder is not None else os.environ.get(VARIABLE) or None
-    candidate = Path(named if named is not None else "data")
+    chosen_folder = folder if folder is not None else os.environ.get(VARIABLE) or None
+    candidate = Path(chosen_folder if chosen_folder is not None else "data")
     if all((candidate / name).is_file() for name in FILES.values()):
         return candidate
-    if named is None:
+    if chosen_folder is None:
         return None
     source = "--sheet" if folder is not None else VARIABLE
     raise InputError(f"{source} must name a folder with {' and '.join(FILES.values())}, got {candidate}")
@@ -176,8 +176,8 @@ def _check_condition(row: dict[str, str], condition: Condition, path: Path) -> N
     command = f"{amplitude:g} sin({'' if omega == 1 else f'{omega:g}'}t)"
     found = Condition(condition.number, command, closed, leak, (row["leakage_level"] or "").strip())
     if found != condition:
-        expected, got = (
+        expected, actual = (
             f"{test.command!r}, {test.closed_pct:g} % closed, {test.mean_leak_lpm:g} L/min, {test.level}"
             for test in (condition, found)
         )
-        raise InputError(f"row {condition.number} must be the test {expected}, got {got} ({path})")
+        raise InputError(f"row {condition.number} must be the test {expected}, got {actual} ({path})")

@@ -88,20 +88,20 @@ def _named_digests(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
 
     Another law gives other cases; a case does not depend on another family.
     """
-    named: dict[str, dict[str, str]] = {FAMILY: {}, CONTROLLER: {}}
+    digests: dict[str, dict[str, str]] = {FAMILY: {}, CONTROLLER: {}}
     for level in plan.factors.get(FAMILY, ()):
-        named[FAMILY][str(level)] = digest(repr(load_profile(plan.profile).family(str(level))))
+        digests[FAMILY][str(level)] = digest(repr(load_profile(plan.profile).family(str(level))))
     for level in plan.factors.get(CONTROLLER, ()):
         if path := source_of(str(level)):
-            named[CONTROLLER][str(level)] = hashlib.sha256(path.read_bytes()).hexdigest()
-    return named
+            digests[CONTROLLER][str(level)] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return digests
 
 
 def cases_of(plan: SimulatedPlan) -> list[CampaignCase]:
     """List all cases of a plan: records of each kind go round the cells in turn, and the last round may be short."""
     cells = [dict(zip(plan.factors, levels, strict=True)) for levels in itertools.product(*plan.factors.values())]
     shared = world(plan)
-    named = _named_digests(plan)
+    digests_by_factor = _named_digests(plan)
     cases = []
     for group in plan.records:
         for number in range(group.count):
@@ -115,7 +115,9 @@ def cases_of(plan: SimulatedPlan) -> list[CampaignCase]:
                 "replicate": replicate,
             }
             levels = {key: str(level) for key, level in cells[k].items()}
-            behind = {key: digests[levels[key]] for key, digests in named.items() if levels.get(key) in digests}
+            behind = {
+                key: digests[levels[key]] for key, digests in digests_by_factor.items() if levels.get(key) in digests
+            }
             name = digest({"world": shared, **content, **behind})
             machine, noise = np.random.SeedSequence(int(name, 16)).generate_state(2, np.uint64)
             machine_seed, noise_seed = int(machine >> np.uint64(1)), int(noise >> np.uint64(1))
@@ -123,7 +125,7 @@ def cases_of(plan: SimulatedPlan) -> list[CampaignCase]:
     return cases
 
 
-def interleaved(cases: Sequence[CampaignCase]) -> list[CampaignCase]:
+def interleave_cases(cases: Sequence[CampaignCase]) -> list[CampaignCase]:
     """Order the cases so that each kind (use, leak, law, fault) is spread evenly.
 
     A campaign that is ended early then has every kind in its proportion, each with its cells in turn.

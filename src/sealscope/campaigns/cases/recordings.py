@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from sealscope.campaigns.cases.row import STROKE, CaseRow, error_text
-from sealscope.campaigns.cases.scoring import INSPECTED, judged_record
+from sealscope.campaigns.cases.scoring import INSPECTED, judge_record
 from sealscope.campaigns.plans.model import RecordedPlan, RecordingSet
 from sealscope.diagnosis.inspection import inspected
 from sealscope.diagnosis.verdict.machine import assumed_rig
@@ -34,10 +34,10 @@ def _files(plan: RecordedPlan, folder: Path) -> Iterator[tuple[RecordingSet, Pat
     for recordings in plan.sets:
         files = inner_files(folder, folder.glob(recordings.files))
         paths = sorted(files, key=lambda path: by_numbers(path.name))
-        chosen = paths[recordings.first - 1 : recordings.end - 1]
-        if not chosen:
+        selected = paths[recordings.first - 1 : recordings.end - 1]
+        if not selected:
             raise InputError(f"a set's files must be there, got none for {recordings.files!r} ({folder})")
-        yield from ((recordings, path) for path in chosen)
+        yield from ((recordings, path) for path in selected)
 
 
 def recorded_rows(plan: RecordedPlan, folder: Path, progress: ProgressCallback | None = None) -> list[CaseRow]:
@@ -75,7 +75,7 @@ def _row(plan: RecordedPlan, recordings: RecordingSet, path: Path, name: str) ->
     )
     try:
         recording = read(path, map=plan.channel_map or None, rate=plan.rate_hz)
-        scores, statements = judged_record(recording, None, plan, assumed_rig(plan.assumed, recording)[0])
+        scores, statements = judge_record(recording, None, plan, assumed_rig(plan.assumed, recording)[0])
         levels[STROKE] = _direction(inspected(recording, INSPECTED).part)
         return row(scores=scores, statements=statements)
     except Exception as error:  # one recording must not end the others; the table says it

@@ -64,9 +64,9 @@ def duty_of(levels: Mapping[str, str | float]) -> str:
     return ", ".join(str(levels[name]) for name in (COMMAND, STROKE) if name in levels)
 
 
-def covers(named: str, true: str) -> bool:
-    """Return whether a named cause is the true one, alone or with another that no channel tells from it."""
-    return named == true or true in _EITHER.get(named, ())
+def covers(named_cause_text: str, true: str) -> bool:
+    """Return True if a named cause is the true one, alone or with another that no channel tells from it."""
+    return named_cause_text == true or true in _EITHER.get(named_cause_text, ())
 
 
 def finite(value: float | None) -> float | None:

@@ -25,7 +25,7 @@ INSPECTED = ("u", "x", "p_A", "p_B")
 _PORTION = 1.0
 
 
-def judged_record(
+def judge_record(
     recording: Recording, split_s: float | None, plan: SimulatedPlan | RecordedPlan, rig: Rig
 ) -> tuple[Scores, dict[str, Statement]]:
     """Run each detector of a plan once; return scores with onsets, and the statements of those that are no scorers.
@@ -44,7 +44,7 @@ def judged_record(
     scores: dict[str, tuple[float | None, float | None]] = {}
     if any(detector.scorer is not None for detector in detectors):
         split_s = float(record.part.t[0]) + record.part.duration / 2 if split_s is None else split_s
-        scores = scored(Sides.from_recording(record.part, split_s), plan.detectors, plan.views)
+        scores = score_sides(Sides.from_recording(record.part, split_s), plan.detectors, plan.views)
     statements: dict[str, Statement] = {}
     for detector in detectors:
         if detector.scorer is None:
@@ -57,13 +57,13 @@ def judged_record(
 
 def _evidence(detector: PlanDetector, examination: Examination) -> Evidence:
     if detector.base == WATCH:
-        return watched(examination.recording, examination.rig, examination.false_alarm_probability)
+        return run_watch(examination.recording, examination.rig, examination.false_alarm_probability)
     if detector.base == DIAGNOSE:
         return examination.fused()
     return examination.evidence(detector.base)
 
 
-def scored(sides: Sides, names: Sequence[str], views: Views) -> dict[str, tuple[float | None, float | None]]:
+def score_sides(sides: Sides, names: Sequence[str], views: Views) -> dict[str, tuple[float | None, float | None]]:
     """Compute the scores of scorers, which find no onset."""
     scores: dict[str, tuple[float | None, float | None]] = {}
     for name in names:
@@ -82,7 +82,7 @@ def _share(evidence: Statement) -> float | None:
     return rank / threshold if threshold > 0 else rank - threshold
 
 
-def watched(recording: Recording, rig: Rig | str | os.PathLike[str], false_alarm: float) -> Evidence:
+def run_watch(recording: Recording, rig: Rig | str | os.PathLike[str], false_alarm: float) -> Evidence:
     """Run the watch of a machine; return its evidence at the record's end, where a raised alarm stays.
 
     Its rate of alarms is the one at which a healthy machine alarms within the record with the probability

@@ -9,7 +9,7 @@ from pathlib import Path
 from sealscope.campaigns.cases.case import CampaignCase
 from sealscope.campaigns.cases.machines import experiment_of
 from sealscope.campaigns.cases.row import CaseRow, error_text
-from sealscope.campaigns.cases.scoring import judged_record
+from sealscope.campaigns.cases.scoring import judge_record
 from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.simulation.simulate import simulate_experiment
 
@@ -30,6 +30,6 @@ def _work(plan: SimulatedPlan, case: CampaignCase, folder: Path | None) -> CaseR
         from sealscope.recordings import write
 
         write(simulated.recording, folder / f"{case.id}.nc")
-    scores, statements = judged_record(simulated.recording, plan.onset_s, plan, plan.assumed)
+    scores, statements = judge_record(simulated.recording, plan.onset_s, plan, plan.assumed)
     flow = simulated.truth.mean_leak_lpm if case.leak_lpm else 0.0
     return CaseRow.from_case(case, flow_lpm=flow, scores=scores, statements=statements)

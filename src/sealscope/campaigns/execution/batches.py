@@ -19,7 +19,7 @@ import numpy as np
 from sealscope.campaigns.cases.case import CampaignCase, digest, world
 from sealscope.campaigns.cases.machines import sized_once, sizing_run, unsized
 from sealscope.campaigns.cases.row import CaseRow, error_text
-from sealscope.campaigns.cases.scoring import scored
+from sealscope.campaigns.cases.scoring import score_sides
 from sealscope.campaigns.plans.detectors import plan_detector
 from sealscope.campaigns.plans.duty import fault_of
 from sealscope.campaigns.plans.model import SimulatedPlan
@@ -93,37 +93,37 @@ def in_batches(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads: int)
     step_of = step_chooser(plan, profile)
     for start in range(0, len(cases), RUNS):
         started, batch = time.process_time(), cases[start : start + RUNS]
-        drawn: list[tuple[CampaignCase, Experiment]] = []
+        pairs: list[tuple[CampaignCase, Experiment]] = []
         rows: list[CaseRow] = []
         for case in batch:
             try:
                 experiment = unsized(plan, case, profile)
-                drawn.append((case, replace(experiment, step=step_of(case, experiment))))
+                pairs.append((case, replace(experiment, step=step_of(case, experiment))))
             except Exception as error:
                 rows.append(CaseRow.from_case(case, error=error_text(error)))
-        rows += _carried_out(plan, drawn, threads)
+        rows += _carried_out(plan, pairs, threads)
         seconds = round((time.process_time() - started) / len(batch), 4)
         yield from (replace(row, seconds=seconds) for row in rows)
 
 
-def _carried_out(plan: SimulatedPlan, drawn: Sequence[tuple[CampaignCase, Experiment]], threads: int) -> list[CaseRow]:
+def _carried_out(plan: SimulatedPlan, pairs: Sequence[tuple[CampaignCase, Experiment]], threads: int) -> list[CaseRow]:
     """Carry out one batch; where it fails, its halves, down to the run that is to blame."""
-    if not drawn:
+    if not pairs:
         return []
     bounds, rows = bounds_of(plan), []
     try:
-        experiments = _sized([experiment for _, experiment in drawn], threads)
+        experiments = _sized([experiment for _, experiment in pairs], threads)
         batch = simulate_batch(experiments, bounds=bounds.ravel() / plan.rig.daq.sample_rate, threads=threads)
-        for (case, _), rms, flow in zip(drawn, batch.rms, batch.mean_leak_lpm, strict=True):
+        for (case, _), rms, flow in zip(pairs, batch.rms, batch.mean_leak_lpm, strict=True):
             sides = Sides.from_squares(dict(zip(CHAMBERS, rms[:, [0, 2]] ** 2, strict=True)), bounds)
-            scores = scored(sides, plan.detectors, plan.views)
+            scores = score_sides(sides, plan.detectors, plan.views)
             rows.append(CaseRow.from_case(case, flow_lpm=float(flow) if case.leak_lpm else 0.0, scores=scores))
         return rows
     except Exception as error:
-        if len(drawn) == 1:
-            return [CaseRow.from_case(drawn[0][0], error=error_text(error))]
-    middle = len(drawn) // 2
-    return _carried_out(plan, drawn[:middle], threads) + _carried_out(plan, drawn[middle:], threads)
+        if len(pairs) == 1:
+            return [CaseRow.from_case(pairs[0][0], error=error_text(error))]
+    middle = len(pairs) // 2
+    return _carried_out(plan, pairs[:middle], threads) + _carried_out(plan, pairs[middle:], threads)
 
 
 def _sized(experiments: Sequence[Experiment], threads: int) -> list[Experiment]:
@@ -145,7 +145,7 @@ def _sized(experiments: Sequence[Experiment], threads: int) -> list[Experiment]:
         numbers = numbers_under(experiment.rig, experiment.load)
         limit = longest_step(numbers, size if laminar else 0.0, 0.0 if laminar else size)
         if experiment.step is not None and experiment.step > limit:
-            experiment = replace(experiment, step=stepped(experiment.rate * oversampling(experiment), limit))
+            experiment = replace(experiment, step=dividing_step(experiment.rate * oversampling(experiment), limit))
         sized[k] = experiment
     return sized
 
@@ -178,12 +178,12 @@ def step_chooser(plan: SimulatedPlan, profile: Profile | None = None) -> Callabl
         method = choose_method(experiment.rig, experiment.method)
         step = of_cell(*case.levels.items()).get(method) or _choose_method(experiment)[1]
         limit = max(longest_step(numbers_under(experiment.rig, experiment.load)), LONGEST_STEP / FINEST)
-        return step if step <= limit else stepped(experiment.rate * oversampling(experiment), limit)
+        return step if step <= limit else dividing_step(experiment.rate * oversampling(experiment), limit)
 
     return step_of
 
 
-def stepped(rate: float, limit: float) -> float:
+def dividing_step(rate: float, limit: float) -> float:
     """Compute the longest step [s] within `limit` [s] that divides the interval of outputs at `rate` [Hz]."""
     return 1.0 / (rate * steps_per_output(rate, limit))
 

@@ -8,7 +8,7 @@ from contextlib import closing
 from functools import partial
 from pathlib import Path
 
-from sealscope.campaigns.cases.case import CampaignCase, cases_of, interleaved
+from sealscope.campaigns.cases.case import CampaignCase, cases_of, interleave_cases
 from sealscope.campaigns.cases.recordings import ProgressCallback
 from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.cases.work import work
@@ -41,10 +41,10 @@ def run(
 
     `jobs`: processes of this machine, one a core by default and two a core at most, 1 for this process alone;
     `cluster`: address of a Dask scheduler instead; `retry`: carry failed cases out again; `batch`: simulate cases side
-    by side (`batches`) with `jobs` threads; `trust`: whether controllers that the plan leads to (`FILE.py:NAME`) are
-    run, which may be hostile. The rows are the same whoever makes them and in whatever order, those of batches in
-    any batch; kinds of records take turns (`interleaved`). Raises InputError where a controller is not trusted, the
-    folder holds another campaign, another run is at work in it, or a batch cannot do what the plan asks for.
+    by side (`batches`) with `jobs` threads; `trust`: whether the plan's own controllers (`FILE.py:NAME`), which may be
+    hostile, are run. The rows do not depend on process, order or batch; kinds of records take turns
+    (`interleave_cases`). Raises InputError for a controller that is not trusted, a folder with another campaign or
+    another run at work, and a plan that no batch can carry out.
     """
     if jobs is not None and jobs < 1:
         raise InputError(f"--jobs must be >= 1, got {jobs}")
@@ -63,7 +63,7 @@ def run(
         rows = store.rows_of(plan, place)
         if retry:
             rows = {name: row for name, row in rows.items() if row.error is None}
-        waiting = [case for case in interleaved(cases) if case.id not in rows]
+        waiting = [case for case in interleave_cases(cases) if case.id not in rows]
         report = progress or (lambda done, size, failures: None)
         done, failures = len(rows), sum(row.error is not None for row in rows.values())
         report(done, plan.size, failures)
@@ -80,8 +80,8 @@ def run(
     return store.progress_of(plan, place)
 
 
-def _rows(ended: Generator[tuple[CampaignCase, CaseRow | None], None, None]) -> Generator[CaseRow, None, None]:
+def _rows(results: Generator[tuple[CampaignCase, CaseRow | None], None, None]) -> Generator[CaseRow, None, None]:
     """Yield the rows of the cases as they end."""
-    with closing(ended):
-        for case, row in ended:
+    with closing(results):
+        for case, row in results:
             yield row or CaseRow.from_case(case, error="the process that carried it out died")

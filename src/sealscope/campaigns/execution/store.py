@@ -56,7 +56,7 @@ class CampaignProgress:
 
     @property
     def complete(self) -> bool:
-        """Whether every record has its row."""
+        """True if every record has its row."""
         return self.done == self.records
 
 
@@ -107,9 +107,8 @@ def read_rows(folder: Path) -> dict[str, CaseRow]:
 def rows_of(plan: SimulatedPlan, folder: Path) -> dict[str, CaseRow]:
     """Read the folder's rows that belong to the plan, by case id in rising order.
 
-    A row without one of the plan's detectors is not among them. Raises InputError
-    where the rows were made from something else than the plan says, by whatever sources; UnreadableFile for a row that
-    says another input than its case has.
+    Rows that lack one of the plan's detectors are left out. Raises InputError for rows of another plan, UnreadableFile
+    for a row whose inputs differ from its case's.
     """
     rows_by_id = read_rows(folder)
     if rows_by_id:

@@ -76,7 +76,7 @@ def carried_out(
 
 
 def in_order(jobs: int, task: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[Item, Result | None]]:
-    """Yield as `carried_out`, in the order of the items: one as soon as it and all before it are done."""
+    """Yield results of `carried_out` in the order of the items."""
     results: dict[int, Result | None] = {}
     place = 0
     for (number, _), result in carried_out(partial(_numbered, task), enumerate(items), jobs):
@@ -99,7 +99,7 @@ class _Pools(NamedTuple):
 def _processes(task: Callable[[Any], Any], most: int) -> Iterator[_Pools]:
     """Start processes of this machine, each a pool of its own, so that one that dies breaks no other."""
     context = get_context("spawn")
-    lifeline, held = context.Pipe(duplex=False)
+    lifeline, far_end = context.Pipe(duplex=False)
     pools: list[Executor] = []
 
     def new() -> Executor:
@@ -111,7 +111,7 @@ def _processes(task: Callable[[Any], Any], most: int) -> Iterator[_Pools]:
     try:
         yield _Pools(new, most, lambda pool, item: pool.submit(_carry_out, item), BrokenProcessPool)
     finally:
-        held.close()
+        far_end.close()
         lifeline.close()
         for pool in pools:
             pool.shutdown(wait=False, cancel_futures=True)

@@ -64,7 +64,7 @@ class Alarms:
 
     def _with_references(self) -> Verdicts:
         """Append the verdicts of two detectors that do not look: one always fires, one never."""
-        rows = [judged.row for judged in next(iter(self.verdicts.values()), ())]
+        rows = [record.row for record in next(iter(self.verdicts.values()), ())]
         always = {name: [JudgedRow(row, verdict, None) for row in rows]
                   for name, verdict in ((ALWAYS, "leak"), (NEVER, "no leak"))}  # fmt: skip
         return {**self.verdicts, **always}
@@ -75,10 +75,10 @@ class Alarms:
         A detector without a record with a leak has one row of size 0, with no detection.
         """
         for name, records in without_fault(self._with_references()).items():
-            free, leaky = ([judged for judged in records if bool(judged.size) == leaks] for leaks in (False, True))
-            alarms = self._share(judged.alarm for judged in free) if free else None
+            free, leaky = ([record for record in records if bool(record.size) == leaks] for leaks in (False, True))
+            alarms = self._share(record.alarm for record in free) if free else None
             hourly = events_per_hour(alarms.count, hours * alarms.n, self.confidence) if alarms and hours else None
-            for size, group in grouped(leaky or free, lambda judged: math.nan if together else judged.size).items():
+            for size, group in grouped(leaky or free, lambda record: math.nan if together else record.size).items():
                 shares = self._shares(name, group, leak_lpm=size)
                 detected = shares.alarms if leaky else self._share(())
                 yield replace(shares, alarms=detected, false_alarm=alarms, per_hour=hourly)
@@ -86,15 +86,15 @@ class Alarms:
     def by_cell(self) -> Iterator[AlarmShares]:
         """Yield the alarms at each size in each cell of the factors."""
         for name, records in without_fault(self.verdicts).items():
-            cells = grouped(records, lambda judged: (judged.size, repr(tuple(judged.row.levels.items()))))
+            cells = grouped(records, lambda record: (record.size, repr(tuple(record.row.levels.items()))))
             for (size, _), group in cells.items():
                 yield self._shares(name, group, leak_lpm=size, levels=dict(group[0].row.levels))
 
     def by_fault(self) -> Iterator[AlarmShares]:
         """Yield the alarms on records with each fault that is no piston leak."""
         for name, records in self._with_references().items():
-            faulty = (judged for judged in records if judged.row.fault and judged.size == 0)
-            for fault, group in grouped(faulty, lambda judged: judged.row.fault).items():
+            faulty = (record for record in records if record.row.fault and record.size == 0)
+            for fault, group in grouped(faulty, lambda record: record.row.fault).items():
                 yield self._shares(name, group, fault=fault)
 
     def by_family(self) -> Iterator[AlarmShares]:
@@ -103,31 +103,32 @@ class Alarms:
         Each size has its laws apart, and together where there are several.
         """
         for name, records in without_fault(self.verdicts).items():
-            members = (judged for judged in records if FAMILY in judged.row.levels)
-            families = grouped(members, lambda judged: str(judged.row.levels[FAMILY]))
+            members = (record for record in records if FAMILY in record.row.levels)
+            families = grouped(members, lambda record: str(record.row.levels[FAMILY]))
             for family, relatives in {ALL: records, **families}.items() if families else ():
-                for size, group in grouped(relatives, lambda judged: judged.size).items():
-                    laws = grouped(group, lambda judged: judged.row.law) if size else {}
+                for size, group in grouped(relatives, lambda record: record.size).items():
+                    laws = grouped(group, lambda record: record.row.law) if size else {}
                     for law, of_law in laws.items() if len(laws) == 1 else {ANY_LAW: group, **laws}.items():
                         yield self._shares(name, of_law, family=family, leak_lpm=size, law=law)
 
     def _share(self, flags: Iterable[bool]) -> Proportion:
-        counted = list(flags)
-        return proportion(sum(counted), len(counted), self.confidence)
+        values = list(flags)
+        return proportion(sum(values), len(values), self.confidence)
 
     def _shares(self, detector: str, group: Sequence[JudgedRow], **common: Any) -> AlarmShares:
-        stated = [(judged, judged.statement) for judged in group if judged.statement is not None]
-        intervals = [(judged.flow_lpm, statement.leak_interval_lpm) for judged, statement in stated]
-        named = [
-            judged.alarm and covers(named_cause(statement), cause_of(judged.row.fault)) for judged, statement in stated
+        statements = [(record, record.statement) for record in group if record.statement is not None]
+        intervals = [(record.flow_lpm, statement.leak_interval_lpm) for record, statement in statements]
+        naming = [
+            record.alarm and covers(named_cause(statement), cause_of(record.row.fault))
+            for record, statement in statements
         ]
-        silent = [False] * (len(group) - len(stated))
+        silent = [False] * (len(group) - len(statements))
         return AlarmShares(
             detector=detector,
-            alarms=self._share(judged.alarm for judged in group),
-            cannot_tell=self._share(judged.verdict == CANNOT_TELL for judged in group),
+            alarms=self._share(record.alarm for record in group),
+            cannot_tell=self._share(record.verdict == CANNOT_TELL for record in group),
             coverage=self._share(ends[0] <= flow <= ends[1] for flow, ends in intervals if ends is not None),
-            named=self._share(named + silent) if stated else None,
-            failed=sum(judged.row.error is not None for judged in group),
+            named=self._share(naming + silent) if statements else None,
+            failed=sum(record.row.error is not None for record in group),
             **common,
         )

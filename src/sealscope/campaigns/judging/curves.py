@@ -45,10 +45,10 @@ class SizeRoc:
 def pods_of(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
     """Yield the probability of detection over the size, where there are leaks."""
     for name, records in verdicts.items():
-        leaky = [judged for judged in records if judged.size > 0]
+        leaky = [record for record in records if record.size > 0]
         if not leaky:
             continue
-        sizes, hits = [judged.size for judged in leaky], [judged.alarm for judged in leaky]
+        sizes, hits = [record.size for record in leaky], [record.alarm for record in leaky]
         detections = by_size(sizes, hits, confidence)
         curve, why = None, ""
         try:
@@ -61,15 +61,15 @@ def pods_of(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
 def rocs_of(verdicts: Verdicts, confidence: float) -> Iterator[SizeRoc]:
     """Yield curves over the scores, with no threshold; a record that cannot be judged counts as the lowest."""
     for name, records in verdicts.items():
-        scores = [judged.row.scores[name][0] if judged.row.error is None else None for judged in records]
+        scores = [record.row.scores[name][0] if record.row.error is None else None for record in records]
         lowest = min((score for score in scores if score is not None), default=None)
         if lowest is None:
             continue
         by_leak: dict[float, list[float]] = {}
-        for judged, score in zip(records, scores, strict=True):
-            by_leak.setdefault(judged.size, []).append(lowest - 1.0 if score is None else score)
+        for record, score in zip(records, scores, strict=True):
+            by_leak.setdefault(record.size, []).append(lowest - 1.0 if score is None else score)
         free = by_leak.pop(0.0, [])
-        together = [score for leaky in by_leak.values() for score in leaky]
-        for size, leaky in ((math.nan, together), *sorted(by_leak.items())):
+        all_scores = [score for leaky in by_leak.values() for score in leaky]
+        for size, leaky in ((math.nan, all_scores), *sorted(by_leak.items())):
             if min(len(free), len(leaky)) > 1:
                 yield SizeRoc(name, size, roc_curve(free, leaky, confidence), auc(free, leaky, confidence))

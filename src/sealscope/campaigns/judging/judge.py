@@ -59,10 +59,10 @@ def judge(
 ) -> Judgement:
     """Compute verdicts and figures of all rows to judge.
 
-    A detector's verdict is the one it stated, or its score's against a threshold: that in `limits`, that of the scorer,
-    else the one from the leak-free rows of the row's duty (`thresholds_of`), which are not asked where there are
-    `limits`. `onset_s` [s]: true onset in leaky records, `hours`: operating time of a record; without them no errors of
-    onsets or alarms per hour are given. Raises InputError where there is no row to judge.
+    A detector's verdict is its own, or its score's against a threshold. The threshold is the one in `limits`, else the
+    scorer's, else that of the leak-free rows of the same duty (`thresholds_of`), which `limits` turn off. `onset_s`
+    [s]: true onset in leaky records, `hours`: operating time of a record; without them there are no errors of onsets
+    and no alarms per hour. Raises InputError where there is no row to judge.
     """
     judged = sorted((row for row in rows if row.use == "judge"), key=lambda row: row.id)
     if not judged:

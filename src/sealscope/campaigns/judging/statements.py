@@ -42,29 +42,29 @@ class NamedCauses:
 def onset_errors(verdicts: Verdicts, onset_s: float, confidence: float) -> Iterator[StatedErrors]:
     """Yield, for detectors that search for the onset, its error over the alarms, by size."""
     for name, records in verdicts.items():
-        for size, group in grouped((judged for judged in records if judged.size > 0 and judged.alarm), _size).items():
-            stated = [
-                (onset, onset_s, None if judged.statement is None else judged.statement.onset_interval_s)
-                for judged in group
-                if (onset := judged.row.scores[name][1]) is not None
+        for size, group in grouped((record for record in records if record.size > 0 and record.alarm), _size).items():
+            estimates = [
+                (onset, onset_s, None if record.statement is None else record.statement.onset_interval_s)
+                for record in group
+                if (onset := record.row.scores[name][1]) is not None
             ]
-            yield from _errors(name, size, stated, confidence)
+            yield from _errors(name, size, estimates, confidence)
 
 
 def flow_errors(verdicts: Verdicts, confidence: float) -> Iterator[StatedErrors]:
     """Yield, for detectors that state a flow, its errors against the record's true flow, by size."""
     for name, records in verdicts.items():
         for size, group in grouped(records, _size).items():
-            stated = [
-                (judged.statement.leak_lpm, judged.flow_lpm, judged.statement.leak_interval_lpm)
-                for judged in group
-                if judged.statement is not None
+            estimates = [
+                (record.statement.leak_lpm, record.flow_lpm, record.statement.leak_interval_lpm)
+                for record in group
+                if record.statement is not None
             ]
-            yield from _errors(name, size, stated, confidence)
+            yield from _errors(name, size, estimates, confidence)
 
 
-def _size(judged: JudgedRow) -> float:
-    return judged.size
+def _size(record: JudgedRow) -> float:
+    return record.size
 
 
 def _errors(
@@ -87,19 +87,19 @@ def causes_of(verdicts: Verdicts, confidence: float) -> Iterator[NamedCauses]:
     A record with a leak and another fault is left out; one that failed is `cannot tell`.
     """
     for name, records in verdicts.items():
-        single = [judged for judged in records if not (judged.size > 0 and judged.row.fault)]
-        other_causes = sorted({cause_of(judged.row.fault) for judged in single if judged.row.fault})
-        if not other_causes or not any(name in judged.row.statements for judged in single):
+        single = [record for record in records if not (record.size > 0 and record.row.fault)]
+        other_causes = sorted({cause_of(record.row.fault) for record in single if record.row.fault})
+        if not other_causes or not any(name in record.row.statements for record in single):
             continue
-        truth = [_true_cause(judged) for judged in single]
+        truth = [_true_cause(record) for record in single]
         causes = [cause for cause in (NO_CAUSE, PISTON_LEAK) if cause in truth] + other_causes
-        named = [CANNOT_TELL if judged.statement is None else named_cause(judged.statement) for judged in single]
-        causes += sorted(set(named) - set(causes) - {CANNOT_TELL})
-        covered = proportion(sum(map(covers, named, truth)), len(truth), confidence)
-        yield NamedCauses(name, confusion_matrix(truth, named, causes, confidence), covered)
+        named_causes = [CANNOT_TELL if record.statement is None else named_cause(record.statement) for record in single]
+        causes += sorted(set(named_causes) - set(causes) - {CANNOT_TELL})
+        covered = proportion(sum(map(covers, named_causes, truth)), len(truth), confidence)
+        yield NamedCauses(name, confusion_matrix(truth, named_causes, causes, confidence), covered)
 
 
-def _true_cause(judged: JudgedRow) -> str:
-    if judged.size > 0:
+def _true_cause(record: JudgedRow) -> str:
+    if record.size > 0:
         return PISTON_LEAK
-    return cause_of(judged.row.fault) if judged.row.fault else NO_CAUSE
+    return cause_of(record.row.fault) if record.row.fault else NO_CAUSE

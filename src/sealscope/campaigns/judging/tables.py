@@ -64,8 +64,8 @@ def _cells(column: str, content: str, row: Any, factors: Sequence[str]) -> Table
     if path == "levels":
         return {name: value.get(name) for name in factors}
     if "share" in how:
-        known = value is not None and (value.n or "stated" not in how)
-        parts = (value.count, value.n, value.value, value.low, value.high) if known else (None,) * 5
+        is_stated = value is not None and (value.n or "stated" not in how)
+        parts = (value.count, value.n, value.value, value.low, value.high) if is_stated else (None,) * 5
         return {f"{column}: {part}": value_of_part for part, value_of_part in zip(_SHARE, parts, strict=True)}
     return {column: "any" if "size" in how and math.isnan(value) else value}
 

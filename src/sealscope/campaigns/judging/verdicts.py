@@ -35,7 +35,7 @@ class JudgedRow(NamedTuple):
 
     @property
     def alarm(self) -> bool:
-        """Whether the verdict is `leak`."""
+        """True for the verdict `leak`."""
         return self.verdict == "leak"
 
 
@@ -67,9 +67,9 @@ def thresholds_of(
     thresholds = {}
     for name in needing:
         for duty, group in leak_free.items():
-            known = [score for row in group if (score := row.scores[name][0]) is not None]
-            if known and len(group) >= needed:
-                scores = known + [min(known)] * (len(group) - len(known))
+            scores_of_group = [score for row in group if (score := row.scores[name][0]) is not None]
+            if scores_of_group and len(group) >= needed:
+                scores = scores_of_group + [min(scores_of_group)] * (len(group) - len(scores_of_group))
                 thresholds[name, duty] = quantile_threshold(scores, false_alarm, confidence, promise)
     return thresholds
 
@@ -96,7 +96,7 @@ def verdicts_of(
 
 def without_fault(verdicts: Verdicts) -> Verdicts:
     """Select the verdicts on records without another fault."""
-    return {name: [judged for judged in records if not judged.row.fault] for name, records in verdicts.items()}
+    return {name: [record for record in records if not record.row.fault] for name, records in verdicts.items()}
 
 
 def grouped(items: Iterable[_T], key: Callable[[_T], Any]) -> dict[Any, list[_T]]:

@@ -43,7 +43,7 @@ class PlanDetector:
 
     @property
     def needs_threshold(self) -> bool:
-        """Whether leak-free records must set its threshold."""
+        """True if leak-free records must set its threshold."""
         return self.scorer is not None and self.scorer.threshold is None
 
 
@@ -62,11 +62,11 @@ def check_detector(name: str, views: Views) -> None:
     if parsed.view and parsed.view not in views:
         known_views = ", ".join(view for view in views if view) or "none"
         raise InputError(f"what stands behind '@' must be one of [views] ({known_views}), got {name!r}")
-    known = [DIAGNOSE, WATCH, *detectors()]
-    if parsed.scorer is not None or parsed.base in known:
+    names = [DIAGNOSE, WATCH, *detectors()]
+    if parsed.scorer is not None or parsed.base in names:
         return
-    near = nearest(name.partition(_VIEW)[0], [*SCORERS, *known], share=0.6)
+    near = nearest(name.partition(_VIEW)[0], [*SCORERS, *names], share=0.6)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     raise InputError(
-        f"a detector must be one of {', '.join(known)}, or a scorer's name such as 'd3 of p_A fell', got {name!r}{hint}"
+        f"a detector must be one of {', '.join(names)}, or a scorer's name such as 'd3 of p_A fell', got {name!r}{hint}"
     )

@@ -121,8 +121,8 @@ class _Plan(_Entries):
 class _JudgedPlan(_Plan):
     """The fields of plans over records of a machine.
 
-    `unit`: of the sizes of leaks; `views`: sets of channels that detectors see (`detectors`), "" for those that name
-    none, of which `channels` says it; `assume`: the rig that detectors may assume, with the values `assume_set`.
+    `unit`: of the sizes of leaks; `views`: sets of channels by name, for the detectors that name one (`detectors`);
+    `channels`: for all others; `assume`: the rig that detectors may assume, with the values `assume_set`.
     """
 
     false_alarm: Share = 0.01

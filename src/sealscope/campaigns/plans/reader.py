@@ -81,8 +81,8 @@ def _entries(tree: Mapping[str, Any], place: str) -> AnyPlan:
     kind, tables, entries_of_source = _KINDS[source]
     for key in tree:
         if key not in tables:
-            known = ", ".join(f"[{name}]" for name in tables)
-            raise InputError(f"[{key}] is not known; a plan with [{source}] has {known} ({place})")
+            table_names = ", ".join(f"[{name}]" for name in tables)
+            raise InputError(f"[{key}] is not known; a plan with [{source}] has {table_names} ({place})")
     entries, names = {**tree, "place": place}, {name: name for name in tables}
     for table in ("campaign", source) if entries_of_source else ("campaign",):
         values = entries.pop(table, {})
@@ -148,8 +148,8 @@ def _commands(plan: SimulatedPlan) -> tuple[str | float, ...]:
     """Return the commands of a plan: its factor's, or else those of its profile, or of its families there."""
     if COMMAND in plan.factors or not plan.profile:
         return plan.factors.get(COMMAND, ("3 sin(4t)",))
-    drawn = load_profile(plan.profile)
-    kinds = [drawn.of_family(str(family)) for family in plan.factors.get("family", ())] or [drawn]
+    profile = load_profile(plan.profile)
+    kinds = [profile.of_family(str(family)) for family in plan.factors.get("family", ())] or [profile]
     return tuple(command for kind in kinds for command in kind.duty.commands)
 
 

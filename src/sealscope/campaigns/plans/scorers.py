@@ -101,7 +101,7 @@ class Scorer:
 
     @property
     def split(self) -> bool:
-        """Whether the rule compares the two sides of the split."""
+        """True if the rule compares the two sides of the split."""
         return all(_WORDS[word][0] == "change" for _, _, word in self.parts)
 
     @property

@@ -84,33 +84,33 @@ def _solved(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
     step = GAMMA * h
     p_A, p_B, p_1, p_2 = rig.pressures_of(z, p)
     total_A, total_B = p_1 - p_A, p_B - p_2
-    add_step = z
+    solved = z
     s = (z[P_A], z[P_B], z[P_1], z[P_2])
     turns = AIR_TURNS if len(p.aerated) + len(p.conserving) + len(p.boiling) > 0 else 1
     for _ in range(turns):
-        K_A, K_B = rig.bulk_modulus(add_step[P_A], p), rig.bulk_modulus(add_step[P_B], p)
-        K_1, K_2 = rig.bulk_modulus(add_step[P_1], p), rig.bulk_modulus(add_step[P_2], p)
+        K_A, K_B = rig.bulk_modulus(solved[P_A], p), rig.bulk_modulus(solved[P_B], p)
+        K_1, K_2 = rig.bulk_modulus(solved[P_1], p), rig.bulk_modulus(solved[P_2], p)
         r_A, r_B = pressure_rate(1.0, V_A, K_A), pressure_rate(1.0, V_B, K_B)
         r_1, r_2 = pressure_rate(1.0, p.V_1, K_1), pressure_rate(1.0, p.V_2, K_2)
         if len(p.boiling) > 0:
             least = p.p_vap - P_ATM
-            boils_A, boils_B = add_step[P_A] < least, add_step[P_B] < least
-            boils_1, boils_2 = add_step[P_1] < least, add_step[P_2] < least
+            boils_A, boils_B = solved[P_A] < least, solved[P_B] < least
+            boils_1, boils_2 = solved[P_1] < least, solved[P_2] < least
             total_A = select(boils_1, least, z[P_1]) - select(boils_A, least, z[P_A])
             total_B = select(boils_B, least, z[P_B]) - select(boils_2, least, z[P_2])
             r_A, r_B = select(boils_A, 0.0 * r_A, r_A), select(boils_B, 0.0 * r_B, r_B)
             r_1, r_2 = select(boils_1, 0.0 * r_1, r_1), select(boils_2, 0.0 * r_2, r_2)
         g_A, g_B = step * (r_A + r_1), step * (r_B + r_2)
         Q_A, Q_B = rig.implicit_flows(total_A, total_B, g_A, g_B, z, p)
-        s = rig.throttle_rates(add_step, Q_A, Q_B, p)
-        before = add_step
-        add_step = add_to_pressures(z, step, s)
+        s = rig.throttle_rates(solved, Q_A, Q_B, p)
+        before = solved
+        solved = add_to_pressures(z, step, s)
         if turns > 1:
-            settled_A = max(abs(add_step[P_A] - before[P_A]), abs(add_step[P_1] - before[P_1]))
-            settled_B = max(abs(add_step[P_B] - before[P_B]), abs(add_step[P_2] - before[P_2]))
+            settled_A = max(abs(solved[P_A] - before[P_A]), abs(solved[P_1] - before[P_1]))
+            settled_B = max(abs(solved[P_B] - before[P_B]), abs(solved[P_2] - before[P_2]))
             if not anywhere(max(settled_A, settled_B) >= AIR_SETTLED):
                 break
-    return add_step, s
+    return solved, s
 
 
 @contracted

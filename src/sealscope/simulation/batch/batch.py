@@ -171,9 +171,9 @@ def simulate_batch(
     done = 0.0
     for part in sets:
 
-        def report(share: float, begun: float = done, size: int = len(part.members)) -> None:
+        def report(share: float, start_share: float = done, size: int = len(part.members)) -> None:
             if progress is not None:
-                progress(min(1.0, begun + share * size / n))
+                progress(min(1.0, start_share + share * size / n))
 
         stated_error = part.experiment.error
         _run(part, batch, error if stated_error is None else stated_error, threads or os.cpu_count() or 1, report)

@@ -123,7 +123,7 @@ def sets_of(experiments: Sequence[Experiment]) -> list[LaneSet]:
     first = experiments[0]
     by_kind: dict[Any, list[Member]] = {}
     shapes: dict[Any, Command] = {}
-    known: dict[Any, RigNumbers] = {}  # by rig and load: most batches have few of them
+    numbers_by_rig: dict[Any, RigNumbers] = {}  # by rig and load: most batches have few of them
     for place, experiment in enumerate(experiments):
         for name in ("duration", "rate"):
             value, common = getattr(experiment, name), getattr(first, name)
@@ -131,9 +131,9 @@ def sets_of(experiments: Sequence[Experiment]) -> list[LaneSet]:
                 raise InputError(f"runs of a batch must have one {name}, got {common:g} and {value:g} (run {place})")
         refuse(experiment, place)
         load = None if experiment.load is None else str(exact(experiment.load))
-        if (id(experiment.rig), load) not in known:
-            known[id(experiment.rig), load] = numbers_under(experiment.rig, experiment.load)
-        numbers = known[id(experiment.rig), load]
+        if (id(experiment.rig), load) not in numbers_by_rig:
+            numbers_by_rig[id(experiment.rig), load] = numbers_under(experiment.rig, experiment.load)
+        numbers = numbers_by_rig[id(experiment.rig), load]
         effects = experiment.effects()
         if any(effect.field.startswith("G_ext") for effect in effects):
             numbers = numbers._replace(open_circuit=(True,))
@@ -157,8 +157,8 @@ def in_lanes(values: Array, width: int) -> Array:
 
 def out_of_lanes(lanes: Array, runs: int) -> Array:
     """Arrange (groups, ..., width) as (runs, ...), the inverse of `in_lanes`."""
-    moved = np.moveaxis(lanes, -1, 1)
-    return moved.reshape(-1, *moved.shape[2:])[:runs]
+    lanes_second = np.moveaxis(lanes, -1, 1)
+    return lanes_second.reshape(-1, *lanes_second.shape[2:])[:runs]
 
 
 def leak_rows(members: Sequence[Member], sizes: Array, measured: Array) -> Array:
@@ -249,8 +249,8 @@ def _channels(rig: Rig, readings: Readings, ends: Array, samples: int) -> Array:
             (at.NOISE, at.NOISE_RISE, f"sensors.{name}.noise", sensor.noise, 0.0),
             (at.COMMON, at.COMMON_RISE, "sensors.common_noise", rig.sensors.common_noise, 0.0),
         ):
-            begun, ended = np.broadcast_to(readings.value(parameter, value, ends), (2,))
-            row[place], row[rise] = begun + plus, (ended - begun) / samples
+            start_value, end_value = np.broadcast_to(readings.value(parameter, value, ends), (2,))
+            row[place], row[rise] = start_value + plus, (end_value - start_value) / samples
         row[at.WALK] = sensor.drift / np.sqrt(daq.sample_rate)
         row[at.HUM], row[at.HUM_TURNS] = sensor.hum, sensor.hum_frequency / daq.sample_rate
         row[at.LEAST], row[at.LARGEST] = sensor.range_lo, sensor.range_hi
@@ -317,12 +317,12 @@ class SetRun:
         """Lay out the anti-alias filter of each lane: tap k is of the output k - `before` steps from the sample."""
         sensors = [member.experiment.rig.sensors for member in self.part.members]
         delays = np.array([[getattr(group, name).delay * rate for name in CHAMBERS] for group in sensors])
-        known = {delay: anti_alias_taps(self.factor, delay % 1.0) for delay in set(delays.ravel().tolist())}
-        self.after = max(taps.size // 2 for taps in known.values())
+        taps_by_delay = {delay: anti_alias_taps(self.factor, delay % 1.0) for delay in set(delays.ravel().tolist())}
+        self.after = max(taps.size // 2 for taps in taps_by_delay.values())
         self.before = self.after + int(delays.max())
         filters = np.zeros((self.runs, self.channels, self.before + self.after + 1))
         for place, delay in np.ndenumerate(delays):
-            taps = known[float(delay)]
+            taps = taps_by_delay[float(delay)]
             start = self.before - int(delay) - taps.size // 2
             filters[place][start : start + taps.size] = taps
         self.taps = in_lanes(filters, self.width)
@@ -341,14 +341,14 @@ class SetRun:
     def run_all(self, threads: int, progress: Callable[[float], None] | None) -> None:
         """Run all groups, shared out over `threads` (the compiled parts run in parallel)."""
         cuts = np.unique(np.linspace(0, self.groups, min(threads, self.groups) + 1).round().astype(int)).tolist()
-        lock, reached = threading.Lock(), 0.0
+        lock, progressed = threading.Lock(), 0.0
 
         def tell(share: float) -> None:
-            nonlocal reached
+            nonlocal progressed
             if progress is not None:
                 with lock:
-                    reached += share
-                    progress(reached)
+                    progressed += share
+                    progress(progressed)
 
         with ThreadPoolExecutor(threads) as pool:
             list(pool.map(lambda part: self._run_groups(part, tell), itertools.pairwise(cuts)))

@@ -31,8 +31,8 @@ INSTRUMENT_ROWS = 18
 def converted(pressure: Any, sensor: np.ndarray, row: int) -> Any:
     """Compute the pressure [Pa] as read back from the converter (`instruments.convert`)."""
     least = load(sensor, row + LEAST)
-    held = min(max(pressure, least), load(sensor, row + LARGEST))
-    volts = load(sensor, row + VOLTS) + (held - least) * load(sensor, row + PER_PASCAL)
+    within_range = min(max(pressure, least), load(sensor, row + LARGEST))
+    volts = load(sensor, row + VOLTS) + (within_range - least) * load(sensor, row + PER_PASCAL)
     top = load(sensor, row + TOP)
     codes = min(max(nearest_whole(volts / load(sensor, row + COUNT)), -top), top - 1.0)
     return least + (codes * load(sensor, row + COUNT) - load(sensor, row + VOLTS)) / load(sensor, row + PER_PASCAL)

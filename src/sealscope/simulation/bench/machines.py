@@ -64,7 +64,7 @@ class BenchMachine:
 
 
 def centred_start(rig: Rig, command: Command | Position | str, duration: float) -> float:
-    """Compute the start [m] from which the strokes of a command lie evenly about mid-stroke, as far as possible.
+    """Compute the start [m] that centres the strokes of a command about mid-stroke, or comes closest to it.
 
     That of a target is where the target begins.
 
@@ -79,8 +79,8 @@ def centred_start(rig: Rig, command: Command | Position | str, duration: float) 
         return float(np.clip(command.value_at(np.zeros(())), -half, half))
     area = 0.5 * (cylinder.A_A + cylinder.A_B)
     if rig.valve.spool == "present":
-        moved = dt * np.cumsum(command.volts(np.arange(0.0, duration + dt, dt))) * drive_of(rig).largest(1.0) / area
-        return float(np.clip(-0.5 * (min(moved.min(), 0.0) + max(moved.max(), 0.0)), -half, half))
+        positions = dt * np.cumsum(command.volts(np.arange(0.0, duration + dt, dt))) * drive_of(rig).largest(1.0) / area
+        return float(np.clip(-0.5 * (min(positions.min(), 0.0) + max(positions.max(), 0.0)), -half, half))
     demand = motor.omega_per_volt * command.volts(np.arange(0.0, duration + dt, dt))
     gain = motor.k_p + motor.C_e
     integral = angle = lowest = highest = 0.0

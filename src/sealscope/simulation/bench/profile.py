@@ -129,8 +129,10 @@ class Duty:
             parse_force(text)
 
     def __repr__(self) -> str:  # seeds of cases derive from it: what a profile does not state is left out
-        stated = [part for part in fields(self) if part.default is MISSING or getattr(self, part.name) != part.default]
-        return f"Duty({', '.join(f'{part.name}={getattr(self, part.name)!r}' for part in stated)})"
+        stated_fields = [
+            part for part in fields(self) if part.default is MISSING or getattr(self, part.name) != part.default
+        ]
+        return f"Duty({', '.join(f'{part.name}={getattr(self, part.name)!r}' for part in stated_fields)})"
 
 
 AnyNuisance = Nuisance | NuisanceChoice
@@ -256,8 +258,8 @@ class Profile:
         for family in self.families:
             if family.name == name:
                 return family
-        known = ", ".join(family.name for family in self.families) or "none"
-        raise InputError(f"a family of {self.name} must be one of its own ({known}), got {name!r} ({self.place})")
+        names = ", ".join(family.name for family in self.families) or "none"
+        raise InputError(f"a family of {self.name} must be one of its own ({names}), got {name!r} ({self.place})")
 
     def of_family(self, name: str) -> Profile:
         """Build the profile of one family's machines: its nuisances in place of this profile's."""

@@ -47,9 +47,9 @@ def agreement(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[Cell, 
         if measured is not None:
             real = measured.log_change(chamber, name)
             ratio = np.log(sheet.rms[chamber][name][:, 0] / measured.rms[chamber][name][:, 0])
-            same, correlation = int(np.sum(np.sign(change) == np.sign(real))), np.corrcoef(change, real)[0, 1]
+            same_sign, correlation = int(np.sum(np.sign(change) == np.sign(real))), np.corrcoef(change, real)[0, 1]
             numbers = (100 * np.expm1(real.mean()), np.exp(ratio.mean()), np.exp(ratio.std(ddof=1)))
-            compared = (*map(float, numbers), same, float(correlation))
+            compared = (*map(float, numbers), same_sign, float(correlation))
         rows.append((chamber, name, float(100 * np.expm1(change.mean())), *compared))
     return rows
 
@@ -87,6 +87,6 @@ def difference_figure(context: Context, item: Item) -> tuple[Figure, ...]:
         ]
     zero = FigureCurve(np.array([leak.min(), leak.max()]), np.zeros(2), "no change", "reference")
     heads = (f"RMS with - without leak, {name} [{UNITS[name]}]", f"change of the RMS of {name} [%]")
-    drawn = zip(heads, (absolute, relative), strict=True)
-    panels = tuple(Panel("mean leak [L/min]", head, (*curves, zero)) for head, curves in drawn)
+    lines = zip(heads, (absolute, relative), strict=True)
+    panels = tuple(Panel("mean leak [L/min]", head, (*curves, zero)) for head, curves in lines)
     return (item.figure(panels, numbers, table.resolved, table.notes),)

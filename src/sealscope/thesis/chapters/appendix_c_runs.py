@@ -41,10 +41,10 @@ def drawn_drifts(number: int, half: float, draw: int = 0) -> tuple[ParameterDrif
     """Draw the drifts of a test's rig at half time: each share uniform within its bounds, up or down, independent."""
     random, drifting = np.random.default_rng([_SEEDS["drift"], draw, number]), texts_of("cases.toml")["drifts"].values()
     shares = [random.uniform(*part["shares"]) for part in drifting]
-    moved = random.choice([-1.0, 1.0], size=len(shares)) * shares
+    signed_shares = random.choice([-1.0, 1.0], size=len(shares)) * shares
     return tuple(
         ParameterDrift(name, tabulated(np.array([half, half]), np.array([0.0, share])))
-        for part, share in zip(drifting, moved, strict=True)
+        for part, share in zip(drifting, signed_shares, strict=True)
         for name in part["parameters"]
     )
 

@@ -141,10 +141,10 @@ def two_tones(context: Context, item: Item) -> tuple[Figure, ...]:
     early, lines = t < 0.2, amplitude > 1e-6
     signal = FigureCurve(t[early], x[early], "x(t), eq. 3.3", "reference")
     spectrum = FigureCurve(frequency[lines], amplitude[lines], "2 |X[n]| / N, eq. 3.2", "reference", "stems")
-    shown = (0.0, 150.0)
+    shown_range = (0.0, 150.0)
     panels = (
         Panel("t [s]", "x(t) [1]", (signal,), "(a) Signal"),
-        Panel("frequency [Hz]", "amplitude [1]", (spectrum,), "(b) Amplitude spectrum", x_range=shown),
+        Panel("frequency [Hz]", "amplitude [1]", (spectrum,), "(b) Amplitude spectrum", x_range=shown_range),
     )
     return (item.figure(panels, numbers, notes=note("two-tones")),)
 
@@ -253,9 +253,9 @@ def pressure_scalogram(context: Context, item: Item) -> tuple[Figure, ...]:
 
 def _running_rms(t: Array, rows: Array, size: int) -> tuple[Array, Array]:
     """Compute the middles [s] of blocks of `size` samples and the rms of each row in them, (rows, blocks)."""
-    whole = t.size // size * size
-    power = np.sqrt(np.mean(rows[:, :whole].reshape(rows.shape[0], -1, size) ** 2, axis=2))
-    return t[:whole].reshape(-1, size).mean(axis=1), power
+    used = t.size // size * size
+    power = np.sqrt(np.mean(rows[:, :used].reshape(rows.shape[0], -1, size) ** 2, axis=2))
+    return t[:used].reshape(-1, size).mean(axis=1), power
 
 
 def judge_claims(context: Context, item: Item) -> tuple[Claim, ...]:
@@ -300,9 +300,14 @@ def _leak(context: Context) -> Claim:
     late = without.t > 10.0
     measures = (np.mean, np.max, np.ptp)
     changes = {
-        name: [float(of(leaking.outputs[name][late]) - of(without.outputs[name][late])) for of in measures]
+        name: [
+            float(measure(leaking.outputs[name][late]) - measure(without.outputs[name][late])) for measure in measures
+        ]
         for name in CHAMBERS
     }
-    moved = ["{}: mean {:+.0f} Pa, peak {:+.0f} Pa, range {:+.0f} Pa".format(name, *of) for name, of in changes.items()]
-    tests = [change < -visible_pressure() for of in changes.values() for change in of]
+    moved = [
+        "{}: mean {:+.0f} Pa, peak {:+.0f} Pa, range {:+.0f} Pa".format(name, *shifts)
+        for name, shifts in changes.items()
+    ]
+    tests = [shift < -visible_pressure() for shifts in changes.values() for shift in shifts]
     return judge_claim("3.6", tests, leak=leaking.mean_leak_lpm, moved="; ".join(moved))

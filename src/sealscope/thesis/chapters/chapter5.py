@@ -199,10 +199,14 @@ _VIEWS: dict[str, tuple[str, Callable[[FigureView], Drawn]]] = {
 def views() -> Iterator[tuple[str, str, dict[str, object]]]:
     """Yield number, title and inputs of Figs. 5.1 to 5.89: of each test every view, whole and in close-up."""
     for test in TESTS.values():
-        shown = [*[("input", "", False), ("input", "", True)][: test.inputs], ("leak", "", False), ("leak", "", True)]
+        views_of_test = [
+            *[("input", "", False), ("input", "", True)][: test.inputs],
+            ("leak", "", False),
+            ("leak", "", True),
+        ]
         for chamber in CHAMBERS:
-            shown += [("details", chamber, False), ("details", chamber, True), ("rms", chamber, False)]
-        for number, (view, chamber, closeup) in enumerate(shown, test.first):
+            views_of_test += [("details", chamber, False), ("details", chamber, True), ("rms", chamber, False)]
+        for number, (view, chamber, closeup) in enumerate(views_of_test, test.first):
             start, stop = (test.half - 10.0, test.half + 10.0) if closeup else (0.0, 2 * test.half)
             when = f"close-up {start:g} to {stop:g} s" if closeup else f"{stop:g} s"
             content = _VIEWS[view][0] + (f" of {chamber}" if chamber else "")

@@ -37,9 +37,9 @@ class Rule:
     printed: str = ""
 
     def fires(self, sheet: DataSheet) -> Fires:
-        """Return which tests the rule fires in, (n,)."""
-        moved = [sheet.log_change(chamber, detail) * DIRECTION[chamber] > 0 for chamber, detail in self.details]
-        return np.asarray(np.all(moved, axis=0))
+        """Find the tests in which the rule fires, (n,) truth values."""
+        moves = [sheet.log_change(chamber, detail) * DIRECTION[chamber] > 0 for chamber, detail in self.details]
+        return np.asarray(np.all(moves, axis=0))
 
 
 def _rules(name: str) -> tuple[Rule, ...]:

@@ -36,5 +36,5 @@ def table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     notes = f"Claims in our own words. A claim holds where every part of it does.{missing}"
     counts = ((verdict, verdicts[verdict]) for verdict in get_args(Verdict))
     title, heads = "How many claims have each verdict", ("verdict", "claims")
-    listed = replace(item.table(rows, notes), claims=tuple(claim.id for claim in claims))
-    return listed, item.table(counts, "", heads, tail="-verdicts", title=title)
+    claims_table = replace(item.table(rows, notes), claims=tuple(claim.id for claim in claims))
+    return claims_table, item.table(counts, "", heads, tail="-verdicts", title=title)

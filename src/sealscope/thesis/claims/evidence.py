@@ -87,7 +87,7 @@ class SheetClaim:
         return judge_claim(id, parts, kind, sheet=result, simulation=findings(evidence.leak)[0], **values)
 
 
-def fired(sheet: DataSheet, rule: Rule) -> str:
+def fired_share(sheet: DataSheet, rule: Rule) -> str:
     """Format `k/n = share %` of the tests that a rule fires in, with its exact 95 % interval."""
     return counted_share(rule.fires(sheet))
 
@@ -110,13 +110,13 @@ def corrected_p(sheet: DataSheet) -> dict[tuple[str, str], float]:
 
 
 def moves_beyond_chance(sheet: DataSheet, chamber: str, name: str) -> bool:
-    """Return whether a column moves in the chamber's direction beyond chance (5 %, corrected for ten columns)."""
+    """Return True if a column moves in the chamber's direction beyond chance (5 %, corrected for ten columns)."""
     change = sheet.log_change(chamber, name) * DIRECTION[chamber]
     return bool(np.sum(change > 0) > np.sum(change < 0) and corrected_p(sheet)[chamber, name] < 0.05)
 
 
 def correlated(r: float, n: int, controls: int = 0) -> bool:
-    """Return whether a (partial) correlation of n points differs from zero at 5 %, with `controls` columns taken out.
+    """Return True if a (partial) correlation of n points differs from 0 at 5 %, with `controls` columns taken out.
 
     By Fisher's z: ``|artanh r| sqrt(n - 3 - controls) > 1.96``. Source: Fisher, Metron 3 (1924) 329-332.
     """

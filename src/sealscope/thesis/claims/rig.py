@@ -13,7 +13,7 @@ from sealscope.signals.filters import decomposition_filters, reach
 from sealscope.signals.windows import WINDOW_SIZE
 from sealscope.thesis.chapters.appendix_c_runs import column
 from sealscope.thesis.chapters.success_rates import CLAIMED
-from sealscope.thesis.claims.evidence import NO_SHEET, ClaimEvidence, counted_share, fired
+from sealscope.thesis.claims.evidence import NO_SHEET, ClaimEvidence, counted_share, fired_share
 from sealscope.thesis.engine.products import Claim
 from sealscope.thesis.engine.texts import judge_claim
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG
@@ -71,10 +71,10 @@ def _between(values: Iterable[float]) -> str:
 def _shown_tests(evidence: ClaimEvidence) -> Iterator[Claim]:
     """Judge the claims on the ten tests shown."""
     tests = evidence.shown
-    moved = {name: abs(_change(test.speed)) for name, test in tests.items()}
-    worst = max(moved, key=lambda name: moved[name])
-    small = [change < 1.0 for change in moved.values()]
-    yield judge_claim("5.7.1", small, moved=moved[worst], worst=worst, tests=len(moved))
+    speed_changes = {name: abs(_change(test.speed)) for name, test in tests.items()}
+    worst = max(speed_changes, key=lambda name: speed_changes[name])
+    small = [change < 1.0 for change in speed_changes.values()]
+    yield judge_claim("5.7.1", small, moved=speed_changes[worst], worst=worst, tests=len(speed_changes))
     drifts = [[1e3 * drift for drift in test.drift] for test in (tests["5.2a"], evidence.control)]
     fell, fell_anyway = (abs(before) - abs(after) for before, after in drifts)
     more = fell - fell_anyway > 0.1 * abs(fell_anyway)
@@ -100,7 +100,7 @@ def _shown_tests(evidence: ClaimEvidence) -> Iterator[Claim]:
 def _leak(evidence: ClaimEvidence) -> Iterator[Claim]:
     """Judge whether the fall of d3 on P_A is the sign of a leak."""
     controls = [float(CLAIMED[0].fires(sheet).mean()) < 0.05 for sheet in (evidence.still, evidence.drift)]
-    counts = {name: fired(getattr(evidence, name), CLAIMED[0]) for name in ("leak", "still", "drift")}
+    counts = {name: fired_share(getattr(evidence, name), CLAIMED[0]) for name in ("leak", "still", "drift")}
     yield judge_claim("5.7.6", controls, **counts)
 
 
@@ -131,10 +131,10 @@ def _similar(evidence: ClaimEvidence) -> Claim:
         for c in CHAMBERS
         for name in ("d1", "d2", "d3", "d4")
     }
-    same = np.sign(leak.log_change("p_A", "d3")) == np.sign(measured.log_change("p_A", "d3"))
+    same_sign = np.sign(leak.log_change("p_A", "d3")) == np.sign(measured.log_change("p_A", "d3"))
     text = (
         f"leak-free RMS over the sheet's: {', '.join(f'{name} {ratio:.2f}' for name, ratio in ratios.items())}; "
-        f"d3 of P_A moves the same way in {int(same.sum())} of {same.size}"
+        f"d3 of P_A moves the same way in {int(same_sign.sum())} of {same_sign.size}"
     )
-    parts = [1 / 1.25 <= ratio <= 1.25 for ratio in ratios.values()] + [bool(same.sum() >= 39)]
+    parts = [1 / 1.25 <= ratio <= 1.25 for ratio in ratios.values()] + [bool(same_sign.sum() >= 39)]
     return judge_claim("6.1.4", parts, compared=text, sheet="the reference")

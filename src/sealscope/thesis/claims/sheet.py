@@ -26,7 +26,7 @@ from sealscope.thesis.claims.evidence import (
     corrected_p,
     correlated,
     counted_share,
-    fired,
+    fired_share,
     in_percent,
     moves_beyond_chance,
 )
@@ -45,8 +45,8 @@ def _past_noise(sheet: DataSheet, chamber: str, name: str) -> np.ndarray:
 
 def _controls(evidence: ClaimEvidence, rule: Rule) -> str:
     return (
-        f"In simulation the rule fires in {fired(evidence.still, rule)} with no leak and in "
-        f"{fired(evidence.drift, rule)} with drift alone"
+        f"In simulation the rule fires in {fired_share(evidence.still, rule)} with no leak and in "
+        f"{fired_share(evidence.drift, rule)} with drift alone"
     )
 
 
@@ -57,7 +57,7 @@ def _cell(rule: Rule, where: str) -> SheetClaim:
         fires = rule.fires(sheet)
         p = at_least(int(fires.sum()), fires.size, chance)
         near = any(abs(100.0 * float(fires.mean()) - rate) <= 1.0 for rate in printed)
-        yield f"{fired(sheet, rule)}; p = {p:.2g} against chance of {100 * chance:g} %", [near, p < 0.05 / 10]
+        yield f"{fired_share(sheet, rule)}; p = {p:.2g} against chance of {100 * chance:g} %", [near, p < 0.05 / 10]
 
     def values(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, str]:
         a, b = (float(part.fires(sheet).mean()) for part in (_A_BOTH, _B_BOTH))
@@ -86,7 +86,7 @@ def _before_table(sheet: DataSheet) -> Iterator[Finding]:
 
 def _over_80(sheet: DataSheet) -> Iterator[Finding]:
     for rule in CLAIMED:
-        yield f"{rule.name} {fired(sheet, rule)}", [bool(rule.fires(sheet).mean() > 0.8)]
+        yield f"{rule.name} {fired_share(sheet, rule)}", [bool(rule.fires(sheet).mean() > 0.8)]
 
 
 def _levels(sheet: DataSheet) -> Iterator[Finding]:
@@ -218,7 +218,7 @@ _CLAIMS: dict[str, SheetClaim] = {
     "5.6.2": SheetClaim(_levels, "d3 of P_A falls beyond noise: "),
     "5.6.3": SheetClaim(_smallest(CLAIMED[:6]), _SMALLEST),
     "6.1.1": SheetClaim(_passes_both, "smallest test that passes d3d4 on both chambers: "),
-    "5.5.1": SheetClaim(_sensitive, values=lambda evidence, sheet: {"d2": fired(sheet, UNCLAIMED[1])}),
+    "5.5.1": SheetClaim(_sensitive, values=lambda evidence, sheet: {"d2": fired_share(sheet, UNCLAIMED[1])}),
     "5.5.2": SheetClaim(_amplified, "mean over scatter of the log change, "),
     "5.5.3": SheetClaim(_trend("p_A"), _CORRELATION, values=_predicted),
     "5.5.4": SheetClaim(_trend("p_B"), _CORRELATION, values=_predicted),
@@ -246,23 +246,23 @@ def levels() -> Iterator[Claim]:
     texts = [
         f"{level} {min(values):.4f} to {max(values):.4f}, mean {np.mean(values):.4f}" for level, values in spans.items()
     ]
-    within = [min(values) <= NOMINAL_LPM[level] <= max(values) for level, values in spans.items()]
+    contains = [min(values) <= NOMINAL_LPM[level] <= max(values) for level, values in spans.items()]
     separate = [min(upper) > max(lower) for upper, lower in itertools.pairwise(spans.values())]
-    yield judge_claim("5.1.1", [*within, *separate], levels="; ".join(texts))
+    yield judge_claim("5.1.1", [*contains, *separate], levels="; ".join(texts))
     nominal, real = (
         (values[1] / values[0], values[2] / values[1], values[3] / values[0])
         for values in (list(NOMINAL_LPM.values()), [float(np.mean(values)) for values in spans.values()])
     )
     tests = [abs(ratio / stated - 1.0) < 0.25 for ratio, stated in zip(nominal, (0.5, 0.5, 1.0 / 16.0), strict=True)]
-    shown = {
+    ratio_texts = {
         name: ", ".join(f"{ratio:.2f}" for ratio in ratios) for name, ratios in (("nominal", nominal), ("real", real))
     }
-    yield judge_claim("5.1.2", tests, **shown)
-    named = [row for row in APPENDIX_C if row.level == "large" and row.command == "3 sin(4t)"]
-    rows = ", ".join(f"row {row.number}: {row.mean_leak_lpm:g} L/min" for row in named)
-    same = [f"{row.number} ({row.command}, {row.level})" for row in APPENDIX_C if row.mean_leak_lpm == 0.0087]
-    tests = [any(abs(row.mean_leak_lpm - 0.0087) < 5e-5 for row in named)]
-    yield judge_claim("5.1.3", tests, rows=rows, same=", ".join(same))
+    yield judge_claim("5.1.2", tests, **ratio_texts)
+    large_rows = [row for row in APPENDIX_C if row.level == "large" and row.command == "3 sin(4t)"]
+    rows = ", ".join(f"row {row.number}: {row.mean_leak_lpm:g} L/min" for row in large_rows)
+    same_leaks = [f"{row.number} ({row.command}, {row.level})" for row in APPENDIX_C if row.mean_leak_lpm == 0.0087]
+    tests = [any(abs(row.mean_leak_lpm - 0.0087) < 5e-5 for row in large_rows)]
+    yield judge_claim("5.1.3", tests, rows=rows, same=", ".join(same_leaks))
 
 
 def _on_rows(
@@ -305,16 +305,18 @@ def curves(evidence: ClaimEvidence) -> Iterator[Claim]:
             last=first + 2,
             level=f"{'an' if test.level[0] in 'aeiou' else 'a'} {test.level} leak",
             command=test.command,
-            names=_and(names),
+            names=_join_words(names),
             chamber=chamber,
             does="falls" if statement == "fall" else "changes",
             sheet=text,
             simulated=", ".join(f"{name} {100 * (rms[name][1] / rms[name][0] - 1):+.1f} %" for name in names),
             limits=", ".join(f"{in_percent(limit):+.1f} %" for limit in limits),
-            beyond_or_within=" and ".join(f"{_and(details)} {side}" for side, details in sides.items() if details),
+            beyond_or_within=" and ".join(
+                f"{_join_words(details)} {side}" for side, details in sides.items() if details
+            ),
             **({} if parts else {"why": NO_SHEET}),
         )
 
 
-def _and(names: Sequence[str]) -> str:
+def _join_words(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -170,10 +170,10 @@ def _status(item: Item, sheet: DataSheet | None, row: ItemRow | None, folder: Pa
     return ItemStatus(item, "kept", "", row.products, row.files)
 
 
-def _rows(ended: Generator[tuple[_Job, ItemRow | None], None, None]) -> Generator[ItemRow, None, None]:
+def _rows(results: Generator[tuple[_Job, ItemRow | None], None, None]) -> Generator[ItemRow, None, None]:
     """Yield the rows of the items as they end."""
-    with closing(ended):
-        for (item, key, _), row in ended:
+    with closing(results):
+        for (item, key, _), row in results:
             yield row or ItemRow(item.id, key, error="the process that made it died")
 
 

@@ -53,9 +53,9 @@ def simulated_run(experiment: Experiment, prove: bool) -> SimulatedRun:
     except SimulationFailed as error:
         return SimulatedRun(None, np.empty(0), {}, 0.0, False if prove else None, diverged=str(error))
     truth, proof = simulated.truth, simulated.proof
-    moved = {} if proof is None else {change.name: change.difference for change in proof.differences}
+    differences = {} if proof is None else {change.name: change.difference for change in proof.differences}
     resolved = None if proof is None else proof.resolved
-    return SimulatedRun(simulated.recording, truth.t, truth.outputs, truth.mean_leak_lpm, resolved, moved)
+    return SimulatedRun(simulated.recording, truth.t, truth.outputs, truth.mean_leak_lpm, resolved, differences)
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ class Item:
 
     @property
     def of_sheet(self) -> bool:
-        """Whether it rests on the data sheet where that is given."""
+        """True for an item that uses the data sheet where it is given."""
         return self.uses_sheet or self.needs_sheet
 
     def figure(
@@ -84,12 +84,14 @@ def _items(name: str, chapter: int, row: Mapping[str, Any]) -> Iterator[Item]:
     inputs_read: dict[str, Any] = {
         key: tuple(value) if isinstance(value, list) else value for key, value in row.items()
     }
-    known: dict[str, Any] = {key: inputs_read.pop(key) for key in row if key in _FIELDS}
-    known["make"] = _function(known["make"])
-    known["claims"] = tuple(f"claim-{claim}" for claim in known.get("claims", ()))
-    variants = _function(inputs_read["each"])() if "each" in inputs_read else [(name, known.pop("title"), inputs_read)]
+    fields_read: dict[str, Any] = {key: inputs_read.pop(key) for key in row if key in _FIELDS}
+    fields_read["make"] = _function(fields_read["make"])
+    fields_read["claims"] = tuple(f"claim-{claim}" for claim in fields_read.get("claims", ()))
+    variants = (
+        _function(inputs_read["each"])() if "each" in inputs_read else [(name, fields_read.pop("title"), inputs_read)]
+    )
     for id, title, inputs in variants:
-        yield Item(**{"kind": "figure", "chapter": chapter, **known, "id": id, "title": title, "inputs": inputs})
+        yield Item(**{"kind": "figure", "chapter": chapter, **fields_read, "id": id, "title": title, "inputs": inputs})
 
 
 def _function(name: str) -> Any:

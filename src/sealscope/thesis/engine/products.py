@@ -135,8 +135,8 @@ def thinned(x: Array, y: Array, most: int = 4000) -> tuple[Array, Array]:
     if x.size <= most:
         return x, y
     size = int(np.ceil(2 * x.size / most))
-    whole = x.size // size * size
-    blocks = y[:whole].reshape(-1, size)
+    used = x.size // size * size
+    blocks = y[:used].reshape(-1, size)
     start = np.arange(blocks.shape[0]) * size
     picks = np.sort(np.concatenate([start + blocks.argmin(axis=1), start + blocks.argmax(axis=1)]))
     return x[picks], y[picks]

@@ -48,19 +48,19 @@ def write_thesis_page(
     It refers to nothing outside it but the drawn files, which lie in the folder. `quick`: made with shorter runs;
     `sheet`: the measured sheet was given. Raises InputError where the page cannot be written.
     """
-    shown: list[tuple[ItemStatus, Figure | ThesisTable, str]] = []
+    entries: list[tuple[ItemStatus, Figure | ThesisTable, str]] = []
     claims: dict[str, Claim] = {}
     for status in statuses:
         for product in status.products:
             if isinstance(product, Claim):
                 claims.setdefault(product.id, product)
             elif isinstance(product, Figure):
-                shown.append((status, product, _picture(folder, product.id)))
+                entries.append((status, product, _picture(folder, product.id)))
             elif status.item.id != "claims":  # the claims have a section of their own
-                shown.append((status, product, ""))
+                entries.append((status, product, ""))
     chapters: dict[int, list[PageProduct]] = defaultdict(list)
     bearing: dict[str, list[str]] = defaultdict(list)
-    for status, product, picture in shown:
+    for status, product, picture in entries:
         chapters[status.item.chapter].append(_page_product(status, product, picture, claims))
         for name in product.claims:
             bearing[name].append(product.id)

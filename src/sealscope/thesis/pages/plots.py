@@ -42,7 +42,7 @@ def require_drawing() -> None:
 
 
 def draw(figure: Figure) -> tuple[bytes, bytes]:
-    """Draw the figure as SVG (text as text) and as PNG (200 dpi, with a palette).
+    """Draw the figure: an SVG whose text stays text, and a PNG with a palette at 200 dpi.
 
     Raises MissingExtra where matplotlib is not installed.
     """
@@ -76,7 +76,7 @@ def _svg(canvas: Canvas, figure: Figure) -> bytes:
 
 
 def _png(canvas: Canvas, *, greys: bool) -> bytes:
-    """Draw as PNG with few colours, which makes the file small; a picture of greys keeps as many as a palette holds."""
+    """Draw as PNG with few colours for a small file; a picture of greys keeps a whole palette."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image as Picture
 
@@ -148,8 +148,8 @@ def _canvas(figure: Figure) -> Canvas:
 def _panel(canvas: Canvas, ax: Axes, panel: Panel, *, mark_words: bool) -> None:
     if panel.image is not None:
         image = panel.image
-        drawn = ax.pcolormesh(image.x, image.y, image.values, cmap="Greys", shading="auto", rasterized=True)
-        canvas.colorbar(drawn, ax=ax, label=typeset(image.label), pad=0.01, fraction=0.05)
+        mesh = ax.pcolormesh(image.x, image.y, image.values, cmap="Greys", shading="auto", rasterized=True)
+        canvas.colorbar(mesh, ax=ax, label=typeset(image.label), pad=0.01, fraction=0.05)
         ax.grid(False)
     counts: dict[Role, int] = {}
     for curve in panel.curves:
@@ -227,7 +227,7 @@ def _curve(ax: Axes, curve: FigureCurve, again: int, x_range: tuple[float, float
 
 
 def _shared_legend(panels: Sequence[Panel]) -> bool:
-    """Return whether all panels show the same curves, so that one legend serves them."""
+    """Return True if all panels show the same curves, so that one legend serves them."""
     keys = {tuple((curve.label, curve.role, curve.kind) for curve in panel.curves) for panel in panels}
     labels = [curve.label for curve in panels[0].curves] if panels else []
     short = sum(map(len, labels)) + 6 * len(labels) <= 100
@@ -255,9 +255,9 @@ def _plain(legend: Legend) -> None:
 
 def _hide_repeated_x_labels(axes: Any, panels: Sequence[Panel]) -> None:
     """Label the x axis in the lowest panel of each column alone, where all panels share it."""
-    shown = [ax for ax in axes.flat if ax.axison]
-    same = {(ax.get_xlabel(), tuple(round(end, 9) for end in ax.get_xlim())) for ax in shown}
-    if len(same) != 1 or any(panel.image is not None for panel in panels):
+    visible_axes = [ax for ax in axes.flat if ax.axison]
+    x_axes = {(ax.get_xlabel(), tuple(round(end, 9) for end in ax.get_xlim())) for ax in visible_axes}
+    if len(x_axes) != 1 or any(panel.image is not None for panel in panels):
         return
     for column in axes.T:
         for above, below in pairwise(column):

@@ -130,11 +130,11 @@ def both_runs(context: Context, command: str, closed_pct: float | None, reading:
 
 
 def resolved(runs: Runs) -> bool:
-    """Return whether all of the runs passed the halving test."""
+    """Return True if all of the runs passed the halving test."""
     return all(run.resolved for run in runs.values())
 
 
-def finished(runs: Runs) -> list[tuple[Solver, str, SimulatedRun]]:
+def finished_runs(runs: Runs) -> list[tuple[Solver, str, SimulatedRun]]:
     """List solver, label and run of those that did not diverge."""
     return [(solver, LABELS[solver], run) for solver, run in runs.items() if not run.diverged]
 

@@ -142,11 +142,11 @@ def _printed(context: Context) -> Iterator[Claim]:
 def passed(tests: Mapping[Reading, tuple[bool, ...]]) -> str:
     """Count the single tests that passed, and name the readings under which all did."""
     every = [test for row in tests.values() for test in row]
-    whole = [reading.title for reading, row in tests.items() if all(row)]
+    passing_readings = [reading.title for reading, row in tests.items() if all(row)]
     text = f"{sum(every)} of {len(every)} tests pass"
     if not any(every) or all(every):
         return text
-    return f"{text}, all of them under {'; '.join(whole) or 'neither reading'}"
+    return f"{text}, all of them under {'; '.join(passing_readings) or 'neither reading'}"
 
 
 def _over(
@@ -241,27 +241,27 @@ def _drift(context: Context) -> Iterator[Claim]:
     def drift(reading: Reading, closed: float | None, solver: Solver) -> float:
         return cases.piston_drift(context.run(cases.drift_spec(reading, closed, solver)))
 
-    without = drift(OURS, None, "converged")
-    least = DRIFT_SHARE * abs(without)
-    moved = {
+    drift_without = drift(OURS, None, "converged")
+    least = DRIFT_SHARE * abs(drift_without)
+    drifts = {
         solver: {reading: [drift(reading, closed, solver) for closed in CLOSINGS] for reading in READINGS}
         for solver in SOLVERS
     }
 
     def gained(rows: list[list[float]]) -> str:
-        parts = (_range([row[k] - without for row in rows], "mm", 1e3) for k in range(len(CLOSINGS)))
+        parts = (_range([row[k] - drift_without for row in rows], "mm", 1e3) for k in range(len(CLOSINGS)))
         return ", ".join(f"{closed:g} % closed {part}" for closed, part in zip(CLOSINGS, parts, strict=True))
 
     heads = {
-        18: f"drift over 60 s without orifices {without * 1e3:.3f} mm, in addition at",
+        18: f"drift over 60 s without orifices {drift_without * 1e3:.3f} mm, in addition at",
         19: "drift over 60 s beyond that without orifices, at",
     }
     tests: dict[int, Callable[[list[float]], Iterable[bool]]] = {
-        18: lambda row: (abs(drift - without) > least for drift in row),
+        18: lambda row: (abs(drift - drift_without) > least for drift in row),
         19: lambda row: (abs(row[1]) - abs(row[0]) > least, abs(row[2]) - abs(row[1]) > least),
     }
     for number, test in tests.items():
-        yield _over(number, moved, test, lambda rows, head=heads[number]: f"{head} {gained(rows)}")  # type: ignore[misc]
+        yield _over(number, drifts, test, lambda rows, head=heads[number]: f"{head} {gained(rows)}")  # type: ignore[misc]
 
 
 #: Numbers of a row of the table of readings, and the factor to their units.

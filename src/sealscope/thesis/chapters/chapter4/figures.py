@@ -21,7 +21,7 @@ from sealscope.thesis.chapters.chapter4.cases import (
     Runs,
     Solver,
     both_runs,
-    finished,
+    finished_runs,
     mean_difference,
     resolved,
     span,
@@ -65,7 +65,7 @@ def _notes(runs: Runs, reading: Reading | None) -> str:
     notes = [note("measured-curve")]
     if reading is not None:
         notes.append(f"Reading: {reading.title}.")
-    for _, label, run in finished(runs):
+    for _, label, run in finished_runs(runs):
         lowest = min(float(run.outputs[name].min()) for name in PRESSURES) * 1e-6
         if lowest < _VACUUM:
             notes.append(note("vacuum", label=label, lowest=lowest))
@@ -91,10 +91,10 @@ def _marks(run: SimulatedRun, name: str, label: str, role: Role) -> FigureCurve:
 
 def _both_solvers(runs: Runs, name: str) -> tuple[FigureCurve, ...]:
     converged = runs["converged"]
-    if len(finished(runs)) == 2 and _difference(runs, name) < _ALIKE * span(converged, name) * OUTPUTS[name][1]:
+    if len(finished_runs(runs)) == 2 and _difference(runs, name) < _ALIKE * span(converged, name) * OUTPUTS[name][1]:
         same = _marks(runs["literal"], name, LABELS["literal"], "literal")
         return _line(converged, name, LABELS["converged"], "converged"), same
-    return tuple(_line(run, name, label, solver) for solver, label, run in finished(runs))
+    return tuple(_line(run, name, label, solver) for solver, label, run in finished_runs(runs))
 
 
 def _difference(runs: Runs, name: str) -> float:
@@ -129,7 +129,7 @@ def over_time(context: Context, item: Item) -> tuple[Figure, ...]:
         else:
             curves = _both_solvers(runs, name)
             unit, factor = OUTPUTS[name]
-            ranges = [(label, span(run, name) * factor) for _, label, run in finished(runs)]
+            ranges = [(label, span(run, name) * factor) for _, label, run in finished_runs(runs)]
             numbers += [Number(f"range of {name}, {label}", value, unit) for label, value in ranges]
             numbers.append(Number(f"rms of the difference in {name}", _difference(runs, name), unit))
         panels.append(Panel("t [s]", _label(name), curves, f"({letter})"))
@@ -141,7 +141,7 @@ def across_orifice(context: Context, item: Item) -> tuple[Figure, ...]:
     runs, notes = _case_of(context, item)
     pump, chamber = item.inputs["quantities"]
     panels, gaps, numbers = [], [], []
-    for letter, (role, label, run) in zip("ab", reversed(finished(runs)), strict=False):
+    for letter, (role, label, run) in zip("ab", reversed(finished_runs(runs)), strict=False):
         panels.append(Panel("t [s]", "pressure [MPa]", _both_ends(run, pump, chamber), f"({letter}) {label}"))
         gaps.append(FigureCurve(run.t, (run.outputs[pump] - run.outputs[chamber]) * 1e-6, label, role))
         peak_gap = float(steady_output(run, pump).max() - steady_output(run, chamber).max()) * 1e-6
