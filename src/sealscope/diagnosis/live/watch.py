@@ -144,7 +144,7 @@ class Watch:
         leak, own = self.leak, self._estimator
         if leak is not None:
             figures: dict[str, Any] = {name: getattr(leak, name) for name in _FIGURES}
-            cause: Any = None if leak.cause == PressureEstimator.cause else leak.cause
+            cause: Any = leak.cause
             return Evidence(decide_verdict(True, math.inf, 0.0), leak.reason, cause=cause, **figures)
         bound = self._detector.bound() if own is not None and len(self._last) else math.inf
         if own is None or not math.isfinite(bound):

@@ -13,7 +13,7 @@ from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.trend.trend import Trend
 from sealscope.paragraphs import paragraph, paragraphs
 from sealscope.recordings.formats.columns import counted
-from sealscope.reporting.messages import machine_text, number, say
+from sealscope.reporting.messages import machine_text, number, say, state_text
 from sealscope.storage.csv_file import guard_cell
 from sealscope.units import BAR, DAY, DAYS_PER_YEAR
 
@@ -149,7 +149,8 @@ def events(trend: Trend) -> list[str]:
 def trend_text(trend: Trend, *, whole: bool = False) -> str:
     """Return the trend as lines of at most 80 columns; `whole`: with the reason, what was assumed and all findings."""
     known, findings = figures(trend), [finding.text for finding in trend.findings]
-    rows = [(name, known[name]) for name in ("now", "healthy", "growth", "limit")]
+    rows = [("state", state_text(trend.state))]
+    rows += [(name, known[name]) for name in ("now", "healthy", "growth", "limit")]
     rows += [("event", line) for line in events(trend)]
     if whole:
         rows += [("since", known["since"]), ("reason", trend.reason), ("assumed", assumed(trend))]
