@@ -158,10 +158,16 @@ def _diagnoses(
 
 def _dated(files: Sequence[Path], **options: Any) -> Iterator[Dated | None]:
     """Yield when each recording began [s since 1970] and its diagnosis; None and `options` as of `_diagnoses`."""
-    from sealscope.recordings.joining import start_seconds
-
     for own in _diagnoses(files, **options):
-        yield None if own is None else (start_seconds(own[0]), own[1])
+        yield None if own is None else (_began(own), own[1])
+
+
+def _began(own: Judged) -> float | None:
+    """Return when a recording of a file began [s since 1970], None of standard input without a date."""
+    from sealscope.recordings.joining import file_seconds, start_seconds
+
+    recording, path = own[0], Path(own[1].file)
+    return file_seconds(recording, path) if path.is_file() else start_seconds(recording, path.name)
 
 
 def _aside(
@@ -234,7 +240,6 @@ def _report_machine(files: Sequence[Path], machine: opt.StatedMachine, output: P
     """Write the page of a commissioned machine: the recordings of a folder over time, the newest verdict first."""
     from sealscope.diagnosis.commissioned.machine import recordings_in
     from sealscope.recordings.formats.columns import counted
-    from sealscope.recordings.joining import start_seconds
     from sealscope.reporting.template import check_page
     from sealscope.reporting.trend.history import Judged, write_history_page
 
@@ -244,9 +249,7 @@ def _report_machine(files: Sequence[Path], machine: opt.StatedMachine, output: P
         raise InputError(f"a page must not replace a recording, got {output}")
     results = list(_diagnoses(paths, machine, False, false_alarm))
     judged = [
-        Judged(own[1], start_seconds(own[0], own[1].file), partial(machine.read, Path(own[1].file)))
-        for own in results
-        if own is not None
+        Judged(own[1], _began(own), partial(machine.read, Path(own[1].file))) for own in results if own is not None
     ]
     if not judged:
         raise UnreadableFile("no recording could be read, so there is no page")

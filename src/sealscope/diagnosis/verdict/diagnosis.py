@@ -155,8 +155,7 @@ class Diagnosis(Evidence):
     @property
     def machine_name(self) -> str | None:
         """What the file calls the machine; None where it does not say."""
-        names = {name.lower(): text for name, text in self.about.items()}
-        return next((names[name] for name in _MACHINES if name in names), None)
+        return machine_name_of(self.about)
 
     @property
     def methods(self) -> tuple[Evidence, ...]:
@@ -353,3 +352,9 @@ class Diagnosis(Evidence):
 def _is_usual(question: Evidence) -> bool:
     """Return whether a question's chance is that of 19 of 20 healthy recordings."""
     return question.chance is None or question.chance >= 0.05
+
+
+def machine_name_of(about: Mapping[str, str]) -> str | None:
+    """Return what the preamble of a file calls the machine; None where it does not say."""
+    names = {name.lower(): text for name, text in about.items()}
+    return next((names[name] for name in _MACHINES if name in names), None)
