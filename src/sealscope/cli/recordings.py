@@ -58,26 +58,20 @@ def diagnose(
 
     With --machine also of folders, a line a recording. Exit status 1 where a file could not be read.
     """
-    from sealscope.campaigns.execution.workers import cores, in_order
-    from sealscope.diagnosis.commissioned.machine import recordings_in
     from sealscope.diagnosis.diagnose import check_probability
 
     check_probability(false_alarm)
     form = "jsonl" if output == "jsonl" else "line" if quiet else "whole" if opt.verbose(context) else "short"
     if stated.known is not None and any(path.is_dir() for path in files):
+        from sealscope.diagnosis.commissioned.machine import recordings_in
+
         files = recordings_in(files)
         form = form if form == "jsonl" else "table"
     work = partial(_dated, machine=stated, joined=join, false_alarm=false_alarm)
-    jobs = min(cores(), len(files))
     piped = _check_standard_input([*files, *stated.baseline])
     # what a baseline costs is spent once, and standard input is this process's
-    if join or piped or stated.baseline or stated.known or jobs == 1 or len(files) < _FEWEST_SIDE_BY_SIDE:
-        results: Iterable[tuple[str, Iterable[Dated | None]]] = [("", work(files))]
-    else:
-        results = (
-            result or (f"sealscope: the process that diagnosed {part[0]} died\n", [None])
-            for part, result in in_order(jobs, partial(_aside, work), [[file] for file in files])
-        )
+    alone = join or piped or stated.baseline or stated.known or len(files) < _FEWEST_SIDE_BY_SIDE
+    results: Iterable[tuple[str, Iterable[Dated | None]]] = [("", work(files))] if alone else _side_by_side(work, files)
     complete, failed = True, False
     starts: list[float | None] = []
     for complaints, judged in results:
@@ -94,6 +88,20 @@ def diagnose(
         opt.complain(f"these {len(files)} files are ordered in time: `sealscope trend` shows how the leakage went")
     if not complete or failed:
         raise Exit(opt.FAILED_ON if failed else 1)
+
+
+def _side_by_side(
+    work: Callable[[Sequence[Path]], Iterator[Dated | None]], files: Sequence[Path]
+) -> Iterator[tuple[str, Iterable[Dated | None]]]:
+    """Yield what is said of each file on standard error, and its results, from a process a core."""
+    from sealscope.campaigns.execution.workers import cores, in_order
+
+    jobs = min(cores(), len(files))
+    if jobs == 1:
+        yield "", work(files)
+        return
+    for part, result in in_order(jobs, partial(_aside, work), [[file] for file in files]):
+        yield result or (f"sealscope: the process that diagnosed {part[0]} died\n", [None])
 
 
 def _text(diagnosis: Diagnosis, form: str, start_s: float | None) -> str:
