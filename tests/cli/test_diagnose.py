@@ -309,8 +309,8 @@ def test_five_lines_by_default_all_with_v_one_when_quiet(call, shell, recordings
     whole = shell("sealscope", "-v", "diagnose", recordings / "leak.nc")
     line = call("diagnose", "--quiet", recordings / "leak.nc")
     labels = [text[2:12].strip() for text in short.out.splitlines()[1:] if text[2:12].strip()]
-    assert labels[0] == "since"
-    assert {"how much", "how sure", "next"} <= set(labels) and len(labels) <= 6
+    assert labels[:2] == ["state", "since"]
+    assert {"how much", "how sure", "next"} <= set(labels) and len(labels) <= 7
     assert "method" not in labels and "  method    volume balance" in whole.out
     assert line.out == short.out.splitlines()[0] + "\n" == f"{recordings / 'leak.nc'}: leak\n"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,8 +33,9 @@ def test_a_folder_becomes_a_few_lines(call, days: Path) -> None:
     assert done.status == 0 and done.err == ""
     assert lines[0] == "leak since 2024-05-06: 8 recordings, 2024-05-01 to 2024-05-08"
     rows = [line.split()[0] for line in lines[1:] if line[2] != " "]
-    assert rows == ["now", "healthy", "growth", "limit", "event", "next"] and max(map(len, lines)) <= 80
-    assert "L/min" in lines[1] and "L/min" in lines[2]
+    assert rows == ["state", "total", "leak", "healthy", "since", "growth", "limit", "event", "next"]
+    assert max(map(len, lines)) <= 80
+    assert all("L/min" in line for line in lines[2:5])
     assert call("trend", days, "--healthy", 3, "--fail-on", "leak").status == 3
 
 
@@ -68,12 +70,14 @@ def test_a_bad_file_is_named_and_the_others_are_in_the_trend(call, days: Path, t
     assert done.status == 1 and "bad.csv" in done.err and done.out.startswith("leak since 2024-05-06: 8 recordings")
 
 
-def test_files_without_a_time_ask_for_every(call, days: Path, tmp_path: Path) -> None:
+def test_files_without_a_time_have_that_of_their_last_change(call, days: Path, tmp_path: Path) -> None:
     for k in (1, 2, 3):
         own = replace(ss.read(days / f"day_{k}.nc"), provenance={})
         ss.write(own, tmp_path / f"run_{k}.nc")
-    complaint = call("trend", tmp_path).refused()
-    assert "every (such as 1d)" in complaint and "run_1.nc" in complaint
+        os.utime(tmp_path / f"run_{k}.nc", times=(0.0, 1.7e9 - k * 86400.0))
+    done = call("trend", tmp_path, "--format", "json")
+    assert "3 of 3 files state no time" in done.err
+    assert [point["file"] for point in json.loads(done.out)["points"]] == ["run_3.nc", "run_2.nc", "run_1.nc"]
     done = call("trend", tmp_path, "--every", "1d")
     assert done.status == 0 and "day 0 to day 2" in done.out
 

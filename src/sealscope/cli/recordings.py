@@ -58,26 +58,20 @@ def diagnose(
 
     With --machine also of folders, a line a recording. Exit status 1 where a file could not be read.
     """
-    from sealscope.campaigns.execution.workers import cores, in_order
-    from sealscope.diagnosis.commissioned.machine import recordings_in
     from sealscope.diagnosis.diagnose import check_probability
 
     check_probability(false_alarm)
     form = "jsonl" if output == "jsonl" else "line" if quiet else "whole" if opt.verbose(context) else "short"
     if stated.known is not None and any(path.is_dir() for path in files):
+        from sealscope.diagnosis.commissioned.machine import recordings_in
+
         files = recordings_in(files)
         form = form if form == "jsonl" else "table"
     work = partial(_dated, machine=stated, joined=join, false_alarm=false_alarm)
-    jobs = min(cores(), len(files))
     piped = _check_standard_input([*files, *stated.baseline])
     # what a baseline costs is spent once, and standard input is this process's
-    if join or piped or stated.baseline or stated.known or jobs == 1 or len(files) < _FEWEST_SIDE_BY_SIDE:
-        results: Iterable[tuple[str, Iterable[Dated | None]]] = [("", work(files))]
-    else:
-        results = (
-            result or (f"sealscope: the process that diagnosed {part[0]} died\n", [None])
-            for part, result in in_order(jobs, partial(_aside, work), [[file] for file in files])
-        )
+    alone = join or piped or stated.baseline or stated.known or len(files) < _FEWEST_SIDE_BY_SIDE
+    results: Iterable[tuple[str, Iterable[Dated | None]]] = [("", work(files))] if alone else _side_by_side(work, files)
     complete, failed = True, False
     starts: list[float | None] = []
     for complaints, judged in results:
@@ -94,6 +88,20 @@ def diagnose(
         opt.complain(f"these {len(files)} files are ordered in time: `sealscope trend` shows how the leakage went")
     if not complete or failed:
         raise Exit(opt.FAILED_ON if failed else 1)
+
+
+def _side_by_side(
+    work: Callable[[Sequence[Path]], Iterator[Dated | None]], files: Sequence[Path]
+) -> Iterator[tuple[str, Iterable[Dated | None]]]:
+    """Yield what is said of each file on standard error, and its results, from a process a core."""
+    from sealscope.campaigns.execution.workers import cores, in_order
+
+    jobs = min(cores(), len(files))
+    if jobs == 1:
+        yield "", work(files)
+        return
+    for part, result in in_order(jobs, partial(_aside, work), [[file] for file in files]):
+        yield result or (f"sealscope: the process that diagnosed {part[0]} died\n", [None])
 
 
 def _text(diagnosis: Diagnosis, form: str, start_s: float | None) -> str:
@@ -158,10 +166,16 @@ def _diagnoses(
 
 def _dated(files: Sequence[Path], **options: Any) -> Iterator[Dated | None]:
     """Yield when each recording began [s since 1970] and its diagnosis; None and `options` as of `_diagnoses`."""
-    from sealscope.recordings.joining import start_seconds
-
     for own in _diagnoses(files, **options):
-        yield None if own is None else (start_seconds(own[0]), own[1])
+        yield None if own is None else (_began(own), own[1])
+
+
+def _began(own: Judged) -> float | None:
+    """Return when a recording of a file began [s since 1970], None of standard input without a date."""
+    from sealscope.recordings.joining import file_seconds, start_seconds
+
+    recording, path = own[0], Path(own[1].file)
+    return file_seconds(recording, path) if path.is_file() else start_seconds(recording, path.name)
 
 
 def _aside(
@@ -234,7 +248,6 @@ def _report_machine(files: Sequence[Path], machine: opt.StatedMachine, output: P
     """Write the page of a commissioned machine: the recordings of a folder over time, the newest verdict first."""
     from sealscope.diagnosis.commissioned.machine import recordings_in
     from sealscope.recordings.formats.columns import counted
-    from sealscope.recordings.joining import start_seconds
     from sealscope.reporting.template import check_page
     from sealscope.reporting.trend.history import Judged, write_history_page
 
@@ -244,9 +257,7 @@ def _report_machine(files: Sequence[Path], machine: opt.StatedMachine, output: P
         raise InputError(f"a page must not replace a recording, got {output}")
     results = list(_diagnoses(paths, machine, False, false_alarm))
     judged = [
-        Judged(own[1], start_seconds(own[0], own[1].file), partial(machine.read, Path(own[1].file)))
-        for own in results
-        if own is not None
+        Judged(own[1], _began(own), partial(machine.read, Path(own[1].file))) for own in results if own is not None
     ]
     if not judged:
         raise UnreadableFile("no recording could be read, so there is no page")

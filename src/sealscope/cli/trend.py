@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
@@ -39,6 +40,9 @@ def trend(
     from sealscope.diagnosis.commissioned.machine import recordings_in
     from sealscope.diagnosis.trend.reading import reading_of
     from sealscope.diagnosis.trend.trend import trend as trend_of
+    from sealscope.diagnosis.verdict.diagnosis import machine_name_of
+    from sealscope.recordings.formats.headings.preamble import remarks_of
+    from sealscope.recordings.joining import file_seconds
     from sealscope.reporting.trend.page import write_trend_page
     from sealscope.reporting.trend.text import trend_csv, trend_text
     from sealscope.units import parse_quantity
@@ -46,13 +50,19 @@ def trend(
     spacing = None if every is None else parse_quantity(every, "s", name="--every")
     if output is not None:
         _check_output(output, files)
-    paths, readings = recordings_in(files), []
+    paths, readings, undated = recordings_in(files), [], 0
+    name = "" if stated.known is None else stated.known.name
     with opt.progress() as update:
         for k, (file, recording) in enumerate(stated.read_all(paths)):
             if recording is not None:
+                name = name or machine_name_of(remarks_of(recording.provenance)) or ""
                 reading = opt.attempt(file, partial(reading_of, recording, stated.rig, file.name))
+                if reading is not None and reading.start is None and spacing is None:
+                    reading, undated = replace(reading, start=file_seconds(recording, file)), undated + 1
                 readings += [] if reading is None else [reading]
             update("recordings", (k + 1) / len(paths))
+    if undated:
+        opt.complain(f"{undated} of {len(paths)} files state no time: that of their last change is taken (--every)")
     if not readings:
         raise UnreadableFile("no recording could be read, so there is no trend")
     result = trend_of(readings, healthy=healthy, limit=stated.limit, years=years, every=spacing)
@@ -67,7 +77,7 @@ def trend(
         if kind in texts:
             opt.write_text(output, texts[kind]() + "\n")
         else:
-            write_trend_page(output, result, title=files[0].resolve().name if files[0].is_dir() else "")
+            write_trend_page(output, result, title=name)
     failed = result.verdict in (fail_on or ())
     if failed or len(readings) < len(paths):
         raise Exit(opt.FAILED_ON if failed else 1)

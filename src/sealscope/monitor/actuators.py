@@ -22,6 +22,7 @@ import numpy as np
 from pydantic import ValidationError
 from sqlalchemy.exc import IntegrityError
 
+from sealscope.diagnosis.commissioned.watched import is_remeasured, load_watched
 from sealscope.diagnosis.live.estimates import BlockEstimate
 from sealscope.diagnosis.live.watch import STATE_VERSION, Watch, watch
 from sealscope.diagnosis.verdict.states import LEAKING, MachineState, state_of
@@ -50,7 +51,8 @@ class _Actuator:
     """What is in memory of an actuator.
 
     `pending`, `bytes`: blocks since the checkpoint; `taken`: blocks so far; `judged_s`: end of the last block that was
-    judged [s]; `kept`: the last samples while there is an alarm, which a machine's file may be taught.
+    judged [s]; `last`: the last estimate, of flows over the cycles seen; `kept`: the last samples while there is an
+    alarm, which a machine's file may be taught.
     """
 
     settings: ActuatorSettings
@@ -78,9 +80,9 @@ class _Actuator:
                 self.oil_celsius = float(known.mean()) - 273.15
         for estimate, leak in self.watch.each(samples, follows=follows):
             version = 0 if self.watch.baseline is None else self.watch.baseline.version
-            change = self.judge.take(estimate, leak, version, settings)
+            self.last = self.watch.over_cycles(estimate)
+            change = self.judge.take(self.last, leak, version, settings)
             estimates.append(estimate)
-            self.last = estimate
             if estimate.judged or self.judged_s is None or self.judged_s > estimate.t:  # the clock may be set back
                 self.judged_s = estimate.t
             if change is not None:
@@ -123,8 +125,10 @@ class _Actuator:
             "state": self._machine_state().as_dict(),
             "by": self.watch.method,
             "total_lpm": last.total_lpm,
+            "total_interval_lpm": last.total_interval_lpm,
             "leak_lpm": last.leak_lpm,
             "leak_interval_lpm": last.leak_interval_lpm,
+            "why_no_litres": self.watch.why_no_litres,
             "oil_celsius": self.oil_celsius,
             "baseline": None if base is None else {"version": base.version, "hours": base.hours, "lpm": base.lpm},
             "alarm": None if alarm is None else alarm.id,
@@ -139,6 +143,12 @@ def _settings_of(stored: str) -> WatchSettings | None:
         return WatchSettings.model_validate_json(stored)
     except ValidationError:
         return None
+
+
+def _learned_alike(stored: Watch, fresh: Watch) -> bool:
+    """Return whether a stored watch learned with what a fresh one would, or with a displacement measured since."""
+    (rig, *rest), (before, *others) = fresh.learned_with, stored.learned_with
+    return rest == others and (rig == before or is_remeasured(rig, before))
 
 
 class _Repeated(Exception):  # noqa: N818 (says what happened)
@@ -162,7 +172,7 @@ class WatchedActuators:
         """Return an actuator as its last transaction left it, or begun anew where it is new or the settings changed."""
         name, rate = settings.name, settings.false_alarms_per_1000_h
         state, taken = self.store.checkpoint(name), self.store.last_number(self.store.tables.blocks, name)
-        fresh = watch(settings.rig, false_alarms_per_1000_h=rate, learn_hours=settings.learn_hours)
+        fresh = watch(load_watched(settings.rig).rig, false_alarms_per_1000_h=rate, learn_hours=settings.learn_hours)
         actuator, anew = _Actuator(settings, fresh, AlarmJudge(name), taken=taken), True
         if state is not None:
             stored, own, pending = state
@@ -180,7 +190,7 @@ class WatchedActuators:
                     actuator.judged(samples, follows, before or settings)
                 anew = before != settings.watched_with
                 actuator.watch.false_alarms_per_1000_h = rate  # with the same baseline
-                if actuator.watch.learned_with != fresh.learned_with:
+                if not _learned_alike(actuator.watch, fresh):
                     _log.warning("%s: its rig or learn_hours are others than it learned with, begins anew", name)
                     fresh.continue_from(actuator.watch.blocks, actuator.watch.baseline_version)
                     actuator.watch, anew = fresh, True

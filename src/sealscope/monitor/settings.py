@@ -10,9 +10,9 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, IPvAnyAddress, ValidationInfo, model_validator
 
+from sealscope.diagnosis.commissioned.watched import load_watched
 from sealscope.diagnosis.live.joining import CHANNELS, in_words, ways_to_watch
 from sealscope.errors import InputError
-from sealscope.parameters import load_rig
 from sealscope.storage.toml_file import read_model, read_toml
 
 _Place = TypeVar("_Place", Path, str)
@@ -82,6 +82,19 @@ class ActuatorSettings(WatchSettings):
     nodes: dict[str, str] = Field(default_factory=dict)
     units: dict[str, str] = Field(default_factory=dict)
     simulate: SimulateSettings | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _machine_states_the_rest(cls, values: Any, info: ValidationInfo) -> Any:
+        """Take rate, map and limit from the machine's file where the table does not state them."""
+        rig = values.get("rig") if isinstance(values, dict) else None
+        if not isinstance(rig, str) or not rig.endswith(".toml"):
+            return values
+        place = Path(info.context["folder"]) / rig if info.context else Path(rig)
+        machine = load_watched(os.fspath(place))
+        columns = {} if isinstance(machine.channel_map, str) else dict(machine.channel_map)
+        stated = {"map": columns or None, "rate": machine.rate, "error_lpm": machine.limit_lpm}
+        return {**{name: value for name, value in stated.items() if value is not None}, **values}
 
 
 class PageSettings(_Part):
@@ -187,7 +200,7 @@ class MonitorSettings(_Part):
             for channel in {**each.nodes, **each.units} if each.nodes else ():
                 if channel not in CHANNELS:
                     raise ValueError(f"nodes must be of {', '.join(CHANNELS)}, got {channel[:40]!r}")
-            ways = ways_to_watch(load_rig(each.rig)) if each.nodes else ()
+            ways = ways_to_watch(load_watched(each.rig).rig) if each.nodes else ()
             if each.nodes and not any(each.nodes.keys() >= {*way} for way in ways):
                 raise ValueError(f"nodes of {each.name!r} must give {in_words(ways)}, got {', '.join(each.nodes)}")
         sends = self.sparkplug is not None or (mqtt is not None and mqtt.alarms_topic is not None)

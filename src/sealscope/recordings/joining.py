@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 
@@ -37,6 +38,18 @@ def start_seconds(recording: Recording, file: str = "") -> float | None:
     if start is None:
         start = _stamp_in_name(str(recording.provenance.get("file") or file))
     return None if start is None else start + (float(recording.t[0]) if len(recording) else 0.0)
+
+
+def file_seconds(recording: Recording, path: Path) -> float:
+    """Return when the first sample of a file's recording was taken [s since 1970], by the one clock of all commands.
+
+    By the time in the file, else in its name, else that of its last change, when the last sample was taken.
+    """
+    start = start_seconds(recording, path.name)
+    if start is not None:
+        return start
+    times = recording.t[np.isfinite(recording.t)]
+    return path.stat().st_mtime - (float(times[-1] - times[0]) if times.size else 0.0)
 
 
 def _stamp_in_name(name: str) -> float | None:

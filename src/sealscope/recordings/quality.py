@@ -309,6 +309,15 @@ def clipped(values: Array, held: NDArray[np.intp] | None = None, low: bool = Tru
     return rails
 
 
+def fast_length(count: int) -> int:
+    """Return the least length from `count` on without a prime factor beyond 5, of which a transform is fast.
+
+    As `scipy.fft.next_fast_len(count, real=True)`, without the modules that scipy.fft loads.
+    """
+    powers = (3**i * 5**j for i in range(40) for j in range(28) if 3**i * 5**j < 2 * count)
+    return min((power << max(0, (-(-count // power) - 1).bit_length()) for power in powers), default=count)
+
+
 def hum(values: Array, rate: float) -> list[tuple[float, float, float]]:
     """Return (frequency [Hz], amplitude, share of the power over 20 Hz) of the lines of the mains, 50 or 60 Hz.
 
@@ -317,8 +326,6 @@ def hum(values: Array, rate: float) -> list[tuple[float, float, float]]:
     Hann-windowed periodogram of the values less their straight line; the amplitude of a line is 2 |X| / sum(w). Clear
     means 10 times the median and 4 times the largest of what lies beside it. Nothing is looked for in under 1.5 s.
     """
-    from scipy.fft import next_fast_len
-
     count = values.size
     if count / rate < 1.5:
         return []
@@ -328,7 +335,7 @@ def hum(values: Array, rate: float) -> list[tuple[float, float, float]]:
     if not centred.any():
         return []
     window = _hann(count)
-    size = next_fast_len(count, real=True)
+    size = fast_length(count)
     centred *= window
     spectrum = np.fft.rfft(centred, size)
     squares = (spectrum.real**2 + spectrum.imag**2) * (2.0 / window.sum()) ** 2

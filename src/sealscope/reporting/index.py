@@ -33,7 +33,7 @@ def write_index(path: str | os.PathLike[str], pages: Sequence[tuple[Path, Diagno
         {
             "href": quote(os.fsencode(page.name)),
             "file": Path(diagnosis.file).name,
-            "verdict": diagnosis.verdict,
+            "symbol": diagnosis.state.symbol,
             "summary": diagnosis.summary,
             "since": messages.since(diagnosis),
             "how_much": messages.how_much(diagnosis) or messages.leakage_in_short(diagnosis),

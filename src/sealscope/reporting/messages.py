@@ -13,6 +13,7 @@ from typing import Any
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LEAKS, RMS_CHANGE
 from sealscope.diagnosis.verdict.machine import AssumedMachine
+from sealscope.diagnosis.verdict.states import MachineState
 from sealscope.errors import printable
 from sealscope.paragraphs import WIDTH, paragraph, paragraphs
 from sealscope.recordings.formats.columns import counted, listed
@@ -76,9 +77,18 @@ def cause(diagnosis: Diagnosis) -> str | None:
     return diagnosis.cause
 
 
+def shows_reason(diagnosis: Diagnosis) -> bool:
+    """Return whether the reason stands beside the verdict: it names what cannot be told, or what else changed."""
+    return diagnosis.verdict == "cannot tell" or (diagnosis.verdict != "leak" and cause(diagnosis) is not None)
+
+
 def state(diagnosis: Diagnosis) -> str:
     """Return the state of the machine as NAMUR NE 107 names it, with its letter and its severity."""
-    own = diagnosis.state
+    return state_text(diagnosis.state)
+
+
+def state_text(own: MachineState) -> str:
+    """Return a state of NE 107 in words."""
     return f"{own.name} ({own.symbol} of NE 107{f', severity {own.severity} of 1000' if own.severity else ''})"
 
 
@@ -87,7 +97,7 @@ def since(diagnosis: Diagnosis) -> str | None:
     if diagnosis.verdict != "leak":
         return None
     if diagnosis.onset_s is None:
-        return say("since.whole")
+        return say("since.unsettled" if diagnosis.rises_within else "since.whole")
     if diagnosis.onset_interval_s is None:
         return clock(diagnosis.onset_s)
     low, high = map(clock, diagnosis.onset_interval_s)
@@ -144,7 +154,9 @@ def machine_text(machine: AssumedMachine) -> str:
         key = "call" if machine.stated_by == "call" else "stated"
     else:
         key = "area" if machine.area_stated else "displacement" if machine.displacement_stated else "assumed"
-    area, displacement = f"{number(1e6 * machine.area)} mm²", f"{number(1e6 * machine.displacement)} cm³/rev"
+    sides = [f"{number(1e6 * area, 4)} mm²" for area in machine.areas or (machine.area,)]
+    area = sides[0] if sides[0] == sides[-1] else f"{sides[0]} at A and {sides[1]} at B"
+    displacement = f"{number(1e6 * machine.displacement)} cm³/rev"
     return say(f"machine.{key}", area=area, displacement=displacement, rig=machine.rig)
 
 
@@ -276,13 +288,13 @@ def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
     level = None if diagnosis.severity is None else diagnosis.severity.level
     judge = diagnosis.methods[0].detector if diagnosis.methods else ""
     confirmed = say(f"once_confirmed.{level or 'plan'}", limit=diagnosis.limit)
-    named = diagnosis.cause is not None and (diagnosis.verdict == "leak") == (diagnosis.cause in LEAKS)
+    named = diagnosis.named_cause is not None
     if named and diagnosis.verdict == "leak":
         steps = [diagnosis.next_check, say("next.repeat"), confirmed]
     elif named:
         steps = [diagnosis.next_check, say("next.resolved")]
     elif diagnosis.verdict == "leak":
-        steps = [*map(say, ("next.repeat", "next.bypass", "next.creep")), confirmed]
+        steps = [diagnosis.next_check, say("next.creep"), confirmed]
     elif diagnosis.verdict == "no leak" and judge == RMS_CHANGE:
         steps = [say("next.ringing"), say("next.longer")]
     elif diagnosis.verdict == "no leak":
@@ -321,13 +333,13 @@ def not_used(diagnosis: Diagnosis) -> str | None:
 
 def short_text(diagnosis: Diagnosis, *, width: int = WIDTH) -> str:
     """Return the verdict, its figures and the next step as plain text of about five lines; `width`: columns [1]."""
-    untold = diagnosis.verdict == "cannot tell"
     sure = in_short(diagnosis) if diagnosis.odds or diagnosis.score is not None else None
     rows = [
+        ("state", state(diagnosis)),
         *_figures(diagnosis),
         ("leakage", total_leakage(diagnosis) if diagnosis.verdict == "no leak" else None),
         ("cause", cause(diagnosis)),
-        ("reason", diagnosis.reason) if untold else ("how sure", sure),
+        ("reason", diagnosis.reason) if shows_reason(diagnosis) else ("how sure", sure),
         ("data", quality_summary(diagnosis) if diagnosis.quality else None),
         ("units", raw_counts(diagnosis)),
         ("not used", not_used(diagnosis)),

@@ -171,7 +171,7 @@ def render_page(
         *charts.detail_charts(chambers, pressure_unit),
     ]
     drawn = charts.draw(recording, chambers, shown, diagnosis, all_marks)
-    circuit = circuit_of(known_rig, recording)
+    circuit = circuit_of(known_rig, recording, diagnosis.machine)
     facts = f"{len(recording)} samples at {recording.rate:g} Hz, {messages.clock(recording.duration)}"
     return template.render(
         "page.html.j2",

@@ -7,6 +7,7 @@ from math import sqrt
 from typing import Any, NamedTuple
 
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
+from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.parameters import Rig
 from sealscope.recordings.recording import CHANNEL_UNITS, Recording
 from sealscope.reporting import messages, template
@@ -45,28 +46,42 @@ class Circuit(NamedTuple):
     values: dict[str, str]
 
 
-def circuit_of(rig: Rig | None, recorded: Container[str]) -> Circuit:
+def circuit_of(rig: Rig | None, recorded: Container[str], machine: AssumedMachine | None = None) -> Circuit:
     """Return what to draw of a machine: of an unknown one only what every pump-controlled actuator has.
 
-    A bypass is drawn where its flow meter was recorded: no rig states it.
+    `machine`: what is stated of one without a rig. A bypass is drawn where its flow meter was recorded.
     """
-    bypass = "q_leak" in recorded
+    bypass, values = "q_leak" in recorded, dict.fromkeys(_VALUES, "")
     if rig is None:
-        return Circuit("cylinder", "AB", _ROD, False, False, bypass, False, dict.fromkeys(_VALUES, ""))
-    areas = rig.cylinder.A_A, rig.cylinder.A_B
-    ratio = min(areas) / max(areas)
-    rod = round(min(0.8, sqrt(1.0 - ratio)) * _BORE, 1)
-    single = ("single-rod cylinder", "A" if areas[0] <= areas[1] else "B", rod)
+        cylinder: tuple[str, str, float] = ("cylinder", "AB", _ROD)
+        if machine is not None and machine.area_stated and machine.areas is not None:
+            cylinder = _cylinder_of(machine.areas)
+            values["A_A"], values["A_B"] = (_value_text(area, "mm²", 1e-6) for area in machine.areas)
+        if machine is not None and machine.displacement_stated:
+            values["q_b"] = _value_text(machine.displacement, "cm³/rev", 1e-6)
+        return Circuit(*cylinder, False, False, bypass, False, values)
     return Circuit(
-        *(("double-rod cylinder", "AB", _ROD) if ratio > _ALIKE else single),
+        *_cylinder_of((rig.cylinder.A_A, rig.cylinder.A_B)),
         throttles=rig.line.orifices == "present" or max(rig.line.closed_A, rig.line.closed_B) > 0,
         make_up=rig.makeup.check_valves != "absent",
         bypass=bypass,
         valve=rig.valve.spool == "present",
-        values={
-            label: f"{messages.number(float(rig[name]) / size)} {unit}" for label, (name, unit, size) in _VALUES.items()
-        },
+        values={label: _value_text(float(rig[name]), unit, size) for label, (name, unit, size) in _VALUES.items()},
     )
+
+
+def _cylinder_of(areas: tuple[float, float]) -> tuple[str, str, float]:
+    """Return kind, sides of the rod and its height in the drawing of a cylinder with areas of sides A and B."""
+    ratio = min(areas) / max(areas)
+    if ratio > _ALIKE:
+        return "double-rod cylinder", "AB", _ROD
+    rod = round(min(0.8, sqrt(1.0 - ratio)) * _BORE, 1)
+    return "single-rod cylinder", "A" if areas[0] <= areas[1] else "B", rod
+
+
+def _value_text(value: float, unit: str, size: float) -> str:
+    """Return a value in its unit, with the digits that a data sheet states."""
+    return f"{messages.number(value / size, 4)} {unit}"
 
 
 def schematic(recording: Recording, diagnosis: Diagnosis, circuit: Circuit) -> str:

@@ -15,7 +15,6 @@ from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple, TypeVar
 
-from sealscope.campaigns.cases.case import code_key
 from sealscope.errors import InputError, MissingExtra
 
 Item = TypeVar("Item")
@@ -124,6 +123,8 @@ def _on_cluster(task: Callable[[Any], Any], address: str) -> Iterator[_Pools]:
         import distributed
     except ImportError:
         raise MissingExtra("a cluster needs Dask: pip install 'sealscope[cluster]'") from None
+    from sealscope.campaigns.cases.case import code_key
+
     dask: Any = distributed
     try:
         client = dask.Client(address, timeout=10, set_as_default=False)

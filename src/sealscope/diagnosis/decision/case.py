@@ -91,9 +91,15 @@ class Case:
         return explain(self.observables, self.null.chance, rise)
 
     def leak_probability(self, alarm: Question) -> float:
-        """Compute the probability of a leak past piston or pump, given that what answers the alarm's question moved."""
-        if alarm.name == LEVEL or not self.context.is_weighed:
+        """Compute the probability of a leak past piston or pump, given that what answers the alarm's question moved.
+
+        A level above the rig's file is that of a leak unless a change within the recording, which raised it, is none.
+        """
+        if not self.context.is_weighed:
             return 1.0
+        if alarm.name == LEVEL:
+            within = next((question for question in self.alarms if question.name == WITHIN), None)
+            return 1.0 if within is None else self.leak_probability(within)
         data = RISE if alarm.name == AGAINST and self.leak is not None else self.judge.observables[0].data
         return probability_of(self.explanations, *LEAK_EVENTS, data=data)
 

@@ -85,7 +85,8 @@ def _leak_evidence(case: Case, alarm: Question) -> Evidence:
         onset, flow = shown.onset, None
     else:
         pump = probability_of(case.explanations, "pump leak")
-        cause = "piston leak" if leak.separates_pump or 0.0 < pump < RAREST else "piston or pump leak"
+        tells_pump = any(own.name == "pump leak" for own in case.observables) and pump < RAREST
+        cause = "piston leak" if leak.separates_pump or tells_pump else "piston or pump leak"
         onset = leak.step.onset() if alarm.name == WITHIN and leak.step is not None else None
         flow = leak.step_flow if alarm.name == WITHIN else leak.rise_flow
     evidence = Evidence(LEAK, "", cause=cause)

@@ -30,9 +30,9 @@ from sealscope.diagnosis.verdict.evidence import Cause
 
 #: Data that the leakage against healthy recordings is.
 RISE = "rise"
-#: Most events of an explanation, and the least log likelihood ratio of an event that stands beside another: duty, noise
+#: Most events of an explanation, and the least log Bayes factor, of ten to one, of what shows an event beside another: duty, noise
 #: and friction change together often enough that two would leave a leak no place.
-MOST, LEAST = 3, 1.0
+MOST, LEAST = 3, 2.3
 #: Events whose leakage passes the piston or the pump, which lie in parallel.
 LEAK_EVENTS = ("piston leak", "pump leak")
 
@@ -120,9 +120,13 @@ def _ways_of(event: Event, weighted: Sequence[tuple[Observable, float]], rise: L
     moved = [(own, gain) for own, gain in weighted if event.does_move(own)]
     gains: dict[str, float] = {}
     if moved:
-        anchor, most = max(moved, key=lambda pair: pair[1])
+        anchor = max(moved, key=lambda pair: pair[1])[0]
         # what shows the event has to show it before it explains anything else
-        disturbed = [pair for pair in weighted if event.does_disturb(pair[0])] if most > LEAST else []
+        # ... and no more of the data by which it is shown
+        shown = {observable.data for observable, gain in moved if gain > LEAST}
+        disturbed = [
+            pair for pair in weighted if shown and pair[0].data not in shown and event.does_disturb(pair[0])
+        ]
         for own, gain in moved + disturbed:
             if _coincide(own, anchor):
                 gain += 0.5 * own.advantage if event.is_sized else 0.0

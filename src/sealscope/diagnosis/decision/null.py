@@ -1,10 +1,12 @@
 """Healthy recordings as the null of every statistic: how much rarer than it is a law calls a healthy recording.
 
-A provider's law gives each statistic a chance P under the null; u = -log P is then exponential. Where the law fails, u
-of healthy recordings is larger: u / lambda is exponential, lambda >= 1 with log lambda exponential beforehand
-(`priors.toml`). With the u_1 .. u_n of n healthy recordings the predictive chance is
+A provider's law gives each statistic a chance P under the null; u = -log P is then exponential. The law may fail, in a
+share of machines (`priors.toml`): then u of healthy recordings is larger, u / lambda exponential, and log lambda
+exponential beforehand. With the u_1 .. u_n of n healthy recordings the predictive chance is
 
-    P(u) = sum_k w_k exp(-u / lambda_k),    w_k ~ lambda_k^(-a) lambda_k^(-n) exp(-sum_i u_i / lambda_k).
+    P(u) = sum_k w_k exp(-u / lambda_k),    w_k ~ p_k lambda_k^(-n) exp(-sum_i u_i / lambda_k),
+
+lambda_0 = 1 for the law as it stands.
 
 What every healthy recording shows, a rest, a ramp or a warm-up, is then no alarm. Without healthy recordings the law
 stands as it is.
@@ -62,13 +64,16 @@ class HealthyNull:
 
 
 def _posterior(rarities: Sequence[float]) -> tuple[Array, Array]:
-    """Compute weights and values (NODES,) of the inflation."""
+    """Compute weights and values (NODES + 1,) of the inflation, first that of the law as it stands."""
     believed = priors("decision")["null"]
     if not len(rarities):
         return np.ones(1), np.ones(1)
-    logarithm = np.linspace(0.0, np.log(believed["largest"]), NODES)
+    logarithm = np.append(0.0, np.linspace(0.0, np.log(believed["largest"]), NODES))
     inflation = np.exp(logarithm)
-    likelihood = -len(rarities) * logarithm - float(np.sum(rarities)) / inflation - logarithm / believed["inflation"]
+    prior = np.exp(-logarithm / believed["inflation"])
+    prior[1:] *= believed["fails"] / prior[1:].sum()
+    prior[0] = 1.0 - believed["fails"]
+    likelihood = np.log(prior) - len(rarities) * logarithm - float(np.sum(rarities)) / inflation
     weights = np.exp(likelihood - likelihood.max())
     return weights / weights.sum(), inflation
 

@@ -6,6 +6,7 @@ import json
 import math
 import os
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +26,7 @@ from sealscope.diagnosis.verdict.evidence import NO_LEAK, Evidence
 from sealscope.errors import InputError
 from sealscope.recordings.corrections.gaps import remove_dropouts
 from sealscope.recordings.formats.timebase import clock_text
-from sealscope.recordings.recording import Recording
+from sealscope.recordings.recording import Array, Recording
 from sealscope.storage.plain_state import part_of, recall, restored, saved
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -33,13 +34,13 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 #: Format of the saved state.
-STATE_VERSION = 12
+STATE_VERSION = 13
 _PRIORS = priors("live")["watch"]
 #: Blocks of one mean that is compared with the baseline, and of the mean that is the leak after an alarm.
 GROUP, _OF_NOW = _PRIORS["group"], _PRIORS["recent"]
-#: What is kept of the last blocks: end, conductance, deviation, flow of a unit of it, and the duty's logarithms; and of
-#: those whose mean is not whole yet, with what all conductances are off by.
-_LAST = np.dtype([(name, float) for name in ("end", "g", "sd", "flow", "pressure", "motion")])
+#: What is kept of the last blocks: end, conductance, deviation, flow of a unit of it, the duty's logarithms, the total
+#: conductance and what it is off by; and of those whose mean is not whole yet.
+_LAST = np.dtype([(name, float) for name in ("end", "g", "sd", "flow", "pressure", "motion", "total", "offset")])
 _GROUP = np.dtype([(name, float) for name in ("end", "g", "sd", "offset")])
 #: A block whose numbers are larger says nothing: their products would overflow.
 _LARGEST = 1e100
@@ -139,12 +140,20 @@ class Watch:
         return LiveBalance.block_seconds if self._estimator is None else self._estimator.block_seconds
 
     @property
+    def why_no_litres(self) -> str:
+        """Why no L/min is stated, "" where it is."""
+        own = self._estimator
+        if own is None or own.litres:
+            return ""
+        return "L/min is not stated: areas and displacement of the machine are not, which its file states"
+
+    @property
     def evidence(self) -> Evidence:
         """Verdict of now, with the leak that the tests show, else with the 95 % bound of one that they do not."""
         leak, own = self.leak, self._estimator
         if leak is not None:
             figures: dict[str, Any] = {name: getattr(leak, name) for name in _FIGURES}
-            cause: Any = None if leak.cause == PressureEstimator.cause else leak.cause
+            cause: Any = leak.cause
             return Evidence(decide_verdict(True, math.inf, 0.0), leak.reason, cause=cause, **figures)
         bound = self._detector.bound() if own is not None and len(self._last) else math.inf
         if own is None or not math.isfinite(bound):
@@ -250,7 +259,7 @@ class Watch:
         if len(self._last) and not 0.0 <= block.end - self._last["end"][-1] <= _PRIORS["pause"]:
             self._forget()
         self._detector.take(block.begin, block.end, block.g, block.sd)
-        row = np.array((block.end, block.g, block.sd, block.flow, *block.duty), _LAST)
+        row = np.array((block.end, block.g, block.sd, block.flow, *block.duty, block.total, block.offset), _LAST)
         self._last = np.append(self._last[1 - RECENT :], row)
         self._test_step(own, block)
         self._test_level(own, block)
@@ -319,6 +328,7 @@ class Watch:
             earlier = self._last["g"][self._last["end"] <= ends[0]][-GROUP:]
             known = float(np.mean(earlier)) if earlier.size else block.g - rise.size
             before = leak.conductance_before if leak is not None else known
+        reason = rise.reason if own.litres else f"{rise.reason}; {self.why_no_litres}"
         half = WITHIN_95 * math.hypot(rise.deviation, own.size_error * rise.size)
         low, high = own.inside * max(0.0, rise.size - half) * block.flow, own.orifice * (rise.size + half) * block.flow
         self.leak = WatchedLeak(
@@ -331,7 +341,7 @@ class Watch:
             conductance_before_sd=rise.deviation,
             test=rise.test,
             cause=own.cause,
-            reason=rise.reason,
+            reason=reason,
             score=rise.score,
             threshold=rise.threshold,
         )
@@ -358,13 +368,60 @@ class Watch:
         """Return the conductance since the onset of a leak, and its interval, in which the oil may have warmed."""
         since = self._last["end"] - self.block_seconds >= leak.onset_interval_s[1]
         recent = self._last["g"][since][-_OF_NOW:]
-        now, oil = float(np.mean(recent)) if recent.size else block.g, priors("inference")["oil"]
-        hours = max(0.0, block.end - leak.onset_s) / 3600.0
-        warmed = oil["warmest"] ** min(1.0, hours / oil["shift"])
+        now, warmed = float(np.mean(recent)) if recent.size else block.g, self._warmed(leak, block.end)
         before, rise = max(leak.conductance_before, 0.0), now - leak.conductance_before
         noise = sd / math.sqrt(max(len(recent), 1))
         spread = WITHIN_95 * math.hypot(noise, leak.conductance_before_sd, own.size_error * rise)
         return rise, own.inside * (now - before * warmed - spread), now - before / warmed + spread
+
+    def over_cycles(self, estimate: BlockEstimate) -> BlockEstimate:
+        """Return the estimate of the last block with mean flows over the cycles seen, as a recording's are.
+
+        These are the last `RECENT` blocks since an interruption, of a leak those since its onset.
+        """
+        own, leak = self._estimator, self.leak
+        if own is None or not (own.litres and estimate.judged and len(self._last)):
+            return estimate
+        rows = self._last
+        if leak is not None:
+            since = rows["end"] - self.block_seconds >= leak.onset_interval_s[1]
+            rows = rows[since] if since.any() else rows[-1:]
+        flow = rows["flow"]
+        noise = math.sqrt(self._detector.noise * float(np.sum((rows["sd"] * flow) ** 2))) / len(rows)
+
+        def mean_of(values: Array) -> tuple[float, float]:
+            spread = float(values.std(ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else 0.0
+            return float(values.mean()), math.hypot(noise, spread)
+
+        total = interval = None
+        if own.levels:
+            total, deviation = mean_of(rows["total"] * flow)
+            half = WITHIN_95 * math.hypot(deviation, float(np.mean(rows["offset"] * flow)))
+            interval = max(0.0, total - half), max(0.0, total + half)
+        estimate = replace(estimate, total_lpm=total, total_interval_lpm=interval)
+        if leak is None and self.baseline is None:
+            return estimate
+        if leak is not None:
+            before, scale = leak.conductance_before, own.inside
+            warmed = self._warmed(leak, estimate.t)
+            least, most = max(before, 0.0) * warmed, before / warmed
+            known = leak.conductance_before_sd
+        else:
+            base = self.baseline
+            assert base is not None
+            before, scale, least, most, known = base.level, 1.0, base.high, base.low, 0.0
+        unit = float(flow.mean())
+        value, deviation = mean_of((rows["g"] - before) * flow)
+        half = WITHIN_95 * math.hypot(deviation, known * unit, own.size_error * value)
+        low = scale * (value + (before - least) * unit - half)
+        high = own.orifice * (value + (before - most) * unit + half)
+        return replace(estimate, leak_lpm=value, leak_interval_lpm=(max(0.0, low), max(0.0, high)))
+
+    @staticmethod
+    def _warmed(leak: WatchedLeak, t: float) -> float:
+        """Return by how much warmer oil may have raised the conductance since the onset of a leak."""
+        oil, hours = priors("inference")["oil"], max(0.0, t - leak.onset_s) / 3600.0
+        return float(oil["warmest"] ** min(1.0, hours / oil["shift"]))
 
     def state(self) -> dict[str, Any]:
         """Return all that the watch knows as plain values that JSON holds, its ``"version"`` that of the format."""

@@ -28,7 +28,7 @@ from sealscope.diagnosis.trend.wear import Episode, Levels, Wear, beyond, episod
 from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, LEAK, NO_LEAK, Verdict
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.severity import RepairLimit
-from sealscope.diagnosis.verdict.states import state_of
+from sealscope.diagnosis.verdict.states import MachineState, state_of
 from sealscope.errors import InputError
 from sealscope.recordings.formats.columns import listed
 from sealscope.recordings.quality import Finding
@@ -143,6 +143,14 @@ class Trend:
             return state_of(CANNOT_TELL).action
         return "Go on recording under the same duty, and compare the level with what a new machine passes."
 
+    @property
+    def state(self) -> MachineState:
+        """State of the machine as NAMUR NE 107 names it, as of a diagnosis."""
+        over = self.verdict == LEAK and self.wear is not None and self.limit is not None
+        if over and self.wear.now.low > self.limit:  # type: ignore[union-attr, operator]
+            return state_of("leak over the limit", action=self.next_check)
+        return state_of("watched" if self.verdict == NO_LEAK else self.verdict, action=self.next_check)
+
     def as_dict(self) -> dict[str, Any]:
         """Return the trend as plain JSON values; a number that is not finite becomes null."""
         alarm, days = self.alarm, [point.day for point in self.points] or [math.nan]
@@ -187,6 +195,7 @@ class Trend:
                     for finding in self.findings
                 ],
                 "next_check": self.next_check,
+                "state": self.state.as_dict(),
             }
         )
 

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sealscope.diagnosis.verdict.evidence import LEAK, LEAKS, NO_LEAK, RMS_CHANGE, Evidence
+from sealscope.diagnosis.verdict.evidence import AGAINST, LEAK, LEAKS, NO_LEAK, RMS_CHANGE, WITHIN, Evidence
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.severity import RepairLimit, Severity, beside_the_pump, severity
-from sealscope.diagnosis.verdict.states import MachineState, state_of
+from sealscope.diagnosis.verdict.states import MachineState, action_of, state_of
 from sealscope.errors import InputError, MissingExtra
 from sealscope.recordings.formats.headings.preamble import remarks_of
 from sealscope.recordings.quality import Finding
@@ -139,7 +139,12 @@ class Diagnosis(Evidence):
             return None if course is None else level
         onset = math.inf if self.onset_s is None or not math.isfinite(self.onset_s) else self.onset_s
         before = course.lpm[(course.t < onset) & np.isfinite(course.lpm)]
-        return level + float(np.median(before)) if before.size else None
+        if not before.size:
+            return None
+        healthy = float(np.median(before))
+        if self.verdict == LEAK and self.onset_s is None:  # it leaks from the first sample on
+            return None if self.leak_lpm is None else level + max(0.0, healthy - self.leak_lpm)
+        return level + healthy
 
     @property
     def measured_ratio(self) -> tuple[float, tuple[float, float]] | None:
@@ -152,8 +157,7 @@ class Diagnosis(Evidence):
     @property
     def machine_name(self) -> str | None:
         """What the file calls the machine; None where it does not say."""
-        names = {name.lower(): text for name, text in self.about.items()}
-        return next((names[name] for name in _MACHINES if name in names), None)
+        return machine_name_of(self.about)
 
     @property
     def methods(self) -> tuple[Evidence, ...]:
@@ -163,28 +167,60 @@ class Diagnosis(Evidence):
     @property
     def _condition(self) -> str:
         """The condition of `states.toml` that the verdict is."""
-        if self.verdict != NO_LEAK or self.known_healthy:
+        if self.verdict != NO_LEAK:
             return self.verdict
+        if self.known_healthy:
+            return NO_LEAK if self.is_baseline else "no leak found"
         return "no change of RMS" if self.detector == RMS_CHANGE else "no change"
+
+    @property
+    def named_cause(self) -> str | None:
+        """The cause that the verdict names: a leak's for `leak`, else another event's; None where it names none."""
+        return self.cause if (self.verdict == LEAK) == (self.cause in LEAKS) else None
 
     @property
     def next_check(self) -> str:
         """What to check next on the machine, in one or two sentences."""
-        return state_of(self._condition, self.cause).action
+        with_bypass = self.machine is not None and self.machine.bypass
+        return action_of(self._condition, self.named_cause, ("bypass",) if with_bypass else ())
 
     @property
     def state(self) -> MachineState:
-        """State of the machine as NAMUR NE 107 names it, a failure where the leak is surely over the repair limit."""
+        """State of the machine as NAMUR NE 107 names it, a failure where the leak is surely over the repair limit.
+
+        Every surface shows this state: name, letter, colour and severity of page, terminal, JSON and metrics.
+        """
         over = self.severity is not None and self.severity.level == "repair"
         condition = "leak over the limit" if over else self._condition
-        cause = self.cause if self.verdict == LEAK or self.cause not in LEAKS else None
-        return state_of(condition, cause, since_s=plain(self.onset_s), action=self.next_check)
+        return state_of(condition, self.named_cause, since_s=plain(self.onset_s), action=self.next_check)
 
     @property
     def known_healthy(self) -> bool:
         """Whether leak-free recordings or the rig show that the level is that of a healthy machine."""
         by_rig = self.total_leakage is not None and self.total_leakage.healthy
         return self.verdict == NO_LEAK and (self.baselines > 0 or by_rig)
+
+    @property
+    def is_baseline(self) -> bool:
+        """Whether it may serve as a baseline: its total is shown to be like that of the healthy recordings."""
+        against = self._question(AGAINST)
+        if self.verdict != NO_LEAK or self.cause is not None or against is None or not _is_usual(against):
+            return False
+        total = self.total_leakage
+        if total is None or total.lpm is None or total.interval_lpm is None or self.bound_lpm is None:
+            return True
+        return total.interval_lpm[0] <= 0.0 or self.bound_lpm < total.lpm  # else all of it may be a leak
+
+    @property
+    def rises_within(self) -> bool:
+        """Whether the leakage probably rose within the recording, of which no onset is stated."""
+        within = self._question(WITHIN)
+        return self.onset_s is None and within is not None and not _is_usual(within)
+
+    def _question(self, name: str) -> Evidence | None:
+        """Return what the judging detector answers to one of its questions; None where it was not asked."""
+        judge = self.parts[0].parts if self.parts else ()
+        return next((own for own in judge if own.detector == name), None)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the diagnosis as plain JSON values, keys in the order of the output contract.
@@ -313,3 +349,14 @@ class Diagnosis(Evidence):
         ]
         body = "".join(f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>" for name, text in rows if text)
         return f"<table><caption>{escape(self.file)}: {escape(self.verdict)}</caption>{body}</table>"
+
+
+def _is_usual(question: Evidence) -> bool:
+    """Return whether a question's chance is that of 19 of 20 healthy recordings."""
+    return question.chance is None or question.chance >= 0.05
+
+
+def machine_name_of(about: Mapping[str, str]) -> str | None:
+    """Return what the preamble of a file calls the machine; None where it does not say."""
+    names = {name.lower(): text for name, text in about.items()}
+    return next((names[name] for name in _MACHINES if name in names), None)

@@ -15,6 +15,7 @@ LEAK, NO_LEAK, CANNOT_TELL = get_args(Verdict)
 Cause = Literal[
     "piston leak",
     "piston or pump leak",
+    "leak inside or outside",
     "pump leak",
     "external leak",
     "friction change",
@@ -26,8 +27,11 @@ Cause = Literal[
 NO_RIG = "L/min is not stated: no rig was stated (--rig)"
 #: Figures that a detector may refuse to state.
 Figure = Literal["onset_s", "leak_lpm"]
-#: The causes for which the verdict is `leak`: piston and pump lie in parallel, and often no channel tells them apart.
-LEAKS: tuple[Cause, ...] = ("piston leak", "piston or pump leak")
+#: The causes for which the verdict is `leak`: piston and pump lie in parallel, often no channel separates them, and
+#: without a position what is lost to the outside shows alike.
+LEAKS: tuple[Cause, ...] = ("piston leak", "piston or pump leak", "leak inside or outside")
+#: What a detector asks of the leakage: did it rise here, is it more than in healthy recordings?
+WITHIN, AGAINST = "within the recording", "against the baseline"
 #: Smallest chance that is stated.
 RAREST: float = priors("verdict")["false_alarm"]["rarest"]
 #: The detector that judges where no other can: it sees that something changed, and states no size.

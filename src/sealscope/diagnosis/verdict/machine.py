@@ -26,7 +26,8 @@ class AssumedMachine:
     `rig`: its name; `stated_by` the call (`--rig` or a Rig), the provenance of a recording of our own, or nobody;
     `area` of the piston, the mean of both sides [m^2], and `displacement` of the pump [m^3/rev]; `area_stated`,
     `displacement_stated`: whether they are stated, by the rig or on their own; `flow_meter`: whether flows are a
-    meter's, `q_pump`, and rest on neither.
+    meter's, `q_pump`, and rest on neither; `areas` of sides A and B [m^2]; `bypass`: whether a flow meter in a bypass
+    of the cylinder was recorded.
     """
 
     rig: str
@@ -36,6 +37,8 @@ class AssumedMachine:
     area_stated: bool
     displacement_stated: bool
     flow_meter: bool = False
+    areas: tuple[float, float] | None = None
+    bypass: bool = False
 
     @property
     def stated(self) -> bool:
@@ -48,6 +51,7 @@ class AssumedMachine:
             "name": self.rig,
             "stated_by": self.stated_by,
             "area_m2": self.area,
+            "areas_m2": self.areas,
             "area_stated": self.area_stated,
             "displacement_m3_per_rev": self.displacement,
             "displacement_stated": self.displacement_stated,
@@ -76,6 +80,8 @@ def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) 
         area_stated=known.states("cylinder.A_A", "cylinder.A_B"),
         displacement_stated=known.states("pump.q_b"),
         flow_meter=measures_flow(recording.units),
+        areas=(known.cylinder.A_A, known.cylinder.A_B),
+        bypass="q_leak" in recording.units,
     )
 
 

@@ -8,7 +8,7 @@ Source: NAMUR NE 107 (2017); its states in OPC UA: OPC 10000-100, DeviceHealthEn
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib.resources import files
@@ -45,7 +45,7 @@ class MachineState:
 
 
 @cache
-def _tables() -> Mapping[str, Mapping[str, Mapping[str, Any]]]:
+def _tables() -> Mapping[str, Mapping[str, Any]]:
     return tomllib.loads((files("sealscope.diagnosis.verdict") / "states.toml").read_text("utf-8"))
 
 
@@ -61,7 +61,18 @@ def state_of(
     tables = _tables()
     by_condition, by_cause = tables["conditions"][condition], tables["causes"].get(cause or "", {})
     name = by_condition["state"] if condition in LEAKING else by_cause.get("state", by_condition["state"])
-    action = action or by_cause.get("action") or by_condition["action"]
+    action = action or action_of(condition, cause)
     return MachineState(
         name=name, **tables["states"][name], condition=condition, since_s=since_s, cause=cause, action=action
     )
+
+
+def action_of(condition: str, cause: str | None = None, parts: Sequence[str] = ()) -> str:
+    """Return what is to be done under a condition, or for the cause of a change; KeyError as for `state_of`.
+
+    `parts`: what the machine has that leaks like a worn seal, and is looked at before its leak.
+    """
+    tables = _tables()
+    action: str = tables["causes"].get(cause or "", tables["conditions"][condition])["action"]
+    first = [str(tables["parts"][part]) for part in parts] if condition in LEAKING else []
+    return " ".join([*first, action])

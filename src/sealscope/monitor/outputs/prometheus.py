@@ -12,8 +12,10 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 #: Metric of an actuator -> help, and where it is in its summary. A name that ends in `_total` is a counter.
 _OF_ACTUATORS = {
-    "sealscope_leak_lpm": ("Leak beyond the healthy machine [L/min]", "leak_lpm"),
-    "sealscope_total_lpm": ("Flow past pump and piston together [L/min]", "total_lpm"),
+    "sealscope_leak_lpm": ("Leak beyond the healthy machine over the cycles seen [L/min]", "leak_lpm"),
+    "sealscope_leak_low_lpm": ("Lower end of its 95 % interval [L/min]", "leak_low"),
+    "sealscope_leak_high_lpm": ("Upper end of its 95 % interval [L/min]", "leak_high"),
+    "sealscope_total_lpm": ("Flow past pump and piston together over the cycles seen [L/min]", "total_lpm"),
     "sealscope_oil_temperature_celsius": ("Oil temperature as recorded [deg C]", "oil_celsius"),
     "sealscope_status_word": ("Bits: 1 warning, 2 error, 4 new", "status_word"),
     "sealscope_health": ("State of NE 107: 0 good, 1 failure, 2 check, 3 off spec, 4 maintenance", "state.health"),
@@ -55,6 +57,7 @@ def metrics_text(
 
     for actuator, summary in summaries.items():
         values = {**summary, **{f"state.{name}": value for name, value in summary.get("state", {}).items()}}
+        values["leak_low"], values["leak_high"] = summary.get("leak_interval_lpm") or (None, None)
         for name, (text, place) in _OF_ACTUATORS.items():
             add(name, text, values.get(place), actuator=actuator)
         if "by" in summary:

@@ -224,10 +224,10 @@ def machine_of(rig: str) -> dict[str, Any]:
     `rods`: the sides that the rod leaves; `stroke` [mm]; `area` [L/min per mm/s] and `displacement` [L/rev] give flows;
     `valve`: whether a servo valve drives it.
     """
-    from sealscope.parameters import load_rig
+    from sealscope.diagnosis.commissioned.watched import load_watched
     from sealscope.reporting.schematic import circuit_of
 
-    known: Rig = load_rig(rig)
+    known: Rig = load_watched(rig).rig
     circuit = circuit_of(known, ())
     return {
         "title": known.title,

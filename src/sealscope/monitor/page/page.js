@@ -251,7 +251,7 @@ function showLife(life) {
     element("span", "action", `${state.cause ? `Cause: ${state.cause}. ` : ""}${state.action}`),
   );
   byId("now").textContent =
-    `${clock(now.t)}: ${now.status}; pump and piston pass ${flow(now.total_lpm)}, leak ${flow(now.leak_lpm, now.leak_interval_lpm)}${oil}${learned}`;
+    `${clock(now.t)}: ${now.status}; ${now.why_no_litres ? `${now.why_no_litres}; ` : ""}pump and piston pass ${flow(now.total_lpm, now.total_interval_lpm)}, leak ${flow(now.leak_lpm, now.leak_interval_lpm)}${oil}${learned}`;
   const alarm = life.alarms.find((each) => each.state !== "closed" && each.state !== "invalid");
   byId("alarm").hidden = !alarm;
   if (alarm) {

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 from fnmatch import fnmatch
 from functools import partial
 from pathlib import Path
@@ -12,14 +14,17 @@ from stat import S_ISREG
 
 import numpy as np
 
+from sealscope.diagnosis.commissioned.machine import read_of_machine
+from sealscope.diagnosis.commissioned.watched import load_watched
 from sealscope.errors import SealscopeError
 from sealscope.monitor.settings import ActuatorSettings
 from sealscope.monitor.sources.source_block import UNREADABLE_FILE, BlockReceiver, RefusedMessage, SourceBlock
 from sealscope.monitor.supervisor import DATABASE, PartAway, place_of
-from sealscope.parameters import load_rig
-from sealscope.recordings import Recording, read
+from sealscope.recordings import Recording
 from sealscope.recordings.corrections.samples import correct_samples, without_holes
+from sealscope.recordings.joining import file_seconds
 from sealscope.recordings.oil import oil_temperature
+from sealscope.units import DAY
 
 _log = logging.getLogger(__name__)
 #: Names of files that are still being written.
@@ -30,58 +35,127 @@ _LOOK_S = 0.5
 _PATIENCE = 6.0
 #: A file that is dated so much later than now [s] is dated in the future.
 _AHEAD_S = 60.0
+#: How far recordings of a day without times of day are placed apart [s].
+_APART_S = 1.0
 
 
 class WatchedFolder:
     """The recordings of one actuator in its folder.
 
     `settle_s`: a file is read when its size and time have not changed for so long [s]; `known`: whether a block with an
-    identity is stored already.
+    identity is stored already; `newest_s`: clock of the newest sample that is stored [s since 1970].
     """
 
-    def __init__(self, settings: ActuatorSettings, settle_s: float, known: Callable[[str, str], bool]) -> None:
+    def __init__(
+        self,
+        settings: ActuatorSettings,
+        settle_s: float,
+        known: Callable[[str, str], bool],
+        newest_s: float = -math.inf,
+    ) -> None:
         assert settings.folder is not None
         self.actuator, self.folder, self.pattern = settings.name, settings.folder, settings.pattern
         self.settle_s, self._known = settle_s, known
-        self._channel_map = settings.map or load_rig(settings.rig).channel_map or None
+        self._channel_map = settings.map or load_watched(settings.rig).channel_map
+        self._rate = settings.rate
+        self._newest_s = self._end_s = newest_s
         self._met: dict[str, float] = {}  # clock at which a file was met [s]
+        self._starts: dict[str, float] = {}  # when the first sample of a file was taken [s since 1970]
         self._handed, self._tried, self._outside = set[str](), set[str](), set[str]()
 
     def blocks(self) -> Iterator[SourceBlock | RefusedMessage]:
-        """Yield the blocks of the files that are whole and not stored yet.
+        """Yield the blocks of the files that are whole and not stored yet, in the order of their recordings.
 
-        A file's samples get the clock at which it was written last. One that cannot be read is tried once more when it
-        has not changed for long, then refused: it is stored as a block without samples, and never read again. Raises
-        PartAway where the folder cannot be read.
+        One that cannot be read is tried once more when it has not changed for long, then refused: it is stored as a
+        block without samples, and never read again. So is one that is older than what was watched. Raises PartAway
+        where the folder cannot be read.
         """
         files = sorted(self._files())
         self._met = {identity: self._met.get(identity, time.monotonic()) for _, _, identity in files}
         self._handed &= self._met.keys()
         self._tried &= self._met.keys()
-        for at, path, identity in files:
-            # of a file that is dated in the future, how long it was not seen to change
-            age = max(time.time() - at, time.monotonic() - self._met[identity])
-            patient = age < _PATIENCE * self.settle_s
-            if identity in self._handed or age < self.settle_s or (patient and identity in self._tried):
+        self._starts = {identity: start for identity, start in self._starts.items() if identity in self._met}
+        whole = [own for own in files if own[2] not in self._handed and self._is_whole(*own)]
+        if len(whole) > 1:  # one that was copied last may have been recorded first
+            whole.sort(key=lambda own: self._start_of(*own))
+        for written, path, identity in whole:
+            samples, reason = self._read(path)
+            if reason and self._is_patient(written, identity):
+                self._tried.add(identity)
                 continue
-            if self._known(self.actuator, identity):
-                self._handed.add(identity)
-                continue
-            try:
-                samples = _on_the_clock(read(path, map=self._channel_map), at)
-            except Exception as error:
-                reason = f"{_shown(path.name)}: {place_of(error)}"
-                if isinstance(error, (SealscopeError, OSError, MemoryError)):  # what is foreseen may be better later
-                    self._tried.add(identity)
-                    if patient:
-                        continue
-                    reason = _shown(str(error)) or type(error).__name__
+            if not reason:
+                reason = self._refusal(samples, path, written)
+            if reason:
                 yield RefusedMessage(UNREADABLE_FILE, f"{self.actuator}: {reason}")
                 samples = None
-            if samples is not None and at > time.time() + _AHEAD_S:
-                _log.warning("%s: %s is dated in the future", self.actuator, _shown(path.name))
             self._handed.add(identity)
-            yield SourceBlock(self.actuator, identity, samples, follows=False)
+            yield SourceBlock(self.actuator, identity, self._on_the_clock(samples, path), follows=False)
+
+    def _is_whole(self, written: float, path: Path, identity: str) -> bool:
+        """Return whether a file has settled, is not stored, and is not to be left alone for a while."""
+        # of a file that is dated in the future, how long it was not seen to change
+        age = max(time.time() - written, time.monotonic() - self._met[identity])
+        if age < self.settle_s or (identity in self._tried and self._is_patient(written, identity)):
+            return False
+        if self._known(self.actuator, identity):
+            self._handed.add(identity)
+            return False
+        return True
+
+    def _is_patient(self, written: float, identity: str) -> bool:
+        """Return whether a file that cannot be read may be whole later."""
+        age = max(time.time() - written, time.monotonic() - self._met[identity])
+        return age < _PATIENCE * self.settle_s
+
+    def _start_of(self, written: float, path: Path, identity: str) -> float:
+        """Return when the first sample of a file was taken [s since 1970]; of one that cannot be read its change."""
+        if identity not in self._starts:
+            samples, _ = self._read(path)
+            self._starts[identity] = written if samples is None else file_seconds(samples, path)
+        return self._starts[identity]
+
+    def _read(self, path: Path) -> tuple[Recording | None, str]:
+        """Read a file; without a recording the reason, and a line in the log where it was not foreseen."""
+        try:
+            return read_of_machine(path, self._channel_map, self._rate), ""
+        except (SealscopeError, OSError, MemoryError) as error:
+            return None, _shown(str(error)) or type(error).__name__
+        except Exception as error:
+            return None, f"{_shown(path.name)}: {place_of(error)}"
+
+    def _refusal(self, samples: Recording | None, path: Path, written: float) -> str:
+        """Return why a recording is not watched, "" where it is: one of before the newest watched comes too late."""
+        if samples is None:
+            return ""
+        start, now = file_seconds(samples, path), time.time()
+        if max(start, written) > now + _AHEAD_S:
+            _log.warning("%s: %s is dated in the future", self.actuator, _shown(path.name))
+        if start >= self._newest_s or self._newest_s > now + _AHEAD_S or _is_day(start, self._newest_s):
+            return ""
+        dates = (datetime.fromtimestamp(clock, UTC).isoformat(" ", "seconds")[:19] for clock in (start, self._newest_s))
+        return "{} must not be older than what was watched, got {} after {}".format(_shown(path.name), *dates)
+
+    def _on_the_clock(self, samples: Recording | None, path: Path) -> Recording | None:
+        """Return a recording at the times at which it was made [s since 1970].
+
+        One of a day without a time of day follows those of the day that were watched. Its samples are corrected as for
+        `diagnose`. The oil's temperature that the file states beside its samples becomes a channel.
+        """
+        if samples is None or not len(samples):
+            return samples
+        start = file_seconds(samples, path)
+        samples = without_holes(correct_samples(samples).recording)
+        if not len(samples):
+            return samples
+        if _is_day(start, self._newest_s):
+            start = max(start, self._end_s + _APART_S)
+        known = samples.t[np.isfinite(samples.t)]
+        times = samples.t + (start - float(known[0]) if known.size else 0.0)
+        self._newest_s, self._end_s = start, float(np.nanmax(times, initial=start))
+        channels, units = dict(samples.channels), dict(samples.units)
+        if "T_oil" not in channels and (celsius := oil_temperature(samples)) is not None:
+            channels["T_oil"], units["T_oil"] = np.full(len(samples), celsius + 273.15), "K"
+        return Recording(times, channels, units, samples.rate)
 
     def _files(self) -> Iterator[tuple[float, Path, str]]:
         try:
@@ -108,8 +182,14 @@ class WatchedFolder:
 def folders_of(service: BlockReceiver, *, once: bool) -> None:
     """Hand over what appears in the folders of a service's actuators; `once`: what is there now."""
     settle_s, part = 0.0 if once else service.settings.settle_s, service.supervisor.part
+    shown = service.plain()
+
+    def newest(name: str) -> float:
+        clock = shown.get(name, {}).get("t")
+        return -math.inf if clock is None else float(clock)
+
     folders = {
-        part(f"folder of {each.name}"): WatchedFolder(each, settle_s, service.store.is_known)
+        part(f"folder of {each.name}"): WatchedFolder(each, settle_s, service.store.is_known, newest(each.name))
         for each in service.settings.actuator
         if each.folder is not None
     }
@@ -132,16 +212,6 @@ def _shown(name: str) -> str:
     return "".join(sign if sign.isprintable() else sign.encode("unicode_escape").decode() for sign in name)
 
 
-def _on_the_clock(recording: Recording, written: float) -> Recording:
-    """Return a recording whose last sample was taken at the clock `written` [s].
-
-    Its samples are corrected as for `diagnose`. The oil's temperature that the file states beside them becomes a
-    channel.
-    """
-    recording = without_holes(correct_samples(recording).recording)
-    last = recording.t[np.isfinite(recording.t)]
-    shift = written - float(last[-1]) if last.size else 0.0
-    channels, units = dict(recording.channels), dict(recording.units)
-    if "T_oil" not in channels and (celsius := oil_temperature(recording)) is not None:
-        channels["T_oil"], units["T_oil"] = np.full(len(recording), celsius + 273.15), "K"
-    return Recording(recording.t + shift, channels, units, recording.rate)
+def _is_day(start: float, newest: float) -> bool:
+    """Return whether a start [s since 1970] is a mere date, that of the day of the newest recording watched."""
+    return start % DAY == 0.0 and start <= newest < start + DAY

@@ -306,7 +306,7 @@ class _Log:
                 break
         if table is None:
             return None
-        columns = {column: cells.to_numpy() for column, cells in zip(self.kinds, table.columns, strict=True)}
+        columns = {column: _values_of(cells) for column, cells in zip(self.kinds, table.columns, strict=True)}
         return None if any(np.isinf(cells).any() for cells in columns.values()) else _Block(columns)
 
     def _samples(self, lines: Sequence[str], first: int) -> list[int]:
@@ -543,3 +543,17 @@ def write_text(
             columns = [series[start : start + _ROWS_WRITTEN_AT_ONCE].tolist() for series in values.values()]
             cells = [["" if isnan(value) else repr(value) for value in column] for column in columns]
             file.write("".join(delimiter.join(row) + "\n" for row in zip(*cells, strict=True)))
+
+
+def _values_of(cells: Any) -> Array:
+    """Return the values (n,) of a pyarrow ChunkedArray of doubles, NaN for null; its own `to_numpy` loads pandas."""
+    parts = []
+    for chunk in cells.chunks:
+        known, values = chunk.buffers()
+        first, stop = chunk.offset, chunk.offset + len(chunk)
+        part = np.frombuffer(values, np.float64, count=stop)[first:]
+        if chunk.null_count:
+            bits = np.unpackbits(np.frombuffer(known, np.uint8), count=stop, bitorder="little")[first:]
+            part = np.where(bits, part, np.nan)
+        parts.append(part)
+    return parts[0] if len(parts) == 1 else np.concatenate([*parts, np.empty(0)])

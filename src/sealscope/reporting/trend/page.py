@@ -84,7 +84,8 @@ def _draw(trend: Trend, picture: Picture) -> None:
     days = [trend.points[row].day for row in trend.rows]
     for own in trend.episodes:
         healthy = own.wear.healthy
-        picture.box("healthy", days[own.begin], days[min(own.end, len(days) - 1)], healthy.low, healthy.high)
+        end = text.healthy_end(own.wear)
+        picture.box("healthy", days[own.begin], days[min(own.end, len(days) - 1)], healthy.low, end)
         if own.alarm is not None:
             picture.mark("mark", days[own.alarm])
     for point in trend.repairs:

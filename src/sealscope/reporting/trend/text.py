@@ -11,11 +11,17 @@ import numpy as np
 from sealscope.diagnosis.inference.onset import Interval
 from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.trend.trend import Trend
+from sealscope.diagnosis.trend.wear import Wear
 from sealscope.paragraphs import paragraph, paragraphs
 from sealscope.recordings.formats.columns import counted
-from sealscope.reporting.messages import machine_text, number, say
+from sealscope.reporting.messages import machine_text, number, say, state_text
 from sealscope.storage.csv_file import guard_cell
 from sealscope.units import BAR, DAY, DAYS_PER_YEAR
+
+
+def level_name(trend: Trend) -> str:
+    """Return what a level is called wherever it is shown: the total of pump and piston, or the ringing of now."""
+    return "now" if trend.basis == "ringing" else "total"
 
 
 def moment(trend: Trend, day: float) -> str:
@@ -61,16 +67,17 @@ def sentence(trend: Trend) -> str:
 
 
 def figures(trend: Trend) -> dict[str, str]:
-    """Return the present level, the healthy one, since when it is another, its growth and its limit, in words.
+    """Return the present total, the leak, the healthy total, since when it is another, growth and limit, in words.
 
-    What is not known is an empty text.
+    The total is what pump and piston pass together, the leak its rise over the healthy one. What is not known is an
+    empty text.
     """
     wear = trend.wear
     if wear is None:
-        return dict.fromkeys(("now", "healthy", "since", "growth", "limit"), "")
+        return dict.fromkeys(("now", "leak", "healthy", "since", "growth", "limit"), "")
     at = "" if trend.pressure is None else f" at {number(trend.pressure / BAR, 2)} bar"
     of_first = " of the first; no rig was stated" if trend.unit == "%" and trend.basis != "ringing" else ""
-    healthy = f"{number(wear.healthy.low, 2)} to {number(wear.healthy.high, 2)} {trend.unit}{of_first}"
+    healthy = f"{number(wear.healthy.low, 2)} to {number(healthy_end(wear), 2)} {trend.unit}{of_first}"
     since, growth = "", "not stated: the recordings are too few, or span less than a day"
     if wear.onset is not None:
         value, low, high = (moment(trend, day) for day in wear.onset)
@@ -79,13 +86,21 @@ def figures(trend: Trend) -> dict[str, str]:
         growth = f"a step of {_figure(wear.step, trend.unit)}"
     elif math.isfinite(wear.growth.value):
         growth = f"{_figure(wear.growth, trend.unit)} a month"
+    rise = wear.step or Interval(*(level - wear.healthy.value for level in wear.now))
     return {
         "now": f"{_figure(wear.now, trend.unit)}{at}",
+        "leak": _figure(rise, trend.unit) if trend.verdict == "leak" else "",
         "healthy": f"{healthy}, 95 of 100 recordings",
         "since": since,
         "growth": growth,
         "limit": "" if wear.reach is None or wear.limit is None else _reach(trend, wear.limit, wear.reach),
     }
+
+
+def healthy_end(wear: Wear) -> float:
+    """Return the upper end of what is called healthy: it ends at the limit, even where recordings scatter further."""
+    high = wear.healthy.high
+    return high if wear.limit is None else min(high, max(wear.limit, wear.healthy.value))
 
 
 def _figure(interval: Interval, unit: str) -> str:
@@ -98,7 +113,7 @@ def _figure(interval: Interval, unit: str) -> str:
 
 def _reach(trend: Trend, limit: float, reach: Interval) -> str:
     """Return when the level reaches its limit, `reach` days after the last recording."""
-    named, first, last = f"{number(limit, 2)} {trend.unit}", trend.points[0].day, trend.points[-1].day
+    named, first, last = f"{number(limit, 2)} {trend.unit} in all", trend.points[0].day, trend.points[-1].day
     furthest = priors("trend")["course"]["furthest"]
     value, low, high = (moment(trend, last + days) if days <= furthest else "later" for days in reach)
     if reach.value == 0.0:
@@ -130,7 +145,9 @@ def assumed(trend: Trend) -> str:
 def limit_note(trend: Trend) -> str:
     """Return what the limit is."""
     maker = "" if trend.repair.stated else ", what a maker of excavators allows a cylinder in service"
-    return f"{trend.repair} beyond the healthy level{maker}"
+    within = trend.wear is not None and trend.wear.limit is not None and trend.wear.limit < trend.wear.healthy.high
+    scatter = "; healthy recordings of this machine scatter as far" if within else ""
+    return f"{trend.repair} beyond the healthy level{maker}{scatter}"
 
 
 def events(trend: Trend) -> list[str]:
@@ -149,10 +166,12 @@ def events(trend: Trend) -> list[str]:
 def trend_text(trend: Trend, *, whole: bool = False) -> str:
     """Return the trend as lines of at most 80 columns; `whole`: with the reason, what was assumed and all findings."""
     known, findings = figures(trend), [finding.text for finding in trend.findings]
-    rows = [(name, known[name]) for name in ("now", "healthy", "growth", "limit")]
+    rows = [("state", state_text(trend.state))]
+    rows += [(level_name(trend), known["now"])]
+    rows += [(name, known[name]) for name in ("leak", "healthy", "since", "growth", "limit")]
     rows += [("event", line) for line in events(trend)]
     if whole:
-        rows += [("since", known["since"]), ("reason", trend.reason), ("assumed", assumed(trend))]
+        rows += [("reason", trend.reason), ("assumed", assumed(trend))]
         rows += [("limit", limit_note(trend)), *(("data", text) for text in findings)]
     else:
         more = f" (and {len(findings) - 1} more: -v)" if len(findings) > 1 else ""

@@ -1,0 +1,85 @@
+"""A machine's file as the monitor takes it: the rig that sizes flows, and how its logs are read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from sealscope.diagnosis.commissioned.machine_file import load_machine
+from sealscope.diagnosis.learnt import Learnt
+from sealscope.diagnosis.verdict.machine import unstated
+from sealscope.diagnosis.verdict.severity import RepairLimit
+from sealscope.parameters import Rig, load_rig
+from sealscope.recordings.formats.columns import ChannelMap
+from sealscope.storage.toml_file import read_toml
+from sealscope.units import LITRE_PER_MINUTE
+
+#: Method whose lessons hold the size of the flows.
+_BALANCE = "volume balance"
+_AREAS, _DISPLACEMENT = ("cylinder.A_A", "cylinder.A_B"), "pump.q_b"
+
+
+@dataclass(frozen=True)
+class WatchedMachine:
+    """What a rig's or a machine's file states of an actuator to be watched.
+
+    Parameters
+    ----------
+    rig : Rig
+        Sizes the flows. Where areas alone are stated, the displacement is the one that the healthy recordings measured.
+    channel_map : mapping of str to str, or "auto"
+        Channel to column of its logs.
+    rate : float, optional
+        Sampling rate [Hz] of logs without a time column.
+    limit_lpm : float, optional
+        Leak from which it is to be repaired [L/min], None where it is not stated, or needs an area that is not.
+    """
+
+    rig: Rig
+    channel_map: ChannelMap = field(default_factory=dict)
+    rate: float | None = None
+    limit_lpm: float | None = None
+
+
+def load_watched(rig: str) -> WatchedMachine:
+    """Load a packaged rig, a rig's file or a machine's file as the monitor takes it; InputError as `load_rig`."""
+    if not rig.endswith(".toml") or "machine" not in read_toml(Path(rig), "a rig file", rig):
+        known = load_rig(rig)
+        return WatchedMachine(known, known.channel_map)
+    machine = load_machine(rig)
+    known = _with_measured_displacement(machine.rig or unstated(), machine.healthy)
+    return WatchedMachine(known, machine.channel_map, machine.rate, _limit_lpm(machine.limit, known))
+
+
+def is_remeasured(rig: Rig, before: Rig) -> bool:
+    """Return whether a rig is that of before, its displacement measured anew from more healthy recordings."""
+    values, others = rig.model_dump(), before.model_dump()
+    for own in (values, others):
+        own.get("pump", {}).pop("q_b", None)
+    return values == others and bool(np.isclose(rig.pump.q_b, before.pump.q_b, rtol=0.05))
+
+
+def _with_measured_displacement(rig: Rig, healthy: tuple[Learnt, ...]) -> Rig:
+    """Return a rig of stated areas with the displacement that healthy recordings measured beside them."""
+    if rig.states(_DISPLACEMENT) or not rig.states(*_AREAS):
+        return rig
+    lessons = (own.lessons.get(_BALANCE) for own in healthy)
+    scales = [float(own["scale"]) for own in lessons if isinstance(own, Mapping) and "scale" in own]
+    measured = [scale for scale in scales if np.isfinite(scale) and scale > 0.0]
+    if not measured:
+        return rig
+    source = f"measured by {len(measured)} healthy recordings beside the stated areas"
+    return rig.with_overrides({_DISPLACEMENT: float(np.median(measured)) * rig.pump.q_b}, source=source)
+
+
+def _limit_lpm(text: str | None, rig: Rig) -> float | None:
+    if text is None:
+        return None
+    limit = RepairLimit.of(text)
+    if limit.kind == "flow":
+        return limit.value / LITRE_PER_MINUTE
+    area = 0.5 * (rig.cylinder.A_A + rig.cylinder.A_B)
+    return limit.value * area / LITRE_PER_MINUTE if rig.states(*_AREAS) else None

@@ -1,0 +1,169 @@
+"""A folder is watched by the machine's file alone, on one clock, with the figures of a diagnosis."""
+
+from __future__ import annotations
+
+import json
+import os
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+import sealscope as ss
+from sealscope.diagnosis.commissioned.machine_file import write_machine
+from sealscope.diagnosis.commissioned.watched import is_remeasured, load_watched
+from sealscope.diagnosis.live.watch import watch
+from sealscope.diagnosis.verdict.machine import unstated
+from sealscope.monitor.outputs.prometheus import metrics_text
+from sealscope.monitor.settings import read_settings
+from sealscope.monitor.sources.folder import WatchedFolder
+from sealscope.monitor.sources.source_block import SourceBlock
+from sealscope.recordings.recording import Recording
+
+from ..diagnosis.balance_machine import machine, step
+from .plant import served
+
+APRIL = datetime(2026, 4, 1, tzinfo=UTC).timestamp()
+LEAK = 3.0e-13
+HEADINGS = {"p_A": ("bottom [bar]", 1e-5), "p_B": ("rod [bar]", 1e-5), "x": ("stroke [mm]", 1e3)}
+MAP = {"p_A": "bottom", "p_B": "rod", "x": "stroke", "theta": "angle [rad]"}
+
+
+def log(path: Path, recording: Recording) -> Path:
+    """Write a log without a time column, in the headings of a plant."""
+    path.parent.mkdir(exist_ok=True)
+    columns = {name: recording[channel] * factor for channel, (name, factor) in HEADINGS.items()}
+    columns["angle [rad]"] = recording["theta"]
+    rows = np.transpose([*columns.values()])
+    np.savetxt(path, rows, delimiter=",", header=",".join(columns), comments="", fmt="%.9g")
+    return path
+
+
+@pytest.fixture(scope="module")
+def commissioned(tmp_path_factory):
+    """A machine's file of which areas, map and rate alone are stated."""
+    folder = tmp_path_factory.mktemp("machine")
+    files = [log(folder / f"healthy/run{seed}.csv", machine(seed, rate=100.0, duration=60.0)) for seed in (1, 2, 3)]
+    rig = unstated()
+    areas = rig.cylinder.A_A, rig.cylinder.A_B
+    rig = rig.with_areas(*areas, source="data sheet").with_overrides({"pump.q_b": 7.0e-6}, source="assumed: a guess")
+    known = ss.commission(files, rig=rig, map=MAP, rate=100.0, limit="20 mL/min", name="press")
+    return write_machine(known, folder / "press.toml")
+
+
+def watching(folder: Path, machine_file: Path, more: str = ""):
+    settings = folder / "watch.toml"
+    settings.write_text(
+        f'database = "monitor.db"\nsettle_s = 0.0\n[[actuator]]\nname = "press"\nrig = "{machine_file}"\n'
+        f'folder = "incoming"\nlearn_hours = 0.02\n{more}',
+        encoding="utf-8",
+    )
+    return read_settings(settings)
+
+
+def test_the_machines_file_states_rate_map_and_limit(commissioned, tmp_path):
+    (actuator,) = watching(tmp_path, commissioned).actuator
+    assert (actuator.rate, actuator.map, actuator.error_lpm) == (100.0, MAP, pytest.approx(0.02))
+    (actuator,) = watching(tmp_path, commissioned, "rate = 50.0\nerror_lpm = 1.0\n").actuator
+    assert (actuator.rate, actuator.error_lpm) == (50.0, 1.0)
+
+
+def test_a_machine_of_areas_alone_is_watched_in_the_litres_of_a_diagnosis(commissioned, tmp_path):
+    """Its logs have no time column, and its pump was guessed: 7.0 in place of 4.9 cm^3/rev."""
+    settings = watching(tmp_path, commissioned)
+    worn = machine(9, G=step(0.0, LEAK, at=150.0), rate=100.0, duration=240.0)
+    path = log(tmp_path / "incoming/run_2026-04-01_0600.csv", worn)
+    service, out = served(settings)
+    (event,) = [json.loads(line) for line in out.splitlines()]
+    diagnosis = ss.load_machine(commissioned).diagnose(path)
+    low, high = diagnosis.leak_interval_lpm
+    assert low <= event["alarm"]["leak_lpm"] <= high
+    summary = service.plain()["press"]
+    assert summary["why_no_litres"] == ""
+    assert summary["leak_lpm"] == pytest.approx(diagnosis.leak_lpm, rel=0.1)
+    assert summary["leak_interval_lpm"][0] <= diagnosis.leak_lpm <= summary["leak_interval_lpm"][1]
+
+
+def test_the_displacement_is_measured_beside_the_stated_areas(commissioned):
+    rig = load_watched(str(commissioned)).rig
+    assert rig.pump.q_b == pytest.approx(4.9e-6, rel=0.03)
+    assert rig.states("pump.q_b")
+    assert is_remeasured(rig, rig.with_overrides({"pump.q_b": 1.01 * rig.pump.q_b}))
+    assert not is_remeasured(rig, rig.with_overrides({"pump.q_b": 2.0 * rig.pump.q_b}))
+
+
+def test_an_alarm_without_litres_says_why():
+    rig = unstated()
+    live = watch(rig, learn_hours=0.02)
+    live.update(machine(9, G=step(0.0, LEAK, at=100.0), rate=100.0, duration=140.0))
+    assert live.leak is not None and live.leak.leak_lpm is None
+    assert "L/min is not stated" in live.leak.reason
+
+
+def folder_of(tmp_path, commissioned) -> WatchedFolder:
+    (actuator,) = watching(tmp_path, commissioned).actuator
+    return WatchedFolder(actuator, 0.0, lambda name, identity: False)
+
+
+def starts(blocks) -> list[float]:
+    return [
+        float(block.samples.t[0]) for block in blocks if isinstance(block, SourceBlock) and block.samples is not None
+    ]
+
+
+def test_files_are_taken_in_the_order_of_their_recordings(commissioned, tmp_path):
+    """Copied at once, in any order, they have the times in their names; one that comes too late is named."""
+    folder, healthy = folder_of(tmp_path, commissioned), machine(4, rate=100.0, duration=20.0)
+    for k, day in enumerate((3, 1, 2)):
+        path = log(tmp_path / f"incoming/run_2026-04-{day:02d}_0600.csv", healthy)
+        os.utime(path, times=(0.0, 1.7e9 + k))
+    hours = [APRIL + (24.0 * day + 6.0) * 3600.0 for day in range(3)]
+    assert starts(folder.blocks()) == pytest.approx(hours)
+    log(tmp_path / "incoming/run_2026-04-02_0700.csv", healthy)
+    refused, empty = folder.blocks()
+    assert "2026-04-02 07:00:00 after 2026-04-03 06:00:00" in str(refused)
+    assert empty.samples is None
+    assert list(folder.blocks()) == []
+
+
+def test_recordings_of_a_day_without_a_time_of_day_follow_each_other(commissioned, tmp_path):
+    folder, healthy = folder_of(tmp_path, commissioned), machine(4, rate=100.0, duration=20.0)
+    for part in "abc":
+        log(tmp_path / f"incoming/run_2026-04-01_{part}.csv", healthy)
+    assert starts(folder.blocks()) == pytest.approx([APRIL, APRIL + 20.99, APRIL + 41.98], abs=0.1)
+
+
+def test_a_file_without_a_date_ends_at_its_last_change(commissioned, tmp_path):
+    path = log(tmp_path / "incoming/run.csv", machine(4, rate=100.0, duration=20.0))
+    os.utime(path, times=(0.0, APRIL))
+    (first,) = starts(folder_of(tmp_path, commissioned).blocks())
+    assert first == pytest.approx(APRIL - 19.99, abs=0.05)
+
+
+def test_after_a_restart_older_recordings_are_refused(commissioned, tmp_path):
+    settings, healthy = watching(tmp_path, commissioned), machine(4, rate=100.0, duration=40.0)
+    log(tmp_path / "incoming/run_2026-04-03_0600.csv", healthy)
+    served(settings)
+    log(tmp_path / "incoming/run_2026-04-02_0600.csv", healthy)
+    service, _ = served(settings)
+    assert service.actuators.counters == {"files that could not be read": 1}
+    assert service.plain()["press"]["t"] == pytest.approx(APRIL + 54.0 * 3600.0 + 40.0, abs=5.0)
+
+
+def test_the_headline_is_the_mean_over_the_cycles_seen(commissioned):
+    live = watch(load_watched(str(commissioned)).rig, learn_hours=0.02)
+    worn = machine(9, G=step(0.0, LEAK, at=100.0), rate=100.0, duration=240.0)
+    shown = [(own, live.over_cycles(own)) for own, leak in live.each(worn) if leak is not None and own.t > 160.0]
+    blocks, means = (np.array([own.leak_lpm for own in kind]) for kind in zip(*shown, strict=True))
+    mean, truth = shown[-1][1], LEAK * float(np.abs(worn["p_A"] - worn["p_B"])[worn.t > 150.0].mean()) * 6e4
+    assert means.std() < 0.5 * blocks.std()
+    assert mean.leak_interval_lpm[0] <= truth <= mean.leak_interval_lpm[1]
+    assert mean.total_interval_lpm[0] < mean.total_lpm < mean.total_interval_lpm[1]
+
+
+def test_metrics_carry_the_interval():
+    text = metrics_text({"press": {"leak_lpm": 1.4, "leak_interval_lpm": [1.2, 1.6]}}, {})
+    values = {own.name: own.samples[0].value for own in text_string_to_metric_families(text)}
+    assert [values[f"sealscope_leak_{end}lpm"] for end in ("", "low_", "high_")] == [1.4, 1.2, 1.6]
