@@ -104,8 +104,8 @@ class VolumeBalance:
             ]
             answering = [own for own in recorded if own.equations[0].name == LOCKED or made_good(own)]
             return min(answering, key=lambda own: bound_of(own, None), default=None)
-        recorded = self._recorded(recording)
-        return None if recorded is None else self._balance(recording, recorded.regime(recorded.odds + odds))
+        blocks = self._recorded(recording)
+        return None if blocks is None else self._balance(recording, blocks.regime(blocks.odds + odds))
 
     def _recorded(self, recording: Recording) -> RecordedBlocks | None:
         return remembered(recording, (self.name, self.rig), lambda own: recorded_blocks(own, self.rig), _READ)
