@@ -10,6 +10,7 @@ from sealscope.diagnosis.inference.decision.recorded import RecordedBalance
 
 from sealscope.diagnosis.inference.balance import recorded_blocks
 from sealscope.diagnosis.inference.detector import VolumeBalance
+from sealscope.diagnosis.inference.regimes import hold_leaks
 from sealscope.diagnosis.inference.terms import find_rests
 from sealscope.parameters import load_rig
 from sealscope.recordings.channels import CHANNEL_UNITS
@@ -89,6 +90,17 @@ def test_healthy_recordings_tell_which_it_is_for_a_leaking_one() -> None:
     assert all(abs(of.score) < of.threshold(0.01) for of in rises)
     evidence = detector.examine(leaking, [press(seed) for seed in range(4)], 0.01)
     assert evidence.verdict == "leak"
+
+
+@pytest.mark.parametrize("leak", [0.0, 1e-13])
+def test_a_locked_hold_separates_piston_and_pump(leak: float) -> None:
+    recorded = recorded_blocks(press(3, leak=leak), RIG)
+    assert recorded is not None and recorded.shut is not None
+    found = hold_leaks(recorded.shut.blocks, recorded.shut.columns[0])
+    assert found is not None and hold_leaks(recorded.open.blocks, recorded.open.columns[0]) is None
+    assert found.loaded[0] == pytest.approx(leak, abs=max(4.0 * found.loaded[1], 2e-15))
+    assert found.loaded[1] < 1e-2 * PUMP
+    assert found.pump[0] == pytest.approx(PUMP, abs=max(4.0 * found.pump[1], 0.2 * PUMP))
 
 
 def test_a_reversal_is_no_rest_and_a_missing_sample_neither() -> None:

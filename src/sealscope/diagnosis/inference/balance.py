@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -185,8 +186,9 @@ class BlockStream:
             early = slice(0, (self._support or end) * length)
             self._zeros = {name: _gauge_to_absolute(samples[name][early]) for name in ("p_A", "p_B") if name in samples}
         if self._finds_rests and self._still[0] < 0.0:
-            whole = Signals(samples, self._rate, self._zeros)
-            self._still = tuple(_still_rate(of, self._rate) for of in (self._balances[0].left(whole), whole.step("x")))
+            signals = Signals(samples, self._rate, self._zeros)
+            left, moved = self._balances[0].left(signals), signals.step("x")
+            self._still = _still_rate(left, self._rate), _still_rate(moved, self._rate)
         each = max(1, AT_ONCE // length)
         cuts = [self._cut(samples, k, min(k + each, end)) for k in range(first, end, each)]
         weights = np.concatenate([cut.weights for cut in cuts])
@@ -274,8 +276,10 @@ def _still_rate(increments: Array, rate: float) -> float:
     flow = increments[np.isfinite(increments)] * rate
     size = np.abs(flow)
     moving = float(size @ size) / max(float(size.sum()), np.finfo(float).tiny)
-    noise = float(np.median(np.abs(np.diff(flow, 6)))) / 0.6745 / np.sqrt(924.0) if len(flow) > 6 else 0.0
-    return max(float(priors("inference")["rest"]["share"]) * moving, 3.0 * noise / np.sqrt(max(1.0, AVERAGED * rate)))
+    sixth = np.abs(np.diff(flow, 6))  # of white noise they have 924 times its variance
+    noise = 1.4826 * float(np.median(sixth)) / math.sqrt(924.0) if len(sixth) else 0.0
+    share: float = priors("inference")["rest"]["share"]
+    return max(share * moving, 3.0 * noise / math.sqrt(max(1.0, AVERAGED * rate)))
 
 
 def _gauge_to_absolute(pressure: Array) -> float:

@@ -16,11 +16,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, solve
-from sealscope.diagnosis.inference.terms import BIAS, LEAK, REST_BIAS, REST_LEAK, RESTS
+from sealscope.diagnosis.inference.terms import BIAS, LEAK, REST_BIAS, REST_LEAK, RESTS, TURNING
 from sealscope.diagnosis.priors import priors
 from sealscope.recordings.recording import Array
 
@@ -71,11 +72,7 @@ def shut_odds(blocks: Blocks, columns: Columns) -> float:
         return 0.0
     chosen = [*columns.nuisance, at_rest, bias]
     each, left = gram[:, chosen][:, :, chosen], gram[:, chosen, columns.left]
-    total = each.sum(axis=0)
-    coefficients = solve(total, left.sum(axis=0))
-    scores = left - each @ coefficients
-    inverse = solve(total, np.eye(len(chosen)))
-    covariance = inverse @ (scores.T @ scores) @ inverse * (len(blocks) / (len(blocks) - 1.0))
+    coefficients, covariance = _sandwich(each, left)
     both = [chosen.index(columns.leak), chosen.index(at_rest)]
     motion, more = coefficients[both]
     resting, differing = float(covariance[np.ix_(both, both)].sum()), float(covariance[both[1], both[1]])
@@ -85,6 +82,43 @@ def shut_odds(blocks: Blocks, columns: Columns) -> float:
     open_ = _log_normal(more, differing + (believed["open"] * motion) ** 2)
     most: float = believed["most"]
     return float(np.clip(shut - open_, -most, most))
+
+
+class HoldLeaks(NamedTuple):
+    """What the rests of a machine whose valves shut say: conductances with standard deviations [m^3/(s Pa)].
+
+    `loaded`: what the side that carries loses, past the piston or to the outside; `pump`: what only motion tells.
+    """
+
+    loaded: tuple[float, float]
+    pump: tuple[float, float]
+
+
+def hold_leaks(blocks: Blocks, columns: Columns) -> HoldLeaks | None:
+    """Estimate what the seal passes while valves shut the pump out, from the blocks of `terms.shut_at_rest`.
+
+    Compliances and areas are those of the motion, of the same fit; deviations are of blocks whose errors differ. None
+    where the columns are of a pump that stays in the circuit.
+    """
+    if TURNING not in columns.names or len(blocks) < 2:
+        return None
+    gram, chosen = blocks.gram[:, 0], list(columns.nuisance)
+    coefficients, covariance = _sandwich(gram[:, chosen][:, :, chosen], gram[:, chosen, columns.left])
+    deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    loaded, pump = (
+        (float(coefficients[at]), float(deviations[at]))
+        for at in map(chosen.index, (columns.leak, columns.names.index(TURNING)))
+    )
+    return HoldLeaks(loaded, pump)
+
+
+def _sandwich(each: Array, left: Array) -> tuple[Array, Array]:
+    """Return coefficients (c,) of sums (K, c, c) and (K, c), and their covariance where the blocks' errors differ."""
+    total = each.sum(axis=0)
+    coefficients = solve(total, left.sum(axis=0))
+    scores = left - each @ coefficients
+    inverse = solve(total, np.eye(len(total)))
+    return coefficients, inverse @ (scores.T @ scores) @ inverse * (len(each) / (len(each) - 1.0))
 
 
 def _log_normal(value: float, variance: float) -> float:

@@ -11,13 +11,16 @@ them to a thousandth, another's change by a tenth from run to run. A narrow prio
 true and scatter where it is not, so y is formed by several widths, each weighted by what is believed of it and the
 evidence of the healthy ones, p(y_1 .. y_n).
 
-All y of a width are normal about an unknown mean, with the variance sigma^2 of each by itself and a covariance between
-them of which there are several candidates. sigma^2 has a scaled inverse chi square prior (s_0, nu_0): the
-rise, y beyond what the others let expect, follows a mixture over all of these. Recordings of one session, by their
-dates, share oil and set-up: a deviation tau of sessions, half-normal beforehand, of leakage in proportion to its level,
-for it goes with the inverse of the oil's viscosity. Recordings without a date are of one session. Where the oil's
-temperature T is known of all, what it makes of the level is taken off, and only that factor's error remains. What is
-believed stands in `priors.toml`.
+Leakage goes with the inverse of the oil's viscosity, so that levels compare in logarithms where they are clearly above
+zero: z = asinh(a / 2 c) of the level a = level of all + y, c what errors make of it. All z of a width are normal about
+an unknown mean, with the variance sigma^2 of each by itself and a covariance between them of which there are several
+candidates. Of sigma nothing is known beforehand but its decades, from a recording's own deviation to a tenth of the
+flow: five recordings that agree show what two do not. Recordings of one session, by their dates, share oil and set-up:
+a deviation tau of sessions, half-normal beforehand. Recordings without a date are of one session. Where the oil's
+temperature T is known of all, z goes with a slope a kelvin that the recordings tell, about what is believed of it, and
+one of other oil than they had is the less certain; else tau holds what oil may do. So it is under another load or speed
+than theirs. The rise, y beyond what the others let expect, follows a mixture over all of these. What is believed stands
+in `priors.toml`.
 
 Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sections 3.2, 5.4 and 5.7; C. E. Rasmussen and C. K.
 I. Williams, Gaussian Processes for Machine Learning (2006), section 2.7 (an unknown mean).
@@ -26,7 +29,7 @@ I. Williams, Gaussian Processes for Machine Learning (2006), section 2.7 (an unk
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,6 +42,10 @@ from sealscope.recordings.recording import Array
 NODES, WIDEST, MOST = 32, 3.0, 60
 #: Widths of what recordings differ by that are weighed, and how far from what is believed [deviations].
 SCALES, FARTHEST = 11, 2.5
+#: Least deviation: what is divided by is no zero.
+TINY = 1e-300
+#: Laws that one of logarithms is split into, how much narrower each is, where logarithms end, what weighs nothing.
+PARTS, NARROWER, FARTHEST_Z, FAINTEST = 7, 0.5, 30.0, 16.0
 
 
 class Mixture(NamedTuple):
@@ -47,6 +54,21 @@ class Mixture(NamedTuple):
     weights: Array
     deviations: Array
     centres: Array
+
+    def quantile(self, probability: float) -> float:
+        """Return the value below which the mixture lies with a probability."""
+        from scipy.optimize import brentq
+        from scipy.special import ndtr, ndtri
+
+        unit = max(float(self.weights @ np.minimum(self.deviations, 1e3 * self.deviations.min())), TINY)
+        centres, deviations = self.centres / unit, self.deviations / unit
+
+        def beyond(value: float) -> float:
+            return float(self.weights @ ndtr((value - centres) / deviations)) - probability
+
+        ends = centres + ndtri(probability) * deviations
+        low, high = float(ends.min()), float(ends.max())
+        return unit * (low if not beyond(low) < 0.0 < beyond(high) else float(brentq(beyond, low, high)))
 
 
 class Rise(NamedTuple):
@@ -79,17 +101,12 @@ class Rise(NamedTuple):
         return float(weights @ ndtr((centres - score * self.deviation) / deviations))
 
     def threshold(self, chance: float) -> float:
-        """Return the score that a healthy recording exceeds with a probability; ArithmeticError where there is none."""
-        from scipy.optimize import brentq
-        from scipy.special import ndtri, stdtrit
+        """Return the score that a healthy recording exceeds with a probability."""
+        from scipy.special import stdtrit
 
         if self.parts is None:
             return float(stdtrit(self.freedom, 1.0 - chance))
-        ends = np.sort((self.parts.centres - ndtri(chance) * self.parts.deviations) / self.deviation)
-        try:
-            return float(brentq(lambda score: self._beyond(score) - chance, ends[0], ends[-1]))
-        except ValueError:  # no number lies between the ends
-            raise ArithmeticError("no threshold of such a scatter") from None
+        return self.parts.quantile(1.0 - chance) / self.deviation
 
     def log_ratio(self, rise: float) -> float:
         """Return the logarithm of the likelihood of a true rise over that of none."""
@@ -106,12 +123,13 @@ class Rise(NamedTuple):
 
     def bound(self, probability: float = 0.95) -> float:
         """Return the upper bound that holds with a probability; a rise below zero does not make it smaller."""
-        return max(self.value, 0.0) + self.threshold(1.0 - probability) * self.deviation
+        return max(self.value, 0.0) - self.threshold(probability) * self.deviation
 
     def interval(self, probability: float = 0.95) -> tuple[float, float]:
         """Return the interval of the rise that holds with a probability."""
-        half = self.threshold(0.5 - 0.5 * probability) * self.deviation
-        return self.value - half, self.value + half
+        tail = 0.5 - 0.5 * probability
+        high, low = (self.threshold(chance) * self.deviation for chance in (tail, 1.0 - tail))
+        return self.value - high, self.value - low
 
 
 class RecordingSums(NamedTuple):
@@ -151,23 +169,117 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
     believed, by_flow = priors("inference")["scatter"], judged.flow / judged.pressure if judged.pressure > 0.0 else 0.0
     decades = np.linspace(-FARTHEST, FARTHEST, SCALES)
     widths = believed["between"] ** decades
-    beyond = np.zeros((SCALES, count))
+    beyond, own_errors = np.zeros((SCALES, count)), np.zeros((SCALES, count))
     if count > 1:
-        beyond = np.array([_rises(own.sums, everything - own.sums, columns, widths) for own in baseline]).T
-    *by_oil, warmer, oil = _of_oil([*baseline, judged], *_level(everything, columns))
-    values = _rises(judged.sums, everything, columns, widths) - warmer
+        pairs = [_rises(own.sums, everything - own.sums, columns, widths) for own in baseline]
+        beyond, own_errors = (np.array(of).T * ((count - 1) / count) for of in zip(*pairs, strict=True))
+    values, error = _rises(judged.sums, everything, columns, widths)
+    level, level_error = _level(everything, columns)
+    errors = believed["own"] * np.median(np.column_stack([error, own_errors]), axis=1)
+    errors = np.maximum(errors, max(believed["finest"] * by_flow, 1.0 / LARGEST))
     starts, pause = [own.start_s for own in (*baseline, judged)], 3600.0 * priors("inference")["oil"]["shift"]
     sessions = np.array(sessions_of(starts, pause))
-    usual, apart = believed["leak"] * by_flow, float(np.hypot(oil, believed["session"] * by_flow))
+    warmer, oil = _oil_shifts([*baseline, judged])
+    unseen = sum(own.excess for own in conditions_beyond(judged, baseline)) * priors("inference")["conditions"]["leak"]
     nodes = WIDEST * ((np.arange(NODES) + 0.5) / NODES) ** 2  # closer near zero
     believed_of = 0.5 * np.log(nodes) - 0.5 * nodes**2
     if len(set(sessions)) == 1:
         nodes, believed_of = np.zeros(1), np.zeros(1)
-    alike = np.equal.outer(sessions, sessions)
-    population = Population(((apart * nodes) ** 2)[:, None, None] * alike, believed_of)
-    return population.rise(
-        values, beyond * ((count - 1) / count) - by_oil, usual, believed["freedom"], -0.5 * decades**2
+    slope, doubt = (priors("inference")["oil"][name] for name in ("per_kelvin", "per_kelvin_deviation"))
+    thin = np.exp(slope * warmer[:-1])
+    left = beyond - level * (thin - thin.mean())
+    turn = max(level_error, float(np.median(errors)), float(np.median(left.std(axis=1))), 0.1 * level)
+    scale = _Levels(level, turn)
+    steep = scale.slope(level)
+    relative = steep * level
+    between = ((np.hypot(relative * oil, steep * believed["session"] * by_flow) * nodes) ** 2)[:, None, None]
+    between = between * np.equal.outer(sessions, sessions) + np.outer(warmer, warmer) * (relative * doubt) ** 2
+    between[:, -1, -1] += (relative * unseen) ** 2
+    if relative * oil > 0.0 and sessions[-1] not in sessions[:-1]:  # a day like those that are known, or like none
+        logs = np.log([[1.0 - believed["unlike"]], [believed["unlike"]]])
+        believed_of, between = (logs + believed_of).ravel(), np.tile(between, (2, 1, 1))
+        between[len(nodes) :, -1, -1] += 2.0 * (relative * oil) ** 2
+    shifts = relative * slope * warmer
+    most = np.maximum(min(steep * believed["largest"] * by_flow, believed["relative"]), 10.0 * steep * errors)
+    own, known = scale.of(values), scale.of(beyond) - shifts[:-1]
+    predicted = Population(between, believed_of).predict(
+        own - shifts[-1],
+        known,
+        np.geomspace(steep * errors, most, NODES, axis=1),
+        np.log(scale.slope(level + beyond)).sum(axis=1) - 0.5 * decades**2,
     )
+    return _combined(scale.levels(predicted, own), values)
+
+
+class _Levels(NamedTuple):
+    """Levels a of a coefficient as z = asinh(a / 2 c): logarithms beyond c, proportional to a below."""
+
+    level: float
+    turn: float
+
+    def of(self, beyond: Array) -> Array:
+        """Return z of levels that are so far beyond that of all."""
+        return np.asarray(np.arcsinh((self.level + beyond) / (2.0 * self.turn)))
+
+    def slope(self, level: Any) -> Any:
+        """Return dz/da at levels."""
+        return 1.0 / np.hypot(level, 2.0 * self.turn)
+
+    def levels(self, predicted: Mixture, own: Array) -> Mixture:
+        """Return a law of z beside `own` (s,) as one of levels beyond that of all, by narrower laws that are linear."""
+        x, shares = np.polynomial.hermite_e.hermegauss(PARTS)
+        centres, deviations = predicted.centres + own[:, None, None], predicted.deviations[..., None]
+        z = np.clip(centres[..., None] + np.sqrt(1.0 - NARROWER**2) * deviations * x, -FARTHEST_Z, FARTHEST_Z)
+        return Mixture(
+            predicted.weights[..., None] + np.log(shares / shares.sum()),
+            2.0 * self.turn * np.cosh(z) * NARROWER * deviations,
+            2.0 * self.turn * np.sinh(z) - self.level,
+        )
+
+
+def _combined(predicted: Mixture, values: Array) -> Rise:
+    """Return the rise of `values` (s,) over laws (s, ...) of what healthy recordings show, by their log weights."""
+    own = np.reshape(values, (-1, *[1] * (predicted.centres.ndim - 1)))
+    logs, deviations, centres = (
+        of.ravel() for of in (predicted.weights, predicted.deviations, predicted.centres - own)
+    )
+    kept = logs > logs.max() - FAINTEST
+    weights = np.exp(logs[kept] - logs.max())
+    law = Mixture(weights / weights.sum(), deviations[kept], centres[kept])
+    low, middle, high = (law.quantile(probability) for probability in (0.16, 0.5, 0.84))
+    return Rise(-middle, 0.5 * (high - low), np.inf, law._replace(centres=law.centres - middle))
+
+
+class Beyond(NamedTuple):
+    """A condition of a recording that no healthy one had: its `name`, value, range of theirs, and unit.
+
+    `excess`: how far it is beyond them, in powers of e of load or speed, or as they would change the oil.
+    """
+
+    name: str
+    value: float
+    low: float
+    high: float
+    unit: str
+    excess: float
+
+
+def conditions_beyond(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> list[Beyond]:
+    """Find the conditions of a recording that are beyond those of the healthy ones: oil, load, speed."""
+    allowed, beyond = priors("inference")["conditions"], list[Beyond]()
+    for name, unit, of in (("load", "Pa", "pressure"), ("speed", "m^3/s", "flow")):
+        value, known = getattr(judged, of), [getattr(own, of) for own in baseline]
+        if not known or not min(value, *known) > 0.0:
+            continue
+        excess = float(max(np.log(value / max(known)), np.log(min(known) / value)))
+        if excess > allowed["ratio"]:
+            beyond.append(Beyond(name, value, min(known), max(known), unit, excess))
+    warm = [own.oil_degC for own in baseline if own.oil_degC is not None]
+    if judged.oil_degC is not None and warm:
+        excess = max(judged.oil_degC - max(warm), min(warm) - judged.oil_degC)
+        if excess > allowed["oil"]:  # what it does is in the slope's doubt
+            beyond.append(Beyond("oil", judged.oil_degC, min(warm), max(warm), "degC", 0.0))
+    return beyond
 
 
 def leave_one_out(recordings: Sequence[RecordingSums], columns: Sequence[Columns]) -> Array:
@@ -198,19 +310,34 @@ class Population:
         self._ones = basis.sum(axis=1)[:, None]
         self._own, self._logarithms = candidates[:, n, n, None], logarithms[:, None]
 
-    def rise(self, values: Array, known: Array, usual: float, freedom: float, logarithms: Array | float = 0.0) -> Rise:
+    def rise(self, values: Array, known: Array, usual: float, freedom: float) -> Rise:
         """Return by how much a value is beyond what those known let expect.
 
-        `values` (s,) and `known` (s, n): the same quantity, estimated in s ways of which `logarithms` (s,) are
-        believed; the evidence of those known weighs the ways. `usual`, `freedom`: what is believed of sigma.
+        `values` (s,) and `known` (s, n): the same quantity, estimated in s ways; the evidence of those known weighs the
+        ways. `usual`, `freedom`: what is believed of sigma, whose square has a scaled inverse chi square law.
         """
-        others, count = known[:, self._chosen], len(self._chosen)
+        count = len(self._chosen)
+        others = known[:, self._chosen]
         squares = freedom * usual**2 + np.sum((others - others.mean(axis=1, keepdims=True)) ** 2, axis=1)
         if not 1e4 * squares.max() < LARGEST:  # numbers that cannot be computed with bound nothing
             return Rise(float(values.mean()), np.inf, freedom)
         least = np.sqrt(np.maximum(0.1 * freedom * usual**2, 1e-9 * squares) / (freedom + count))
         most = np.maximum(100.0 * np.sqrt(squares), 10.0 / LARGEST)
-        variance = np.geomspace(np.maximum(least, 1.0 / LARGEST), most, NODES, axis=1)[:, None] ** 2  # (s, 1, nodes)
+        sigma = np.geomspace(np.maximum(least, 1.0 / LARGEST), most, NODES, axis=1)
+        believed = -0.5 * freedom * (np.log(sigma**2) + usual**2 / sigma**2)
+        predicted = self.predict(values, known, sigma, np.zeros(len(values)), believed)
+        return _combined(predicted._replace(centres=predicted.centres + values[:, None, None]), values)
+
+    def predict(
+        self, values: Array, known: Array, sigma: Array, logarithms: Array, believed: Array | float = 0.0
+    ) -> Mixture:
+        """Return the law of the judged value beside `values` (s,): log weights, deviations, centres (s, g, nodes).
+
+        `known` (s, n): the others, in s ways of which `logarithms` (s,) are believed; `sigma` (s, nodes): evenly spaced
+        in their logarithms, of whose densities `believed` (s, nodes) are the logarithms.
+        """
+        others = known[:, self._chosen]
+        variance = sigma[:, None] ** 2  # (s, 1, nodes)
         weight = 1.0 / (variance[..., None] + self._eigen)  # (s, g, nodes, n)
         of_ones, cross = weight * self._ones, self._cross
         precision = (of_ones * self._ones).sum(axis=-1)
@@ -218,17 +345,14 @@ class Population:
         mean = (of_ones * rotated).sum(axis=-1) / precision
         left = weight * (rotated - mean[..., None] * self._ones)
         logarithm = 0.5 * (np.log(weight).sum(axis=-1) - np.log(precision) - (left * rotated).sum(axis=-1))
-        logarithm += self._logarithms - 0.5 * freedom * (np.log(variance) + usual**2 / variance)
-        logarithm += np.reshape(logarithms, (-1, 1, 1)) + np.log(np.log(variance[..., 1:2] / variance[..., :1]))
-        weights = np.exp(logarithm - logarithm.max())
-        weights /= weights.sum()
+        logarithm += self._logarithms + np.reshape(logarithms, (-1, 1, 1))
+        logarithm += (
+            np.broadcast_to(believed, sigma.shape)[:, None] + np.log(np.log(sigma[:, 1:2] / sigma[:, :1]))[:, None]
+        )
         centres = mean + (left * cross).sum(axis=-1) - values[:, None, None]
         missing = 1.0 - (of_ones * cross).sum(axis=-1)
         variances = variance + self._own - (weight * cross**2).sum(axis=-1) + missing**2 / precision
-        middle = float((weights * centres).sum())
-        parts = Mixture(weights.ravel(), np.sqrt(variances).ravel(), (centres - middle).ravel())
-        total = float((weights * (variances + (centres - middle) ** 2)).sum())
-        return Rise(-middle, float(np.sqrt(total)), np.inf, parts)
+        return Mixture(logarithm, np.sqrt(variances), centres)
 
 
 def sessions_of(starts: Sequence[float | None], pause: float) -> list[int]:
@@ -238,19 +362,15 @@ def sessions_of(starts: Sequence[float | None], pause: float) -> list[int]:
     return [-1 if own is None else int(np.searchsorted(begins, own, "right")) for own in starts]
 
 
-def _of_oil(recordings: Sequence[RecordingSums], level: float, error: float) -> list[float]:
-    """Return by how much each recording's leakage is beyond its mean over all but the last, for its oil's temperature.
+def _oil_shifts(recordings: Sequence[RecordingSums]) -> tuple[Array, float]:
+    """Return how much warmer the oil of each was than on the mean of all but the last [K], and what else it may do.
 
-    Last the deviation of the last one's: what may still differ, as far as the `level` within its `error` goes.
+    Where a temperature is missing none counts, and levels of sessions deviate in their logarithms by the latter.
     """
-    believed = priors("inference")["oil"]
     known = [own.oil_degC for own in recordings if own.oil_degC is not None]
     if len(known) < len(recordings):  # the difference of two sessions has twice the variance of each
-        return [0.0] * len(recordings) + [0.5**1.5 * (believed["warmest"] - 1.0) * (level + error)]
-    warmer = np.array(known) - np.mean(known[:-1])
-    factor = np.exp(believed["per_kelvin"] * warmer)
-    deviation = believed["per_kelvin_deviation"] * abs(warmer[-1]) * factor[-1] * (level + error)
-    return [*(level * (factor - factor[:-1].mean())).tolist(), float(np.hypot(deviation, error * (factor[-1] - 1.0)))]
+        return np.zeros(len(recordings)), float(np.sqrt(0.125) * np.log(priors("inference")["oil"]["warmest"]))
+    return np.array(known) - np.mean(known[:-1]), 0.0
 
 
 def _level(sums: Array, columns: Sequence[Columns]) -> tuple[float, float]:
@@ -305,8 +425,8 @@ def _about_own(sums: Array, columns: Sequence[Columns]) -> Array:
     return reduced
 
 
-def _rises(own: Array, reference: Array, columns: Sequence[Columns], widths: Array) -> Array:
-    """Return the rise (s,) of the leak's coefficient in one recording's sums (E, m, m) beyond those of others.
+def _rises(own: Array, reference: Array, columns: Sequence[Columns], widths: Array) -> tuple[Array, Array]:
+    """Return the rise (s,) of the leak's coefficient in one recording's sums (E, m, m) beyond others', and its error.
 
     The recording's other coefficients differ from theirs by what is believed of recordings of one machine, over all
     `widths` (s,).
@@ -327,4 +447,6 @@ def _rises(own: Array, reference: Array, columns: Sequence[Columns], widths: Arr
             solved = solve(tied, right)
             precision[s] += float(own[e][column.leak, column.leak] - along @ solved[:, 0])
             vector[s] += float(residual[column.leak] - along @ solved[:, 1])
-    return np.where(precision > 0.0, vector / np.where(precision > 0.0, precision, 1.0), 0.0)
+    known = precision > 0.0
+    divisor = np.where(known, precision, 1.0)
+    return np.where(known, vector / divisor, 0.0), np.where(known, divisor**-0.5, 0.0)
