@@ -21,8 +21,8 @@ from pathlib import Path
 
 import numpy as np
 
+from sealscope.diagnosis.detectors.registry import DETECTORS
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY, Examination
-from sealscope.diagnosis.registry import DETECTORS
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.instruments import record

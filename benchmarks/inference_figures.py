@@ -16,7 +16,7 @@ import sealscope as ss
 from sealscope.diagnosis.inference.balance import blocks_of
 from sealscope.diagnosis.inference.blocks import information
 from sealscope.diagnosis.inference.onset import Information, course, step_test
-from sealscope.diagnosis.inference.weak_form import test_function
+from sealscope.diagnosis.inference.rows.weak_form import test_function
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Array
 from sealscope.units import LITRE_PER_MINUTE

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
-from sealscope.diagnosis import registry
+from sealscope.diagnosis.detectors import registry
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings import Recording
 from sealscope.signals.details import details

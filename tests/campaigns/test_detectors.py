@@ -20,9 +20,9 @@ from sealscope.campaigns.judging.judge import judge
 from sealscope.campaigns.plans.detectors import ALL_CHANNELS, check_detector, plan_detector
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.campaigns.results import simulated_result, write_result
-from sealscope.diagnosis import registry
 from sealscope.diagnosis.decision.decide import decide
-from sealscope.diagnosis.detector import make_observable
+from sealscope.diagnosis.detectors import registry
+from sealscope.diagnosis.detectors.detector import make_observable
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.verdict.evidence import Cause, Evidence
 from sealscope.errors import InputError

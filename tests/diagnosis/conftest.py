@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from sealscope.diagnosis import registry
+from sealscope.diagnosis.detectors import registry
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.instruments import record

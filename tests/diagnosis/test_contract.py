@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sealscope.diagnosis import observation
-from sealscope.diagnosis.detector import checked
+from sealscope.diagnosis.detectors import observation
+from sealscope.diagnosis.detectors.detector import checked
+from sealscope.diagnosis.detectors.registry import detectors
 from sealscope.diagnosis.diagnose import Examination, diagnose
-from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.rms_change.detector import RmsChange
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.parameters import Rig, load_rig

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis import registry
-from sealscope.diagnosis.detector import make_observable
+from sealscope.diagnosis.detectors import registry
+from sealscope.diagnosis.detectors.detector import make_observable
 from sealscope.diagnosis.diagnose import Examination
 from sealscope.diagnosis.inference.observable import Observable, Observed, Ringing
 from sealscope.parameters import Rig, load_rig

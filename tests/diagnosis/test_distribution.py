@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.inference.distribution import PARTS, distribution
+from sealscope.diagnosis.inference.rows.distribution import PARTS, distribution
 
 RATE, SECONDS, NOISE = 500.0, 3.0, 7e3
 

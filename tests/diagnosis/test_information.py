@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, Weighting, information, solve
-from sealscope.diagnosis.inference.row_weights import HUBER, SUPPORT, weighted
+from sealscope.diagnosis.inference.rows.row_weights import HUBER, SUPPORT, weighted
+from sealscope.diagnosis.inference.rows.weak_form import OVERLAP, rows
 from sealscope.diagnosis.inference.terms import LEAK, Equation, Term
-from sealscope.diagnosis.inference.weak_form import OVERLAP, rows
 from sealscope.diagnosis.priors import priors
 
 FIELDS = tuple(Blocks.__dataclass_fields__)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.inference.pressures.detector import PressureResponse
+from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.parameters import load_rig
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_experiment

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.inference.detector import VolumeBalance
-from sealscope.diagnosis.inference.recorded import RecordedBalance
+from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
+from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.inspection import inspected
 from sealscope.diagnosis.rms_change.detector import RmsChange
 from sealscope.parameters import load_rig

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from sealscope.diagnosis import detector, registry
+from sealscope.diagnosis.detectors import detector, registry
+from sealscope.diagnosis.detectors.registry import DETECTORS, detectors
 from sealscope.diagnosis.diagnose import Examination, diagnose
-from sealscope.diagnosis.registry import DETECTORS, detectors
 from sealscope.recordings.recording import Recording
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "ringing-energy"
@@ -27,7 +27,7 @@ class Good:
 """
 #: A detector that reports one change alone.
 ONE_CHANGE = """
-from sealscope.diagnosis.detector import make_observable
+from sealscope.diagnosis.detectors.detector import make_observable
 class Good:
     name = "good"
     def __init__(self, rig): pass
@@ -46,7 +46,7 @@ def short(healthy: Recording) -> Recording:
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
     """Install a distribution of that name with its source and entry points, as pip would leave it."""
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr("sealscope.diagnosis.registry.DETECTORS", {"rms change": DETECTORS["rms change"]})
+    monkeypatch.setattr("sealscope.diagnosis.detectors.registry.DETECTORS", {"rms change": DETECTORS["rms change"]})
 
     def made(distribution: str, source: str, points: dict[str, str]) -> None:
         (tmp_path / f"{distribution}.py").write_text(source, encoding="utf-8")

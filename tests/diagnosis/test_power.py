@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from sealscope.diagnosis.detectors.registry import detectors
 from sealscope.diagnosis.diagnose import Examination
-from sealscope.diagnosis.registry import detectors
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_experiment

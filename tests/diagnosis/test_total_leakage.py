@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.inference.detector import VolumeBalance
+from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.verdict.machine import unstated
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import spherical_jn
 
-from sealscope.diagnosis.inference.weak_form import SPAN, STRIDE, rows, stride_samples
+from sealscope.diagnosis.inference.rows.weak_form import SPAN, STRIDE, rows, stride_samples
 
 RATES = (80.0, 160.0, 320.0, 640.0)  # whole samples a stride
 

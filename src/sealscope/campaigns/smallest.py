@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, solve
-from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.inference.terms import PUMP
+from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.machine import healthy_leakage
 from sealscope.errors import InputError, SealscopeError

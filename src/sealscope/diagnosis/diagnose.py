@@ -15,14 +15,14 @@ from sealscope.diagnosis.decision.case import DecisionContext
 from sealscope.diagnosis.decision.combination import ORDER, combine, is_decided, rank
 from sealscope.diagnosis.decision.decide import decide
 from sealscope.diagnosis.decision.null import HealthyNull
-from sealscope.diagnosis.inference.balance_leak import BalanceLeak
+from sealscope.diagnosis.detectors.observation import null_of, run_detector
+from sealscope.diagnosis.detectors.registry import detectors
 from sealscope.diagnosis.inference.changes.signals import SIGNALS, observe_signals
 from sealscope.diagnosis.inference.observable import Observed
+from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inspection import comparable, inspected
 from sealscope.diagnosis.learnt import Healthy, Learnt
-from sealscope.diagnosis.observation import null_of, run_detector
 from sealscope.diagnosis.priors import priors
-from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import RMS_CHANGE, Evidence
 from sealscope.diagnosis.verdict.machine import assumed_rig

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.inference.detector import RESOLVED
-from sealscope.diagnosis.inference.weak_form import STRIDE
+from sealscope.diagnosis.inference.rows.weak_form import STRIDE
+from sealscope.diagnosis.inference.volumes.detector import RESOLVED
 from sealscope.errors import InputError
 from sealscope.fmu.description import description, templates
 from sealscope.fmu.machine import FAILURES, Choice, code, object_code

@@ -32,9 +32,9 @@ from numba import carray
 from sealscope.compiled import large_law, law, layout_of, record_at
 from sealscope.diagnosis.inference.blocks import Columns
 from sealscope.diagnosis.inference.onset import WITHIN_95
-from sealscope.diagnosis.inference.row_weights import SUPPORT, Workspace, median, weigh, workspace_shapes
+from sealscope.diagnosis.inference.rows.row_weights import SUPPORT, Workspace, median, weigh, workspace_shapes
+from sealscope.diagnosis.inference.rows.weak_form import LARGEST, SPAN, STRIDE, stride_samples, test_function
 from sealscope.diagnosis.inference.terms import HALF_DIFFERENCE, LEAST_ABSOLUTE
-from sealscope.diagnosis.inference.weak_form import LARGEST, SPAN, STRIDE, stride_samples, test_function
 from sealscope.diagnosis.live.balance import BLOCK_SECONDS, LEARNED, TELLS, WAKES, live_equations, size_error
 from sealscope.diagnosis.live.known import (
     MISFIT,

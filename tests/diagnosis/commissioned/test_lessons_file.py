@@ -268,7 +268,7 @@ def test_a_main_method_that_cannot_run_is_never_no_leak(machine, monkeypatch):
     def fail(*_: object) -> None:
         raise np.linalg.LinAlgError("Singular matrix")
 
-    monkeypatch.setattr("sealscope.diagnosis.inference.detector.judge", fail)
+    monkeypatch.setattr("sealscope.diagnosis.inference.volumes.detector.judge", fail)
     diagnosis = machine.diagnose(judged)
     assert diagnosis.verdict == "cannot tell"
     assert "volume balance cannot be computed on this recording: singular matrix" in diagnosis.reason

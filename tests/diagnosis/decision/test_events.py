@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import sealscope as ss
-from sealscope.diagnosis.detector import make_observable
+from sealscope.diagnosis.detectors.detector import make_observable
 from sealscope.diagnosis.inference.changes.levels import PATTERNS
 from sealscope.diagnosis.inference.changes.signals import observe_signals
 from sealscope.diagnosis.inference.changes.volumes import OUTSIDE, SCALE

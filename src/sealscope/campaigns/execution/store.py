@@ -12,7 +12,7 @@ from sealscope.campaigns.cases.case import CaseInputs, cases_of, code_key, diges
 from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.plans.detectors import DIAGNOSE, plan_detector
 from sealscope.campaigns.plans.model import SimulatedPlan
-from sealscope.diagnosis.registry import PlugIn, detectors
+from sealscope.diagnosis.detectors.registry import PlugIn, detectors
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.storage import rows
 from sealscope.storage.atomic import atomic_write

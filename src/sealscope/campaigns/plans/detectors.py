@@ -15,7 +15,7 @@ from functools import cache
 
 from sealscope.calls import nearest
 from sealscope.campaigns.plans.scorers import SCORERS, Scorer
-from sealscope.diagnosis.registry import detectors
+from sealscope.diagnosis.detectors.registry import detectors
 from sealscope.errors import InputError
 from sealscope.recordings.recording import CHANNEL_UNITS
 

@@ -16,12 +16,12 @@ import numpy as np
 from sealscope.calls import checked_call
 from sealscope.diagnosis.commissioned.cross_check import find_outliers, with_remarks, without_leaks
 from sealscope.diagnosis.commissioned.lessons_file import check_lesson
-from sealscope.diagnosis.detector import failure, unusable
+from sealscope.diagnosis.detectors.detector import failure, unusable
+from sealscope.diagnosis.detectors.observation import rarities_of
+from sealscope.diagnosis.detectors.registry import detectors
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY, diagnose
 from sealscope.diagnosis.inspection import inspected
 from sealscope.diagnosis.learnt import Learnt, Lesson
-from sealscope.diagnosis.observation import rarities_of
-from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LEAK
 from sealscope.diagnosis.verdict.machine import assumed_rig

@@ -12,8 +12,8 @@ import numpy as np
 from sealscope.diagnosis.commissioned.cross_check import BY_OTHERS
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY
 from sealscope.diagnosis.inference.blocks import Columns, solve
-from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.inference.terms import equations
+from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.inspection import Inspection
 from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.machine import unstated

@@ -10,10 +10,18 @@ import numpy as np
 
 from sealscope.control.drive import Drive
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, Weighting, solve
-from sealscope.diagnosis.inference.distribution import distribution
 from sealscope.diagnosis.inference.onset import FEWEST
 from sealscope.diagnosis.inference.regimes import apply_regime, has_rests, shut_odds
-from sealscope.diagnosis.inference.row_weights import RIDGE, SUPPORT
+from sealscope.diagnosis.inference.rows.distribution import distribution
+from sealscope.diagnosis.inference.rows.row_weights import RIDGE, SUPPORT
+from sealscope.diagnosis.inference.rows.weak_form import (
+    OVERLAP,
+    SPAN,
+    STRIDE,
+    rows,
+    stride_samples,
+    weights_beside_holes,
+)
 from sealscope.diagnosis.inference.terms import (
     AVERAGED,
     CYLINDER,
@@ -28,7 +36,6 @@ from sealscope.diagnosis.inference.terms import (
     shut_at_rest,
     with_rests,
 )
-from sealscope.diagnosis.inference.weak_form import OVERLAP, SPAN, STRIDE, rows, stride_samples, weights_beside_holes
 from sealscope.diagnosis.inference.zero import about_zero
 from sealscope.diagnosis.priors import priors
 from sealscope.recordings.channels import flow_source

@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.inference.onset import Information
-from sealscope.diagnosis.inference.row_weights import MOST_TURNS, RIDGE, SUPPORT, TOLERANCE, weighted
+from sealscope.diagnosis.inference.rows.row_weights import MOST_TURNS, RIDGE, SUPPORT, TOLERANCE, weighted
+from sealscope.diagnosis.inference.rows.weak_form import OVERLAP
 from sealscope.diagnosis.inference.terms import BIAS, LEAK, REST_LEAK, RESTS, Equation
-from sealscope.diagnosis.inference.weak_form import OVERLAP
 from sealscope.diagnosis.priors import priors
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array

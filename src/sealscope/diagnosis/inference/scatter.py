@@ -34,7 +34,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, solve, total
-from sealscope.diagnosis.inference.weak_form import LARGEST
+from sealscope.diagnosis.inference.rows.weak_form import LARGEST
 from sealscope.diagnosis.priors import priors
 from sealscope.recordings.recording import Array
 

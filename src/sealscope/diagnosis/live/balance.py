@@ -17,8 +17,8 @@ import numpy as np
 from sealscope.compiled import kernel
 from sealscope.diagnosis.inference.balance import BlockStream
 from sealscope.diagnosis.inference.blocks import Blocks, Columns
+from sealscope.diagnosis.inference.rows.weak_form import stride_samples
 from sealscope.diagnosis.inference.terms import Equation, equations
-from sealscope.diagnosis.inference.weak_form import stride_samples
 from sealscope.diagnosis.live.joining import SampleRun
 from sealscope.diagnosis.live.known import STANDSTILL, TINY, Known, add, begin, known_shapes, motion, says, take
 from sealscope.diagnosis.priors import priors

@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sealscope.compiled import large_law, law
-from sealscope.diagnosis.inference.row_weights import eliminate
-from sealscope.diagnosis.inference.weak_form import OVERLAP
+from sealscope.diagnosis.inference.rows.row_weights import eliminate
+from sealscope.diagnosis.inference.rows.weak_form import OVERLAP
 from sealscope.diagnosis.priors import priors
 
 JUMP: float = priors("live")["coefficients"]["jump"]

@@ -11,10 +11,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sealscope.diagnosis.detector import unusable
-from sealscope.diagnosis.inference.detector import VolumeBalance
+from sealscope.diagnosis.detectors.detector import unusable
 from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.inference.pressures.detector import PressureResponse
+from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.inspection import inspected
 from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.rms_change.blocks import JUDGED, whole

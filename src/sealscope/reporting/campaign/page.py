@@ -18,7 +18,7 @@ from sealscope.campaigns.judging.tables import PriorKnowledge
 from sealscope.campaigns.plans.detectors import DIAGNOSE, plan_detector
 from sealscope.campaigns.plans.model import RecordedPlan, SimulatedPlan
 from sealscope.campaigns.results import CampaignResult
-from sealscope.diagnosis.registry import detectors
+from sealscope.diagnosis.detectors.registry import detectors
 from sealscope.evaluation.roc import Area
 from sealscope.paragraphs import paragraph
 from sealscope.recordings.channels import Array

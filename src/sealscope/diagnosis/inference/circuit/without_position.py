@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from sealscope.diagnosis.inference.balance import LONGEST, commanded, whole_samples
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, Weighting
 from sealscope.diagnosis.inference.circuit.store import cycle_length, lost_oil
-from sealscope.diagnosis.inference.distribution import distribution
 from sealscope.diagnosis.inference.onset import FEWEST, WITHIN_95, StepTest
+from sealscope.diagnosis.inference.rows.distribution import distribution
 from sealscope.diagnosis.inference.terms import (
     LEAK,
     LOCKED,

@@ -10,12 +10,12 @@ import numpy as np
 
 from sealscope.diagnosis.decision.case import step_key
 from sealscope.diagnosis.decision.null import HealthyNull, key_of
-from sealscope.diagnosis.detector import Detector, checked, failure, unusable
+from sealscope.diagnosis.detectors.detector import Detector, checked, failure, unusable
+from sealscope.diagnosis.detectors.registry import detectors
 from sealscope.diagnosis.inference.changes.signals import observe_signals
-from sealscope.diagnosis.inference.detector import VolumeBalance
 from sealscope.diagnosis.inference.observable import Observable, Observed
+from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.learnt import Healthy, Learnt, lessons_of
-from sealscope.diagnosis.registry import detectors
 from sealscope.diagnosis.rms_change.detector import RmsChange, compare_lessons
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.motion import does_not_move

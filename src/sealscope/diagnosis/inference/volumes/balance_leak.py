@@ -10,8 +10,8 @@ import numpy as np
 
 from sealscope.diagnosis.inference.observable import Flow, Remark
 from sealscope.diagnosis.inference.onset import BELOW_95, WITHIN_95, Interval, StepTest
-from sealscope.diagnosis.inference.recorded import RecordedBalance
 from sealscope.diagnosis.inference.scatter import RecordingSums, Rise, rise
+from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.evidence import LeakCourse, RelativeLeak, TotalLeakage
 from sealscope.diagnosis.verdict.machine import healthy_leakage

@@ -20,7 +20,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sealscope.diagnosis.detector import Detector, Factory, failure
+from sealscope.diagnosis.detectors.detector import Detector, Factory, failure
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -59,7 +59,7 @@ def _made(module: str, name: str, rig: Rig) -> Detector:
 
 #: The built-in detectors by name, loaded when first made; one contract test runs them all.
 DETECTORS: dict[str, Factory] = {
-    "volume balance": partial(_made, "inference.detector", "VolumeBalance"),
+    "volume balance": partial(_made, "inference.volumes.detector", "VolumeBalance"),
     "pressure response": partial(_made, "inference.pressures.detector", "PressureResponse"),
     "rms change": partial(_made, "rms_change.detector", "RmsChange"),
 }

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from sealscope.diagnosis.inference.weak_form import stride_samples
+from sealscope.diagnosis.inference.rows.weak_form import stride_samples
 from sealscope.recordings.recording import Array
 
 #: Equal parts of a block's distribution whose means are kept, and the time over which the pressure is averaged [s].

@@ -8,15 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.diagnosis.inference.balance import RecordedBlocks, RegimeBlocks, recorded_blocks, shortest
-from sealscope.diagnosis.inference.balance_leak import BalanceLeak
 from sealscope.diagnosis.inference.blocks import Columns
 from sealscope.diagnosis.inference.circuit.store import lost_beside
 from sealscope.diagnosis.inference.circuit.without_position import circulations
 from sealscope.diagnosis.inference.differences import difference
 from sealscope.diagnosis.inference.observable import Observable, Observed
-from sealscope.diagnosis.inference.recorded import RecordedBalance
 from sealscope.diagnosis.inference.regimes import shut_without_rests
-from sealscope.diagnosis.inference.rivals import rival_rises
+from sealscope.diagnosis.inference.rows.weak_form import STRIDE, stride_samples
 from sealscope.diagnosis.inference.scatter import RecordingSums, Rise, leave_one_out, motion_change, rise
 from sealscope.diagnosis.inference.terms import (
     CYLINDER,
@@ -27,7 +25,9 @@ from sealscope.diagnosis.inference.terms import (
     locked,
     shut_at_rest,
 )
-from sealscope.diagnosis.inference.weak_form import STRIDE, stride_samples
+from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
+from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
+from sealscope.diagnosis.inference.volumes.rivals import rival_rises
 from sealscope.diagnosis.learnt import Healthy, Lesson, lessons_of
 from sealscope.diagnosis.priors import priors
 from sealscope.recordings.chambers import CHAMBERS

@@ -1,0 +1,1 @@
+"""What every detector promises, which there are, and how they are run."""

@@ -1,0 +1,1 @@
+"""The balance of volumes as a provider: its observables, its leak, and rivals of a rise."""
