@@ -16,12 +16,12 @@ from sealscope.parameters import load_rig
 from sealscope.recordings.channels import CHANNEL_UNITS
 from sealscope.recordings.recording import Array, Recording
 
+from .judging import judge
+
 RIG = load_rig("thesis")
 RATE, AREA, DISPLACEMENT = 100.0, 633e-6, 4.9e-6 / (2.0 * np.pi)
 PUMP, STORED, LOAD = 4e-13, 1.7e-13, 8e6
 CYCLE = 12.0
-
-from .judging import judge
 
 
 def press(seed: int, leak: float = 0.0, since: float = 0.0, shut: bool = True, seconds: float = 96.0) -> Recording:
