@@ -113,7 +113,9 @@ class Examination:
         for name in names:
             if name not in ORDER or not any(is_decided(own) for own in judged.values()):
                 judged[name] = self._decide(name, reports, context)
-        failed = next((self.report(name).lack for name in ORDER if name in judged and self.report(name).has_failed), None)
+        failed = next(
+            (self.report(name).lack for name in ORDER if name in judged and self.report(name).has_failed), None
+        )
         return combine(list(judged.values()), replace(context, refusal=self.refusal or failed))
 
     def _decide(self, name: str, reports: Sequence[Observed], context: DecisionContext) -> Evidence:

@@ -105,8 +105,8 @@ def valve_rig_text(
     base = load_rig("servo-valve")
     drop = base.valve.dp_N if rated_drop is None else rated_drop
     setting = base.supply.p_set if pressure is None else pressure
-    given = {"area-A": area_A, "area-B": area_B, "stroke": stroke, "valve": rated_flow, "drop": drop, "supply": setting}
-    _check_sizes(name, given)
+    sizes = {"area-A": area_A, "area-B": area_B, "stroke": stroke, "valve": rated_flow, "drop": drop, "supply": setting}
+    _check_sizes(name, sizes)
     assumed = f"assumed: that of {base.name}"
     torques = rated_flow / _SUPPLY_SPEED * setting / (base.pump.q_b * base.supply.p_set)  # so many motors on one shaft
     motor = {name: f"{base[f'motor.{name}'] * torques:.4g}" for name in ("i_max", "J_M", "B_M")}  # type: ignore[operator]
@@ -147,7 +147,7 @@ def _size(base: Rig, area_A: float, area_B: float, stroke: float) -> float:
 
 
 def _cylinder_sizes(base: Rig, area_A: float, area_B: float, stroke: float) -> dict[str, str]:
-    """Return what cylinder and friction are in the files of rigs, by the templates' names."""
+    """Return the parameters of cylinder and friction, by the keys of the templates."""
     larger, size = max(area_A, area_B), _size(base, area_A, area_B, stroke)
     bore = math.sqrt(larger / max(base.cylinder.A_A, base.cylinder.A_B))
     mass, friction = base.cylinder.M_eq * size, base.friction

@@ -171,8 +171,7 @@ def test_what_happened_is_named_only_where_it_is_sure() -> None:
     assert judge_leak(MeasuredLeak(step(0.0)), also=alike).cause is None
 
 
-#: Files of the diagnosis that may hold a verdict's words as a constant: the types, and the one decision; then those
-#: that still compare or state them, of which there shall be fewer.
+#: Files of the diagnosis that may hold a verdict's words as a constant: the types, and the one decision.
 WORDS = {"leak", "no leak", "cannot tell"}
 DECISION = {"verdict/evidence.py", "decision/decide.py", "decision/case.py"}
 #: "leak" as the name of a term, a column, a table of texts or a prior.
@@ -183,15 +182,6 @@ NAMES = {
     "inference/blocks.py",
     "inference/scatter.py",
     "inference/terms.py",
-}
-LEGACY = {
-    "commissioned/machine.py",
-    "commissioned/scikit_learn.py",
-    "live/watch.py",
-    "trend/trend.py",
-    "verdict/diagnosis.py",
-    "verdict/severity.py",
-    "verdict/states.py",
 }
 #: Files that make evidence: the decision, what chooses among several, and what still decides by itself.
 MAKERS = {"decision/decide.py", "decision/combination.py"}
@@ -215,8 +205,7 @@ def calls(path: Path, name: str) -> bool:
 def test_verdicts_stand_in_one_place() -> None:
     holding = {path.relative_to(SOURCE).as_posix(): constants(path) & WORDS for path in SOURCE.rglob("*.py")}
     found = {name for name, words in holding.items() if words - ({"leak"} if name in NAMES else set())}
-    assert found - DECISION - LEGACY == set()
-    assert LEGACY - found == set(), "take these from the list"
+    assert found - DECISION == set()
 
 
 def test_evidence_is_made_in_one_place() -> None:

@@ -31,11 +31,24 @@ def leak_probability(*observables: object) -> float:
 
 
 @pytest.mark.parametrize("chance", [1e-2, 1e-6, 1e-40])
-def test_a_chance_is_worth_the_bound_of_sellke_within_the_misfit(chance: float) -> None:
+def test_a_chance_is_worth_the_bound_of_sellke(chance: float) -> None:
     bound = -math.log(-math.e * chance * math.log(chance))
-    misfit = priors("decision")["explanation"]["misfit"]
-    assert log_bayes_factor(chance) == pytest.approx(bound / (1.0 + 2.0 * misfit * bound))
+    assert log_bayes_factor(chance) == pytest.approx(bound)
     assert bound > 0.0
+
+
+def test_rivals_are_told_apart_no_better_than_the_terms_are_known() -> None:
+    """However long the recording, the odds of two rivals of the same data end at exp(1 / 4 m)."""
+    misfit = priors("decision")["explanation"]["misfit"]
+    probable = {event.name: event.probability for event in EVENTS.values()}
+    for chance in (1e-20, 1e-100, 1e-280):
+        rivals = [observable("levels: friction", chance), observable("levels: load", math.sqrt(chance))]
+        one, other = (
+            next(row.probability for row in explain(rivals) if [event.name for event in row.events] == [name])
+            for name in ("friction", "load")
+        )
+        odds = math.log(one / other) - math.log(probable["friction"] / probable["load"])
+        assert 0.0 < odds < 1.0 / (4.0 * misfit)
 
 
 def test_what_is_not_rare_is_worth_nothing() -> None:
@@ -46,7 +59,8 @@ def test_what_is_not_rare_is_worth_nothing() -> None:
 
 def test_one_observable_by_hand() -> None:
     """Events that move it earn its Bayes factor, all others their probability, and pairs of the former both."""
-    factor = math.exp(log_bayes_factor(LEAK.chance))
+    bound = log_bayes_factor(LEAK.chance)
+    factor = math.exp(bound / (1.0 + 2.0 * priors("decision")["explanation"]["misfit"] * bound))
     moving = [event.probability for event in EVENTS.values() if event.does_move(LEAK)]
     silent = sum(event.probability for event in EVENTS.values() if not event.does_move(LEAK))
     pairs = 0.5 * (sum(moving) ** 2 - sum(p * p for p in moving))
@@ -119,10 +133,11 @@ def explained_by(data: str, name: str) -> object:
 def test_a_leak_within_and_one_against_healthy_recordings_are_one() -> None:
     """A rise as large as the step makes is the same leak; none at all speaks against a step of that size."""
     rises = [Rise(value, 1.0, 30.0) for value in (6.0, 0.0)]
+    rival = observable("volumes: zero of p_A", LEAK.chance)
     with_rise, without = (
-        probability_of(explain([LEAK], rise=LeakRise(rise, 6.0)), *LEAK_EVENTS, data="volumes") for rise in rises
+        probability_of(explain([LEAK, rival], rise=LeakRise(rise, 6.0)), *LEAK_EVENTS, data="volumes") for rise in rises
     )
-    assert with_rise > leak_probability(LEAK) > without
+    assert with_rise > leak_probability(LEAK, rival) > without
     ratio = rises[0].log_ratio(6.0)
     assert ratio == pytest.approx(float(student.logpdf(0.0, 30) - student.logpdf(6.0, 30)))
 

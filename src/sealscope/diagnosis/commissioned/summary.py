@@ -97,7 +97,9 @@ class Summary:
             needs = "speed or angle of the pump, flow or command, and two recordings"
             rows.append(("smallest leak", f"not known, that needs {needs}; the ringing alone judges"))
         alarms = sum(BY_OTHERS in problem for problem in self.problems)
-        promised = f"1 in {len(healthy) + 1} by the ranks of {len(healthy)} healthy recordings alone, whatever their law"
+        promised = (
+            f"1 in {len(healthy) + 1} by the ranks of {len(healthy)} healthy recordings alone, whatever their law"
+        )
         rows.append(("false alarms", f"{promised}; {alarms or 'none'} of them stand out of the others"))
         rows += [("check", problem) for problem in self.problems]
         return "\n".join(paragraphs(rows, 16))

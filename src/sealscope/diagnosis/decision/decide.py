@@ -8,8 +8,9 @@ verdict: `combine` chooses which provider's decision stands.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -103,11 +104,11 @@ def _leak_evidence(case: Case, alarm: Question) -> Evidence:
     return replace(evidence, reason=reason_of(case, evidence, alarm, np.inf, None))
 
 
-def _sizes(leak: LeakMeasure, flow: Flow | None) -> Mapping[str, object]:
+def _sizes(leak: LeakMeasure, flow: Flow | None) -> dict[str, Any]:
     """Return the leak's figures in L/min and beside the pump, or which of them are refused."""
     if flow is None:
         return {}
-    sizes: dict[str, object] = {"relative": leak.relative(flow)}
+    sizes: dict[str, Any] = {"relative": leak.relative(flow)}
     if leak.litres is None:
         return {**sizes, "refuses": frozenset({"leak_lpm"})}
     half = WITHIN_95 * float(np.hypot(flow.deviation, flow.value * leak.size_deviation))

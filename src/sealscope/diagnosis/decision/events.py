@@ -64,6 +64,13 @@ def load_events() -> Sequence[Event]:
     """Read the table of events."""
     rows = tomllib.loads((files("sealscope.diagnosis.decision") / "events.toml").read_text("utf-8"))
     return tuple(
-        Event(name, row["cause"] or None, row["probability"]["value"], tuple(row["moves"]), tuple(row.get("disturbs", ())), row["words"])
+        Event(
+            name,
+            row["cause"] or None,
+            row["probability"]["value"],
+            tuple(row["moves"]),
+            tuple(row.get("disturbs", ())),
+            row["words"],
+        )
         for name, row in rows.items()
     )

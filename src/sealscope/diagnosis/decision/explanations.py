@@ -24,14 +24,12 @@ import numpy as np
 
 from sealscope.diagnosis.decision.events import Event, load_events
 from sealscope.diagnosis.inference.observable import Observable
-from sealscope.diagnosis.inference.scatter import Rise
+from sealscope.diagnosis.inference.scatter import RISE, Rise
 from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.evidence import Cause
 
-#: Data that the leakage against healthy recordings is.
-RISE = "rise"
-#: Most events of an explanation, and the least log Bayes factor, of ten to one, of what shows an event beside another: duty, noise
-#: and friction change together often enough that two would leave a leak no place.
+#: Most events of an explanation, and the least log Bayes factor, of ten to one, of what shows an event beside another:
+#: duty, noise and friction change together often enough that two would leave a leak no place.
 MOST, LEAST = 3, 2.3
 #: Events whose leakage passes the piston or the pump, which lie in parallel.
 LEAK_EVENTS = ("piston leak", "pump leak")
@@ -90,9 +88,12 @@ def explain(
     weighted = [(own, factor / (1.0 + misfit * largest[own.data])) for own, factor in factors]
     ways = {event.name: _ways_of(event, weighted, rise) for event in events}
     telling = [event for event in events if max(sum(gains.values()) for gains in ways[event.name]) > LEAST]
-    groups = [(event,) for event in events]
+    groups: list[tuple[Event, ...]] = [(event,) for event in events]
     groups += [group for size in range(2, MOST + 1) for group in combinations(telling, size)]
-    moved = {name: frozenset(kind for gains in rows for kind, gain in gains.items() if gain > 0.0) for name, rows in ways.items()}
+    moved = {
+        name: frozenset(kind for gains in rows for kind, gain in gains.items() if gain > 0.0)
+        for name, rows in ways.items()
+    }
     logarithms = np.array([_logarithm(group, ways) for group in groups])
     weights = np.exp(logarithms - logarithms.max())
     weights /= weights.sum()
@@ -121,16 +122,13 @@ def _ways_of(event: Event, weighted: Sequence[tuple[Observable, float]], rise: L
     gains: dict[str, float] = {}
     if moved:
         anchor = max(moved, key=lambda pair: pair[1])[0]
-        # what shows the event has to show it before it explains anything else
-        # ... and no more of the data by which it is shown
+        # an event explains what it disturbs only once other data show it
         shown = {observable.data for observable, gain in moved if gain > LEAST}
-        disturbed = [
-            pair for pair in weighted if shown and pair[0].data not in shown and event.does_disturb(pair[0])
-        ]
+        disturbed = [pair for pair in weighted if shown and pair[0].data not in shown and event.does_disturb(pair[0])]
         for own, gain in moved + disturbed:
             if _coincide(own, anchor):
-                gain += 0.5 * own.advantage if event.is_sized else 0.0
-                gains[own.data] = max(gain, gains.get(own.data, 0.0))
+                sized = gain + (0.5 * own.advantage if event.is_sized else 0.0)
+                gains[own.data] = max(sized, gains.get(own.data, 0.0))
     ways: list[_Gains] = [gains]
     if rise is not None and event.name in LEAK_EVENTS:
         if gains.get("volumes", 0.0) > 0.0:

@@ -24,9 +24,12 @@ def decide_verdict(is_leak: bool, bound: float, worth: float) -> Verdict:
     str
         One of the three verdicts.
     """
+    verdict: Verdict = CANNOT_TELL
     if is_leak:
-        return LEAK
-    return NO_LEAK if math.isfinite(bound) and bound <= worth else CANNOT_TELL
+        verdict = LEAK
+    elif math.isfinite(bound) and bound <= worth:
+        verdict = NO_LEAK
+    return verdict
 
 
 def bound_worth_stating(flow: float) -> float:

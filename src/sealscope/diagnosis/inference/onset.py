@@ -242,9 +242,7 @@ class NullLaw(NamedTuple):
         return min(1.0, 0.5 * float(betainc(0.5 * (n - 1), 0.5, away)) + tube)
 
 
-def step_test(
-    information: Information, signs: Sequence[float] = (1.0,), shape: Array | None = None
-) -> StepTest | None:
+def step_test(information: Information, signs: Sequence[float] = (1.0,), shape: Array | None = None) -> StepTest | None:
     """Return the likeliest test of a step of one of the `signs`; None where too few blocks say anything.
 
     The chance of one of two is twice that stated.

@@ -38,6 +38,8 @@ from sealscope.diagnosis.inference.rows.weak_form import LARGEST
 from sealscope.diagnosis.priors import priors
 from sealscope.recordings.recording import Array
 
+#: Name of the data that leakage against healthy recordings is.
+RISE = "rise"
 #: Nodes of a deviation, and the largest one between sessions over what is believed; most recordings that are compared.
 NODES, WIDEST, MOST = 32, 3.0, 60
 #: Widths of what recordings differ by that are weighed, and how far from what is believed [deviations].

@@ -126,7 +126,9 @@ def observe_against(recording: Recording, baseline: Sequence[Healthy]) -> Observ
     judged = RmsChange().learn(recording)
     observables, bound = compare_lessons(judged, lessons, chambers)
     is_dated = None not in [lesson.get("start_s") for lesson in (judged, *lessons)]
-    return Observed(RmsChange.name, observables, ringing=Ringing(bound, recording.rate, len(lessons), is_dated, recording.unused))
+    return Observed(
+        RmsChange.name, observables, ringing=Ringing(bound, recording.rate, len(lessons), is_dated, recording.unused)
+    )
 
 
 def compare_lessons(

@@ -55,9 +55,9 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
             "long one touches counts less"
         )
         findings.append(Finding("gaps_bridged", "note", None, lost.size, float(part.t[lost[0]]), text))
-    rows = np.flatnonzero(np.all([np.isfinite(part[name]) for name in needed], axis=0)) if needed else None
-    if rows is not None and rows.size < len(part):
-        part = part.samples(slice(int(rows[0]), int(rows[-1]) + 1) if rows.size else slice(0, 0))
+    kept = np.flatnonzero(np.all([np.isfinite(part[name]) for name in needed], axis=0)) if needed else None
+    if kept is not None and kept.size < len(part):
+        part = part.samples(slice(int(kept[0]), int(kept[-1]) + 1) if kept.size else slice(0, 0))
     within = int(np.count_nonzero((recording.t >= part.t[0]) & (recording.t <= part.t[-1]))) if len(part) else 0
     share = within / max(len(recording), 1)
     if len(part) and within < len(recording):

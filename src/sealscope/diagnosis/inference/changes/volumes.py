@@ -22,9 +22,10 @@ from sealscope.diagnosis.inference.blocks import (
 )
 from sealscope.diagnosis.inference.leak_law import law_shapes
 from sealscope.diagnosis.inference.observable import Observable
-from sealscope.diagnosis.inference.onset import StepTest, step_tests
+from sealscope.diagnosis.inference.onset import Information, StepTest, step_tests
 from sealscope.diagnosis.inference.terms import AIR, BIAS, LEAK, MADE_UP, ORIFICE, PUMP, Equation, Term
 from sealscope.diagnosis.priors import priors
+from sealscope.recordings.recording import Array
 
 #: Name of the data that these observables describe.
 VOLUMES = "volumes"
@@ -63,7 +64,7 @@ def volume_observables(
     about, recorded = (own.merged(priors("inference")["blocks"]["coarse"]) for own in (blocks, plain))
     first = columns[0]
     orifice = first.names.index(ORIFICE)
-    tests = []
+    tests: list[tuple[str, tuple[float, ...], Information, Array | None]] = []
     for index, term in enumerate(balances[0].terms):
         if not _is_tested(term, index, first, bool(lost)):
             continue
@@ -119,8 +120,7 @@ def _name_of(term: Term) -> str:
 
 
 def _rarity_of_size(table: str, step: float, above: bool = False) -> float:
-    """Compute minus twice the logarithm of a step's prior density over the likeliest; `above`: no smaller one is rare.
-    """
+    """Compute -2 times the logarithm of a step's prior density over the largest; `above`: no smaller one is rare."""
     size, spread = (priors("inference")[table][name] for name in ("size", "spread"))
     away = float(np.log(max(abs(step), np.finfo(float).tiny) / size)) / spread
     return float(max(away, 0.0) ** 2 if above else away**2)

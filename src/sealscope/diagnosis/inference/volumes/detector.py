@@ -101,11 +101,11 @@ class VolumeBalance:
         balances = equations(self.rig, frozenset(recording.channels))
         if not balances:
             made = remembered(recording, (self.name, self.rig), lambda own: circulations(own, self.rig), _READ)
-            recorded = [
+            candidates = [
                 RecordedBalance(own.blocks, (own.equation,), (own.columns,), self.rig, recording, own.lost)
                 for own in made
             ]
-            answering = [own for own in recorded if own.equations[0].name == LOCKED or made_good(own)]
+            answering = [own for own in candidates if own.equations[0].name == LOCKED or made_good(own)]
             return min(answering, key=lambda own: BalanceLeak(self.name, own).bound_flow, default=None)
         recorded = self._recorded(recording)
         return None if recorded is None else self._balance(recording, recorded.regime(recorded.odds + odds))

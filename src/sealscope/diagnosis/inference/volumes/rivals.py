@@ -14,13 +14,10 @@ import numpy as np
 from sealscope.diagnosis.inference.blocks import Columns, solve
 from sealscope.diagnosis.inference.differences import difference
 from sealscope.diagnosis.inference.observable import Observable
-from sealscope.diagnosis.inference.scatter import RecordingSums
+from sealscope.diagnosis.inference.scatter import RISE, RecordingSums
 from sealscope.diagnosis.inference.terms import AIR, LEAK
 from sealscope.diagnosis.priors import priors
 from sealscope.recordings.recording import Array
-
-#: Name of the data that they describe: the leakage against healthy recordings.
-RISE = "rise"
 
 
 def rival_rises(
