@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sealscope.diagnosis.commissioned.machine_file import load_machine
+from sealscope.diagnosis.commissioned.machine_file import read_machine
 from sealscope.diagnosis.learnt import Learnt
 from sealscope.diagnosis.verdict.machine import unstated
 from sealscope.diagnosis.verdict.severity import RepairLimit
@@ -49,7 +49,7 @@ def load_watched(rig: str) -> WatchedMachine:
     if not rig.endswith(".toml") or "machine" not in read_toml(Path(rig), "a rig file", rig):
         known = load_rig(rig)
         return WatchedMachine(known, known.channel_map)
-    machine = load_machine(rig)
+    machine = read_machine(rig)
     known = _with_measured_displacement(machine.rig or unstated(), machine.healthy)
     return WatchedMachine(known, machine.channel_map, machine.rate, _limit_lpm(machine.limit, known))
 

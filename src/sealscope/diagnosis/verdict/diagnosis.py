@@ -65,15 +65,17 @@ class Diagnosis(Evidence):
         When the recording began, as ISO 8601, where the file says so.
     unused : tuple of str
         Recorded pressures, positions and speeds that no channel is made of.
+    pressure_unit : str
+        Unit in which its texts state pressures: that of the log.
 
     Examples
     --------
     >>> import sealscope as ss
     >>> diagnosis = ss.diagnose(ss.simulate(leak="0.05 L/min from 30 s", duration="60 s", seed=1))
     >>> diagnosis
-    Diagnosis('leak', file='recording', onset_s=29.95, leak_lpm=0.05199, score=169.3, threshold=15.47)
+    Diagnosis('leak', file='recording', onset_s=29.95, leak_lpm=0.05077, score=169.3, threshold=15.47)
     >>> diagnosis.cause, f"{diagnosis.severity.creep_mm_per_min[0]:.0f} mm/min"
-    ('piston or pump leak', '82 mm/min')
+    ('piston or pump leak', '80 mm/min')
     >>> [evidence.detector for evidence in diagnosis.parts if evidence.abstains]
     ['rms change']
     >>> [round(end, 1) for end in diagnosis.as_dict()["onset_interval_s"]]
