@@ -35,7 +35,7 @@ class WatchedMachine:
     rate : float, optional
         Sampling rate [Hz] of logs without a time column.
     limit_lpm : float, optional
-        Leak from which it is to be repaired [L/min], None where it is not stated, or needs an area that is not.
+        Leak from which it is to be repaired [L/min], None where it needs an area that is not stated.
     """
 
     rig: Rig
@@ -76,8 +76,7 @@ def _with_measured_displacement(rig: Rig, healthy: tuple[Learnt, ...]) -> Rig:
 
 
 def _limit_lpm(text: str | None, rig: Rig) -> float | None:
-    if text is None:
-        return None
+    """Return the repair limit of a machine [L/min], the default one where none is stated; None without its area."""
     limit = RepairLimit.of(text)
     if limit.kind == "flow":
         return limit.value / LITRE_PER_MINUTE
