@@ -103,6 +103,8 @@ def test_from_logs_of_several_loggers_to_a_watched_machine(press, call, monkeypa
     written = page.read_text(encoding="utf-8")
     assert messages.how_much(diagnosis) in written
     assert f'class="verdict state-{leaking["state"]["symbol"]}"' in written
+    assert call("report", "suspect/press_2026-04-21_0600.csv", "--machine", "press.toml", "-o", "own.html").status == 0
+    assert "<title>press: leak" in Path("own.html").read_text(encoding="utf-8")
     assert call("report", "healthy", "suspect", "--machine", "press.toml", "-o", "press.html").status == 0
     history = Path("press.html").read_text(encoding="utf-8")
     assert messages.flow(diagnosis) in history and "<title>press:" in history
