@@ -76,9 +76,11 @@ def test_the_examples_are_true(name, tmp_path, monkeypatch):
 
 def test_the_stub_names_each_export_once_and_is_what_python_loads():
     tree = ast.parse(Path(ss.__file__).with_suffix(".pyi").read_text("utf-8"))
-    lines = [(node.module, alias) for node in tree.body if isinstance(node, ast.ImportFrom) for alias in node.names]
+    imports = [(node.module, alias) for node in tree.body if isinstance(node, ast.ImportFrom) for alias in node.names]
+    lines = [(module, alias) for module, alias in imports if alias.asname is not None]  # others serve the stub itself
     names = [alias.asname for _, alias in lines]
     assert len(set(names)) == len(names)
     assert {*names, "__version__"} == {*ss.__all__, "LeakDetector"}
     for module, alias in lines:
         assert getattr(ss, alias.name) is getattr(import_module(str(module)), str(alias.asname))
+    assert {node.name for node in tree.body if isinstance(node, ast.FunctionDef)} == set(ss._DEPRECATED)

@@ -1,7 +1,13 @@
 # What `import sealscope` exports, and from where: `__init__.py` loads each name from here when it is first used.
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from typing_extensions import deprecated
+
 from sealscope.diagnosis.commissioned.machine import CommissionedMachine as CommissionedMachine
 from sealscope.diagnosis.commissioned.machine import commission as commission
-from sealscope.diagnosis.commissioned.machine_file import load_machine as load_machine
+from sealscope.diagnosis.commissioned.machine_file import read_machine as read_machine
 from sealscope.diagnosis.commissioned.machine_file import write_machine as write_machine
 from sealscope.diagnosis.commissioned.scikit_learn import LeakDetector as LeakDetector
 from sealscope.diagnosis.diagnose import diagnose as diagnose
@@ -15,12 +21,13 @@ from sealscope.fmu.build import write_sensor_fmu as write_sensor_fmu
 from sealscope.fmu.recording import record_fmu as record_fmu
 from sealscope.parameters import Rig as Rig
 from sealscope.parameters import load_rig as load_rig
+from sealscope.parameters.load import rigs as rigs
 from sealscope.recordings import Recording as Recording
 from sealscope.recordings import inspect as inspect
 from sealscope.recordings import read as read
 from sealscope.recordings import read_parts as read_parts
 from sealscope.recordings import write as write
-from sealscope.reporting.page import write_page as write_page
+from sealscope.reporting.page import report as report
 from sealscope.signals.streams import DetailStream as DetailStream
 from sealscope.signals.windows import RmsStream as RmsStream
 from sealscope.simulation.batch.batch import simulate_batch as simulate_batch
@@ -30,3 +37,9 @@ from sealscope.simulation.simulate import simulate as simulate
 from sealscope.simulation.simulate import simulate_with_truth as simulate_with_truth
 
 __version__: str
+
+# Names of the release before, gone in the next one: `__init__.py` gives them with a DeprecationWarning.
+@deprecated("use read_machine")
+def load_machine(path: str | PathLike[str]) -> CommissionedMachine: ...
+@deprecated("use report(recording, path, diagnosis)")
+def write_page(path: str | PathLike[str], recording: Recording, diagnosis: Diagnosis, **options: Any) -> Path: ...

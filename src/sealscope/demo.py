@@ -10,7 +10,7 @@ from sealscope.diagnosis.commissioned.machine import CommissionedMachine, commis
 from sealscope.diagnosis.commissioned.machine_file import write_machine
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.recordings import read, write
-from sealscope.reporting.page import write_page
+from sealscope.reporting.page import report
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import Progress, Truth, simulate_experiment
 from sealscope.storage.folders import make_folder
@@ -58,9 +58,9 @@ def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> D
     judged = partial(_judged, machine, folder)
     healthy, diagnosis = judged("healthy.nc"), judged(file.name)
     update("writing the page", 0.5)
-    write_page(
-        page,
+    report(
         read(file),
+        page,
         diagnosis,
         rig=experiment.rig,
         truth_onset_s=result.truth.onset_s,

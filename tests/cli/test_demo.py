@@ -42,7 +42,7 @@ def test_the_recording_is_a_recording_that_does_not_know_the_truth(first, folder
     recording = sealscope.read(folder / "first" / "recording.nc")
     assert recording.duration == 60.0
     assert "leak" not in str(dict(recording.provenance)).lower()
-    result = sealscope.load_machine(folder / "first" / "machine.toml").diagnose(recording)
+    result = sealscope.read_machine(folder / "first" / "machine.toml").diagnose(recording)
     assert result.verdict == "leak"
     assert abs(result.onset_s - 30.0) <= 10.0
 

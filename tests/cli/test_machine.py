@@ -84,7 +84,7 @@ def test_a_link_is_written_through(call, healthy, tmp_path):
     ss.write(ss.simulate(command="3 sin(4t)", duration="15 s", seed=5), new)
     assert "4 healthy" in call("commission", new, "-o", link, "--add").out
     assert link.is_symlink()
-    assert len(ss.load_machine(file).healthy) == len(ss.load_machine(link).healthy) == 4
+    assert len(ss.read_machine(file).healthy) == len(ss.read_machine(link).healthy) == 4
     assert sorted(each.name for each in tmp_path.iterdir()) == ["link.toml", "new.nc", "there"]
     assert call("diagnose", new, "--machine", link).status == 0
     link.unlink()

@@ -237,10 +237,10 @@ def machines(folder: Path) -> Use:
     judged, taught = sealscope.simulate(duration="6 s", seed=4), (folder / "whole.lessons").read_bytes()
 
     def read() -> None:
-        machine = sealscope.load_machine(path)
+        machine = sealscope.read_machine(path)
         texts = [machine.diagnose(judged).reason, str(machine)]
         assert not any(_NAN.search(text) for text in texts), texts
-        again = sealscope.load_machine(sealscope.write_machine(machine, folder / "again.toml"))
+        again = sealscope.read_machine(sealscope.write_machine(machine, folder / "again.toml"))
         assert [own.digest for own in again.healthy] == [own.digest for own in machine.healthy]
 
     def use(draw: random.Random) -> bool:

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sealscope.recordings.gaps import remove_dropouts
 
 import sealscope as ss
 from sealscope.diagnosis.inspection import inspected
+from sealscope.recordings.corrections.gaps import remove_dropouts
 from sealscope.recordings.motion import find_holds
 from sealscope.recordings.recording import Recording
 

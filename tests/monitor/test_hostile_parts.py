@@ -143,13 +143,13 @@ def test_names_are_bytes(tmp_path: Path):
 def test_a_file_that_cannot_be_read_is_named_once_and_not_read_again(tmp_path: Path, monkeypatch, caplog):
     reads: list[str] = []
 
-    def read(path: Path, **_: object) -> object:
+    def read(path: Path, *_: object) -> object:
         reads.append(path.name)
         if path.name.startswith("b"):
             raise {"b1.csv": MemoryError(), "b2.csv": RuntimeError("the reader crashed")}[path.name]
         return HEALTHY
 
-    monkeypatch.setattr("sealscope.monitor.sources.folder.read", read)
+    monkeypatch.setattr("sealscope.monitor.sources.folder.read_of_machine", read)
     settings = settings_in(tmp_path, folder_settings(tmp_path, "press 3"))
     for name in ("b1.csv", "b2.csv", "c.csv"):
         (tmp_path / "press 3" / name).write_text(name)
@@ -174,11 +174,11 @@ def watched_folder(folder: Path, settle_s: float = 0.0) -> Callable[[], list[Sou
 def test_a_file_that_fails_is_read_twice_at_most(tmp_path: Path, monkeypatch):
     reads: list[Path] = []
 
-    def read(path: Path, **_: object) -> object:
+    def read(path: Path, *_: object) -> object:
         reads.append(path)
         raise MemoryError
 
-    monkeypatch.setattr("sealscope.monitor.sources.folder.read", read)
+    monkeypatch.setattr("sealscope.monitor.sources.folder.read_of_machine", read)
     (tmp_path / "a.csv").write_text("a")
     blocks = watched_folder(tmp_path, 0.05)
     deadline, handed = time.monotonic() + 2.0, []
@@ -445,6 +445,6 @@ def test_a_workbook_and_a_bomb_that_end_their_reader_are_named_once(tmp_path: Pa
     def read(*_: object, **__: object) -> None:
         raise AssertionError("it is read again")
 
-    monkeypatch.setattr("sealscope.monitor.sources.folder.read", read)
+    monkeypatch.setattr("sealscope.monitor.sources.folder.read_of_machine", read)
     again, _ = served(settings)
     assert again.actuators.counters == {} and len(blocks_of(again)) == 4

@@ -67,7 +67,7 @@ def test_the_samples_of_an_invalid_alarm_are_taught(tmp_path, commissioned):
     service = alarmed(tmp_path, commissioned[3.0e-13])
     service.actuators.mark(NAME, "invalid", text="another valve", by_whom="Ada")
     assert said_by(service.actuators) == "press.toml: taught as healthy"
-    before, after = (ss.load_machine(tmp_path / f"press.toml{end}") for end in (".bak", ""))
+    before, after = (ss.read_machine(tmp_path / f"press.toml{end}") for end in (".bak", ""))
     assert (len(before.healthy), len(after.healthy)) == (4, 5)
     (taught,) = [own for own in after.healthy if own.file == f"{NAME}-1"]
     assert WORN.t[0] + 100.0 < taught.start_s < WORN.t[-1]
@@ -79,7 +79,7 @@ def test_samples_that_leak_are_not_taught_whatever_is_said(tmp_path, commissione
     service = alarmed(tmp_path, commissioned[0.0], worn(1.0e-11))
     service.actuators.mark(NAME, "invalid", text="no oil seen")
     assert said_by(service.actuators).startswith("press.toml: not taught: a healthy recording must not leak")
-    assert len(ss.load_machine(tmp_path / "press.toml").healthy) == 4
+    assert len(ss.read_machine(tmp_path / "press.toml").healthy) == 4
 
 
 def test_nothing_is_taught_from_the_onset_of_a_valid_alarm_on_until_the_repair(tmp_path, commissioned):
@@ -87,7 +87,7 @@ def test_nothing_is_taught_from_the_onset_of_a_valid_alarm_on_until_the_repair(t
     service = alarmed(tmp_path, commissioned[3.0e-13])
     service.actuators.mark(NAME, "valid")
     assert said_by(service.actuators) == "press.toml: written down"
-    known = ss.load_machine(file)
+    known = ss.read_machine(file)
     (alarm,) = known.alarms
     assert alarm.onset_s == pytest.approx(WORN.t[0] + 100.0, abs=2.0)
     assert alarm.leak_lpm == pytest.approx(0.00195, rel=0.3)
@@ -102,7 +102,7 @@ def test_nothing_is_taught_from_the_onset_of_a_valid_alarm_on_until_the_repair(t
     with pytest.raises(InputError, match=r"must be of a time without a leak, got press 1-1 valid"):
         known.with_healthy(late)
     service.actuators.mark(NAME, "repaired")
-    again = ss.load_machine(file).with_healthy(late)
+    again = ss.read_machine(file).with_healthy(late)
     assert len(again.since(alarm.date_s).healthy) == 1
     with pytest.raises(InputError, match="without a leak"):
         again.with_healthy(healthy(alarm.onset_s + 3600.0, 21))
@@ -114,7 +114,7 @@ def test_the_last_word_on_an_alarm_counts(tmp_path, commissioned):
     service.actuators.mark(NAME, "valid")
     service.actuators.mark(NAME, "invalid", text="another valve")
     assert said_by(service.actuators) == "press.toml: taught as healthy"
-    known = ss.load_machine(tmp_path / "press.toml")
+    known = ss.read_machine(tmp_path / "press.toml")
     assert [own.mark for own in known.alarms] == ["valid", "invalid"]
     later = known.alarms[1].date_s + 120.0
     made = {"start": datetime.fromtimestamp(later, UTC).replace(tzinfo=None).isoformat()}
@@ -143,10 +143,10 @@ def test_without_samples_or_a_file_it_says_so(tmp_path, commissioned):
 def test_a_newline_in_the_name_of_an_alarm_makes_no_line(tmp_path, commissioned):
     service = alarmed(tmp_path, commissioned[3.0e-13])
     alarm = service.actuators._actuator(NAME).judge.alarm
-    lines = str(ss.load_machine(tmp_path / "press.toml")).splitlines()
+    lines = str(ss.read_machine(tmp_path / "press.toml")).splitlines()
     forged = replace(alarm, id="press\n  alarm         valve-1 valid", reason="a\nb\x1b[31m\u2028c")
     assert pass_on(str(tmp_path / "press.toml"), forged, "valid", []) == "press.toml: written down"
-    shown = str(ss.load_machine(tmp_path / "press.toml")).splitlines()
+    shown = str(ss.read_machine(tmp_path / "press.toml")).splitlines()
     assert len(shown) == len(lines) + 1
     assert all(line.isprintable() for line in shown)
 

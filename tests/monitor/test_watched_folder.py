@@ -77,7 +77,7 @@ def test_a_machine_of_areas_alone_is_watched_in_the_litres_of_a_diagnosis(commis
     path = log(tmp_path / "incoming/run_2026-04-01_0600.csv", worn)
     service, out = served(settings)
     (event,) = [json.loads(line) for line in out.splitlines()]
-    diagnosis = ss.load_machine(commissioned).diagnose(path)
+    diagnosis = ss.read_machine(commissioned).diagnose(path)
     low, high = diagnosis.leak_interval_lpm
     assert low <= event["alarm"]["leak_lpm"] <= high
     summary = service.plain()["press"]

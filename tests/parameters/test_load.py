@@ -184,7 +184,7 @@ HEAVY = {
 
 
 @pytest.mark.parametrize("kind", HEAVY)
-@pytest.mark.parametrize("load", [ss.load_rig, ss.load_machine])
+@pytest.mark.parametrize("load", [ss.load_rig, ss.read_machine])
 def test_a_hostile_file_takes_less_than_ten_times_its_size_in_memory(tmp_path: Path, kind: str, load) -> None:
     """The first error ends it, and what would become many objects is refused before it is parsed."""
     path = write(tmp_path, HEAVY[kind])
@@ -200,7 +200,7 @@ def test_a_hostile_file_takes_less_than_ten_times_its_size_in_memory(tmp_path: P
     assert len(str(caught.value)) < 500
 
 
-@pytest.mark.parametrize("load", [ss.load_rig, ss.load_machine])
+@pytest.mark.parametrize("load", [ss.load_rig, ss.read_machine])
 def test_rigs_and_machines_have_one_limit(tmp_path: Path, load) -> None:
     with pytest.raises(InputError, match="must be at most 1000000 bytes, got more"):
         load(write(tmp_path, "#" * 1_000_001))

@@ -17,7 +17,7 @@ from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.recordings.quality import Finding
 from sealscope.reporting.charts import Mark
-from sealscope.reporting.page import render_page, write_page
+from sealscope.reporting.page import render_page, report
 from sealscope.reporting.particulars import particulars_of
 from sealscope.reporting.schematic import circuit_of, schematic
 
@@ -271,7 +271,7 @@ def test_the_page_is_the_same_twice(recording, make_diagnosis):
 
 def test_a_page_is_written_whole_or_not_at_all(tmp_path, recording, make_diagnosis, monkeypatch):
     target = tmp_path / "page.html"
-    assert write_page(target, recording, make_diagnosis()) == target
+    assert report(recording, target, make_diagnosis()) == target
     assert target.read_text(encoding="utf-8") == render_page(recording, make_diagnosis())
     assert [entry.name for entry in tmp_path.iterdir()] == ["page.html"]
     before = target.read_bytes()
@@ -281,22 +281,22 @@ def test_a_page_is_written_whole_or_not_at_all(tmp_path, recording, make_diagnos
 
     monkeypatch.setattr("pathlib.Path.replace", full)
     with pytest.raises(InputError, match="No space left on device"):
-        write_page(target, recording, make_diagnosis(verdict="no leak"))
+        report(recording, target, make_diagnosis(verdict="no leak"))
     assert target.read_bytes() == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["page.html"]
 
 
 def test_a_folder_that_is_not_there_is_one_clear_line(tmp_path, recording, make_diagnosis):
     with pytest.raises(InputError, match=r"^the folder of a file to write must exist, got .*absent"):
-        write_page(tmp_path / "absent" / "page.html", recording, make_diagnosis())
+        report(recording, tmp_path / "absent" / "page.html", make_diagnosis())
 
 
 @pytest.mark.parametrize("name", ["page.svg", "page.html.gz", "page"])
 def test_a_page_is_a_page_and_nothing_else(tmp_path, recording, make_diagnosis, name):
     with pytest.raises(InputError, match=rf"^a page must be a file \.html, \.htm, \.pdf, \.png, got .*{name}$"):
-        write_page(tmp_path / name, recording, make_diagnosis())
+        report(recording, tmp_path / name, make_diagnosis())
     assert list(tmp_path.iterdir()) == []
-    assert write_page(tmp_path / "page.HTM", recording, make_diagnosis()).is_file()
+    assert report(recording, tmp_path / "page.HTM", make_diagnosis()).is_file()
 
 
 def test_a_mark_must_stand_at_a_time():

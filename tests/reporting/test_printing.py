@@ -18,7 +18,7 @@ import pytest
 from sealscope.diagnosis.verdict.evidence import LeakCourse
 from sealscope.errors import InputError, MissingExtra
 from sealscope.reporting import printing
-from sealscope.reporting.page import render_card, write_page
+from sealscope.reporting.page import render_card, report
 
 PAGE = "<!DOCTYPE html><title>t</title><h1>Leak</h1>"
 BROWSER = next(filter(None, map(shutil.which, printing.BROWSERS)), None)
@@ -36,16 +36,16 @@ def test_a_browser_prints(tmp_path: Path) -> None:
 @pytest.mark.skipif(BROWSER is None, reason="no browser of Chromium's family on this machine")
 def test_the_page_of_a_leak_fits_a_sheet(tmp_path: Path, recording, make_diagnosis) -> None:
     """What is not folded stands on a single sheet of A4, the schematic and the rig's values included."""
-    page = write_page(tmp_path / "page.pdf", recording, make_diagnosis(quality=()), rig="thesis-calibrated")
+    page = report(recording, tmp_path / "page.pdf", make_diagnosis(quality=()), rig="thesis-calibrated")
     assert len(re.findall(rb"/Type */Page\b", page.read_bytes())) == 1
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no browser of Chromium's family on this machine")
 def test_a_card_is_a_picture_of_its_stated_size(tmp_path: Path, recording, make_diagnosis) -> None:
-    leak = write_page(tmp_path / "leak.png", recording, make_diagnosis()).read_bytes()
+    leak = report(recording, tmp_path / "leak.png", make_diagnosis()).read_bytes()
     head = b"\x89PNG\r\n\x1a\n" + (13).to_bytes(4, "big") + b"IHDR"
     assert leak.startswith(head + (1200).to_bytes(4, "big") + (630).to_bytes(4, "big"))
-    other = write_page(tmp_path / "other.PNG", recording, make_diagnosis(verdict="no leak")).read_bytes()
+    other = report(recording, tmp_path / "other.PNG", make_diagnosis(verdict="no leak")).read_bytes()
     assert len(leak) > 5_000 and leak != other  # it shows the verdict
     assert sorted(path.name for path in tmp_path.iterdir()) == ["leak.png", "other.PNG"]
 
@@ -84,7 +84,7 @@ def test_weasyprint_gets_drawings_with_styles_of_their_own(tmp_path, monkeypatch
     monkeypatch.setattr("shutil.which", lambda name: None)
     monkeypatch.setitem(sys.modules, "weasyprint", SimpleNamespace(HTML=HTML))
     with pytest.raises(InputError, match="to its end"):
-        write_page(tmp_path / "page.pdf", recording, make_diagnosis())
+        report(recording, tmp_path / "page.pdf", make_diagnosis())
     (page,) = pages
     drawings = re.findall(r"<svg\b.*?</svg>", page, re.DOTALL)
     assert drawings
@@ -100,7 +100,7 @@ def test_weasyprint_prints_a_page_in_colour(tmp_path: Path, monkeypatch, recordi
     monkeypatch.setattr("shutil.which", lambda name: None)
     streams: list[bytes] = []
     for rig in (None, "thesis"):
-        page = write_page(tmp_path / "page.pdf", recording, make_diagnosis(), rig=rig)
+        page = report(recording, tmp_path / "page.pdf", make_diagnosis(), rig=rig)
         assert page.read_bytes().startswith(b"%PDF-")
         for stream in re.findall(rb"stream\r?\n(.*?)\r?\nendstream", page.read_bytes(), re.DOTALL):
             with contextlib.suppress(zlib.error):
@@ -112,7 +112,7 @@ def test_weasyprint_prints_a_page_in_colour(tmp_path: Path, monkeypatch, recordi
 def test_without_a_browser_no_card_is_drawn(tmp_path: Path, monkeypatch, recording, make_diagnosis) -> None:
     monkeypatch.setattr("shutil.which", lambda name: None)
     with pytest.raises(MissingExtra, match=r"^a picture needs Chromium, got none: install it, or write \.html .*\.png"):
-        write_page(tmp_path / "card.png", recording, make_diagnosis())
+        report(recording, tmp_path / "card.png", make_diagnosis())
     assert list(tmp_path.iterdir()) == []
 
 
@@ -182,12 +182,12 @@ def test_a_browser_on_a_full_disk(kind: str, tmp_path: Path, recording, make_dia
         resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
         try:
             with pytest.raises(InputError):
-                write_page(target, recording, make_diagnosis())
+                report(recording, target, make_diagnosis())
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)
         assert target.read_text() == "what was there before"
         assert [path.name for path in tmp_path.iterdir()] == [target.name]
-    write_page(target, recording, make_diagnosis())
+    report(recording, target, make_diagnosis())
     assert target.stat().st_size > 20_000
 
 

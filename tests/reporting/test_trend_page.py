@@ -13,7 +13,7 @@ from sealscope.diagnosis.trend.trend import Trend
 from sealscope.diagnosis.trend.trend import trend as trend_of
 from sealscope.errors import InputError
 from sealscope.reporting.trend.page import render_trend_page, trend_pictures, write_trend_page
-from sealscope.reporting.trend.text import trend_text
+from sealscope.reporting.trend.text import figures, healthy_end, trend_text
 
 from ..diagnosis.test_trend import life
 from .pages import Reader, places
@@ -91,3 +91,19 @@ def test_a_session_has_ticks_of_minutes(trend: Trend) -> None:
     assert pictures is not None
     times = [label.text for label in pictures["wide"].labels if ":" in label.text]
     assert len(times) >= 3
+
+
+def test_total_leak_and_limit_have_one_meaning_each() -> None:
+    """The leak is the rise over the healthy total; what is called healthy ends at the limit."""
+    days = life(40, wears=0.03, since=10.0)
+    result = trend_of(days, healthy=8, limit="0.01 mL/min")
+    assert result.verdict == "leak" and result.wear is not None and result.limit is not None
+    shown = figures(result)
+    rise = result.wear.now.value - result.wear.healthy.value
+    assert float(shown["leak"].split()[0]) == pytest.approx(rise, rel=0.2)
+    assert result.limit < result.wear.healthy.high
+    assert healthy_end(result.wear) == max(result.limit, result.wear.healthy.value)
+    page = render_trend_page(result)
+    assert "healthy recordings of this machine scatter as far" in page
+    assert ">Total<" in page and ">Now<" not in page
+    assert result.state.name in page and f"state-{result.state.symbol}" in page

@@ -152,14 +152,14 @@ class StatedMachine:
         from sealscope.recordings.formats.columns import check_call
 
         if machine is not None:
-            from sealscope.diagnosis.commissioned.machine_file import load_machine
+            from sealscope.diagnosis.commissioned.machine_file import read_machine
 
             beside = {"--baseline": baseline, "--map": maps, "--rate": rate, "--rig": rig}
             beside |= {"--area": area, "--displacement": displacement, "--limit": limit}
             for name, value in beside.items():
                 if value:
                     raise InputError(f"{name} must not stand beside --machine, whose file states it")
-            known = load_machine(machine)
+            known = read_machine(machine)
             return cls(known, rig=known.rig, limit=known.limit)
         own_rig = _assumed_rig(rig, area, displacement)
         stated = cls(None, channel_map_of(maps), rate, own_rig, limit, tuple(baseline or ()))

@@ -29,7 +29,7 @@ def plan(
     From the information of simulated leak-free recordings, by the test that diagnose judges with.
     """
     from sealscope.campaigns.smallest import PlannedDuty, plan_recording
-    from sealscope.diagnosis.commissioned.machine_file import load_machine
+    from sealscope.diagnosis.commissioned.machine_file import read_machine
     from sealscope.diagnosis.diagnose import check_probability
     from sealscope.units import parse_quantity
 
@@ -41,7 +41,7 @@ def plan(
         raise InputError(f"--find must be a flow > 0, got {find}")
     known = opt.rig_with(rig, overrides)
     if machine is not None:
-        commissioned = load_machine(machine)
+        commissioned = read_machine(machine)
         if overrides:
             raise InputError(f"--set must not stand beside --machine, whose file states the rig ({machine})")
         if commissioned.rig is None or not commissioned.rig.states("cylinder.M_eq"):

@@ -204,7 +204,7 @@ def report(
     """
     from sealscope.diagnosis.diagnose import check_probability
     from sealscope.reporting.index import write_index
-    from sealscope.reporting.page import write_page
+    from sealscope.reporting.page import report as write_report
     from sealscope.reporting.template import check_page
     from sealscope.storage.folders import make_folder
 
@@ -230,12 +230,15 @@ def report(
         make_folder(output)
     else:
         opt.check_folder(check_page(output))
-    results = 0
+    results, name = 0, None if stated.known is None else stated.known.name
     written: list[tuple[Path, Diagnosis]] = []
     for own in _diagnoses(files, stated, join, false_alarm):
         results += 1
         page = output if own is None or not several else output / f"{Path(own[1].file).stem}.html"
-        if own is not None and opt.attempt(page, partial(write_page, page, *own, rig=stated.rig)) is not None:
+        if own is None:
+            continue
+        write = partial(write_report, own[0], page, own[1], rig=stated.rig, title=name)
+        if opt.attempt(page, write) is not None:
             written.append((page, own[1]))
             opt.say(f"{own[1].file}: {own[1].verdict} -> {page}")
     if several and written:

@@ -28,6 +28,24 @@ def rig_names() -> tuple[str, ...]:
 
 
 @checked_call
+def rigs() -> tuple[str, ...]:
+    """Return the names of the packaged rigs, which `load_rig` loads.
+
+    Returns
+    -------
+    tuple of str
+        In alphabetical order.
+
+    Examples
+    --------
+    >>> import sealscope as ss
+    >>> "thesis" in ss.rigs()
+    True
+    """
+    return rig_names()
+
+
+@checked_call
 def load_rig(rig: Rig | str | os.PathLike[str] = "thesis") -> Rig:
     """Load the parameters of a rig.
 

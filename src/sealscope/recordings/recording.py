@@ -17,11 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.calls import checked_call
-from sealscope.errors import InputError, UnreadableFile
+from sealscope.errors import InputError, MissingExtra, UnreadableFile
 from sealscope.recordings.chambers import SHOWN_UNITS
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, LONG_NAMES, Array
 from sealscope.recordings.formats.columns import ChannelMap, Wanted, counted
 from sealscope.storage.opening import whole
+from sealscope.units import from_si
 
 if TYPE_CHECKING:
     import pandas
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 __all__ = ["CHANNEL_UNITS", "COUNTS", "Array", "Recording", "recording_of", "remembered"]
 
 _T = TypeVar("_T")
+#: Unit of a channel -> the one in which it is drawn where its log has none.
+_SHOWN = {"m": "mm", "rad/s": "rpm", "m^3/s": "L/min", "K": "degC"}
 
 
 def _frozen(values: Any) -> Array:
@@ -246,6 +249,48 @@ class Recording:
         from sealscope.recordings.frames import to_xarray
 
         return to_xarray(*self.series())
+
+    def plot(self, channels: Iterable[str] | None = None) -> NDArray[Any]:
+        """Draw channels over time, those of one unit in one picture, in the units of the log or of a workshop.
+
+        Parameters
+        ----------
+        channels : iterable of str, optional
+            Names of the channels; by default all.
+
+        Returns
+        -------
+        numpy.ndarray of matplotlib.axes.Axes
+            The axes (k,), one for each unit, above one another.
+
+        Raises
+        ------
+        InputError
+            The recording has no such channel, or none at all.
+        MissingExtra
+            matplotlib is not installed.
+        """
+        names = list(self.channels if channels is None else channels)
+        by_unit: dict[str, list[tuple[str, Array]]] = {}
+        for name in names:
+            values, unit = self[name], self.units[name]
+            shown = self.unit_in_log(name) or (self.pressure_unit if unit == "Pa" else _SHOWN.get(unit, unit))
+            values = values if shown == unit else from_si(values, shown, CHANNEL_UNITS.get(name, unit))
+            by_unit.setdefault(shown, []).append((name, values))
+        if not by_unit:
+            raise InputError("a recording must have channels to be drawn, got none")
+        try:
+            from matplotlib.figure import Figure
+        except ImportError:
+            raise MissingExtra("a drawing needs matplotlib: pip install 'sealscope[report]'") from None
+        axes = Figure(layout="constrained").subplots(len(by_unit), sharex=True, squeeze=False)[:, 0]
+        for picture, (unit, lines) in zip(axes, by_unit.items(), strict=True):
+            for name, values in lines:
+                picture.plot(self.t, values, label=name)
+            picture.set(ylabel=f"{', '.join(name for name, _ in lines)} [{unit}]")
+            picture.legend()
+        axes[-1].set(xlabel="t [s]")
+        return np.asarray(axes)
 
     @classmethod
     @checked_call

@@ -32,10 +32,10 @@ WIDTH, HEIGHT, _CURVE_HEIGHT = 1200, 630, 190
 
 
 @checked_call
-def write_page(
-    path: str | os.PathLike[str],
+def report(
     recording: Recording,
-    diagnosis: Diagnosis,
+    path: str | os.PathLike[str],
+    diagnosis: Diagnosis | None = None,
     *,
     rig: Rig | str | os.PathLike[str] | None = None,
     marks: Sequence[Mark] = (),
@@ -48,14 +48,14 @@ def write_page(
 
     Parameters
     ----------
+    recording : Recording
+        The recording that was judged.
     path : str or path-like
         The page, ending in .html, .htm or .pdf, or its card, ending in .png. It is complete under its name or not there
         at all. A PDF is printed by a browser of Chromium's family or by WeasyPrint, whichever is on the machine. The
         card is a picture of 1200 x 630 pixels with machine, date, verdict, L/min and its curve; a browser draws it.
-    recording : Recording
-        The recording that was judged.
-    diagnosis : Diagnosis
-        Its diagnosis.
+    diagnosis : Diagnosis, optional
+        Its diagnosis; by default that of `sealscope.diagnose` with the `rig`.
     rig : Rig, str or path-like, optional
         A Rig, the name of a packaged rig or the path of a TOML file; its values label the schematic.
     marks : sequence of Mark, optional
@@ -83,17 +83,26 @@ def write_page(
     --------
     >>> import sealscope as ss
     >>> recording = ss.simulate(duration="20 s")
-    >>> page = ss.write_page("report.html", recording, ss.diagnose(recording))
+    >>> page = ss.report(recording, "report.html", ss.diagnose(recording))
     >>> page.read_text(encoding="utf-8")[:15]
     '<!DOCTYPE html>'
     """
     target = template.check_page(path)
+    if diagnosis is None:
+        from sealscope.diagnosis.diagnose import diagnose
+
+        diagnosis = diagnose(recording, rig=rig)
     options: dict[str, Any] = {"rig": rig, "marks": marks, "truth_onset_s": truth_onset_s, "title": title}
     if target.suffix.lower() == ".png":
         printing.draw_page(render_card(recording, diagnosis, **options), target, WIDTH, HEIGHT)
         return target
     page = render_page(recording, diagnosis, truth_leak_lpm=truth_leak_lpm, pressure_unit=pressure_unit, **options)
     return template.write(target, page)
+
+
+def write_page(path: str | os.PathLike[str], recording: Recording, diagnosis: Diagnosis, **options: Any) -> Path:
+    """Write the page of a diagnosis as `report` does; deprecated, as is its order of arguments."""
+    return report(recording, path, diagnosis, **options)
 
 
 def _rig_of(diagnosis: Diagnosis, rig: Rig | str | os.PathLike[str] | None) -> Rig | None:
@@ -124,7 +133,7 @@ def render_card(
     truth_onset_s: float | None = None,
     title: str | None = None,
 ) -> str:
-    """Return the card as HTML of `WIDTH` x `HEIGHT` pixels; arguments as for `write_page`."""
+    """Return the card as HTML of `WIDTH` x `HEIGHT` pixels; arguments as for `report`."""
     shown = charts.course_charts(diagnosis, height=_CURVE_HEIGHT)
     all_marks = _all_marks(recording, marks, truth_onset_s)
     particulars = particulars_of(recording, _rig_of(diagnosis, rig))
@@ -156,7 +165,7 @@ def render_page(
     title: str | None = None,
     pressure_unit: str | None = None,
 ) -> str:
-    """Return the page as a string of HTML; arguments and errors as for `write_page`."""
+    """Return the page as a string of HTML; arguments and errors as for `report`."""
     from markupsafe import Markup
 
     pressure_unit = pressure_unit or recording.pressure_unit

@@ -29,7 +29,7 @@ def pair(file: Path, tmp_path: Path) -> tuple[Path, Path]:
 
 def refused(path: Path) -> str:
     with pytest.raises(InputError) as caught:
-        ss.load_machine(path)
+        ss.read_machine(path)
     message = str(caught.value)
     assert "\n" not in message
     return message
@@ -89,7 +89,7 @@ def test_without_its_damaged_lesson_the_machine_is_what_the_others_taught(pair):
     assert "run2.nc" in refused(text)
     parts = text.read_text().split("[[healthy]]")
     text.write_text("[[healthy]]".join(part for part in parts if "run2.nc" not in part))
-    assert [learnt.file for learnt in ss.load_machine(text).healthy] == ["run1.nc", "run3.nc", "run4.nc"]
+    assert [learnt.file for learnt in ss.read_machine(text).healthy] == ["run1.nc", "run3.nc", "run4.nc"]
 
 
 def test_a_lesson_that_is_not_there_is_named(pair):
@@ -107,10 +107,10 @@ def test_lessons_that_were_left_behind_are_asked_for(pair):
 def test_a_pair_is_renamed_or_its_text_alone(pair, tmp_path):
     text, lessons = pair
     alone = text.rename(tmp_path / "press.toml")
-    assert len(ss.load_machine(alone).healthy) == 4
+    assert len(ss.read_machine(alone).healthy) == 4
     lessons.rename(tmp_path / "press.lessons")
-    assert len(ss.load_machine(alone).healthy) == 4
-    ss.write_machine(ss.load_machine(alone), alone)
+    assert len(ss.read_machine(alone).healthy) == 4
+    ss.write_machine(ss.read_machine(alone), alone)
     assert 'lessons = "press.lessons"' in alone.read_text()
 
 
@@ -148,7 +148,7 @@ def test_each_text_keeps_its_lessons_whichever_file_was_written_last(pair, machi
             patch.setattr(lessons_file, "atomic_write", stop)
             patch.setattr(machine_file, "atomic_write", stop)
             ss.write_machine(later, text)
-        texts = (ss.load_machine(path) for path in (text, text.with_suffix(".toml.bak")))
+        texts = (ss.read_machine(path) for path in (text, text.with_suffix(".toml.bak")))
         return [(known.name, len(known.healthy)) for known in texts]
 
     assert [written(count) for count in range(3)] == [
@@ -157,8 +157,8 @@ def test_each_text_keeps_its_lessons_whichever_file_was_written_last(pair, machi
         [("first", 4), ("first", 4)],
     ]
     ss.write_machine(later, text)
-    assert len(ss.load_machine(text).healthy) == 3
-    assert len(ss.load_machine(text.with_suffix(".toml.bak")).healthy) == 4
+    assert len(ss.read_machine(text).healthy) == 3
+    assert len(ss.read_machine(text.with_suffix(".toml.bak")).healthy) == 4
 
 
 def test_lessons_that_no_text_names_are_kept_for_its_copies_while_they_are_few(pair, machine, monkeypatch):
@@ -167,7 +167,7 @@ def test_lessons_that_no_text_names_are_kept_for_its_copies_while_they_are_few(p
     copy.write_bytes(text.read_bytes())
     for _ in range(3):
         ss.write_machine(replace(machine, healthy=machine.healthy[:1]), text)
-    assert len(ss.load_machine(copy).healthy) == 4
+    assert len(ss.read_machine(copy).healthy) == 4
     monkeypatch.setattr(
         "sealscope.diagnosis.commissioned.machine_file._SPARE", 2 * len(format_lesson(machine.healthy[0]).data)
     )
@@ -254,7 +254,7 @@ def test_a_file_of_lessons_takes_less_than_ten_times_its_size_in_memory(pair):
     assert parse_lesson(line, "run1.nc", "place").digest
     tracemalloc.start()
     try:
-        assert len(ss.load_machine(text).healthy) == 2000
+        assert len(ss.read_machine(text).healthy) == 2000
         assert tracemalloc.get_traced_memory()[1] < 10 * (text.stat().st_size + lessons.stat().st_size)
     finally:
         tracemalloc.stop()
@@ -281,4 +281,4 @@ def test_what_could_not_be_read_again_is_not_learnt(folder, tmp_path, monkeypatc
     monkeypatch.setattr(RmsChange, "learn", lambda *words: {**learn(*words), "levels": np.full(10, -np.inf)})
     machine = ss.commission(folder / "run1.nc", rig="thesis")
     assert "rms change" not in machine.healthy[0].lessons
-    assert len(ss.load_machine(ss.write_machine(machine, tmp_path / "m.toml")).healthy) == 1
+    assert len(ss.read_machine(ss.write_machine(machine, tmp_path / "m.toml")).healthy) == 1

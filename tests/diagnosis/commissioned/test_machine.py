@@ -36,10 +36,10 @@ def figures(diagnosis: ss.Diagnosis) -> tuple:
 def test_the_file_judges_as_the_recordings_do(healthy, file, by_pressures, leak, channels, seed):
     """All methods, with every digit, whichever channels the judged recording has."""
     recording = ss.simulate(command="3 sin(4t)", duration="20 s", leak=leak, seed=seed)
-    machine = ss.load_machine(file)
+    machine = ss.read_machine(file)
     if channels is not None:
         recording, healthy = recording.only(channels), [own.only(channels) for own in healthy]
-        machine = ss.load_machine(by_pressures)
+        machine = ss.read_machine(by_pressures)
     by_file, by_recordings = machine.diagnose(recording), ss.diagnose(recording, healthy, rig="thesis")
     assert figures(by_file) == figures(by_recordings)
     assert [figures_of(part) for part in by_file.parts] == [figures_of(part) for part in by_recordings.parts]
@@ -121,10 +121,10 @@ def test_what_was_left_out_is_known_whenever_the_file_is_written(folder, tmp_pat
     machine = ss.commission(tmp_path / "runs", rig="thesis")
     assert "torn.csv" in machine.left_out[0]
     path = ss.write_machine(machine, tmp_path / "machine.toml")
-    again = ss.load_machine(path)
+    again = ss.read_machine(path)
     assert (again.left_out, again.summary.problems) == (machine.left_out, machine.summary.problems)
     ss.write_machine(again, path)
-    assert ss.load_machine(path).summary.problems == machine.summary.problems
+    assert ss.read_machine(path).summary.problems == machine.summary.problems
 
 
 def test_a_recording_in_which_a_found_leak_begins_or_is_repaired_is_not_taught(machine):
@@ -147,7 +147,7 @@ def test_a_file_whose_name_is_no_text_is_kept_by_its_escaped_name(folder, tmp_pa
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs" / "a\udcff.nc").write_bytes((folder / "run1.nc").read_bytes())
     path = ss.write_machine(ss.commission(tmp_path / "runs", rig="thesis"), tmp_path / "machine.toml")
-    assert [own.file for own in ss.load_machine(path).healthy] == ["a\\udcff.nc"]
+    assert [own.file for own in ss.read_machine(path).healthy] == ["a\\udcff.nc"]
 
 
 def test_a_machine_without_recordings_says_so():
@@ -163,7 +163,7 @@ def test_the_map_of_raw_counts_goes_with_the_machine(folder, tmp_path):
     columns = {"t": "time s", "p_A": "ch2*0.0625-0.625 bar", "p_B": "p_rod_bar", "u": "volts V"}
     machine = ss.commission(log, rig="thesis", map=columns)
     ss.write_machine(machine, tmp_path / "counts.toml")
-    again = ss.load_machine(tmp_path / "counts.toml").read(log)
+    again = ss.read_machine(tmp_path / "counts.toml").read(log)
     np.testing.assert_allclose(again["p_A"], recording["p_A"], rtol=1e-9, atol=1.0)
 
 
@@ -188,7 +188,7 @@ def test_a_file_is_whole_whenever_its_writer_is_killed(machine, folder, tmp_path
         writer.kill()
         writer.join()
         for file in (path, path.with_suffix(".toml.bak")):
-            left = ss.load_machine(file)
+            left = ss.read_machine(file)
             assert (left.name, len(left.healthy)) in known
     assert any(tmp_path.glob(".*.part"))  # it was killed while it wrote, too
     remove_temporaries(tmp_path)
@@ -216,7 +216,7 @@ def test_a_hostile_file_is_refused_in_one_line(file, tmp_path, part):
     path = tmp_path / "hostile.toml"
     path.write_text(text.replace(part, wrong, 1))
     with pytest.raises(InputError) as caught:
-        ss.load_machine(path)
+        ss.read_machine(path)
     assert rule in str(caught.value)
     assert "\n" not in str(caught.value)
     assert "hostile.toml" in str(caught.value)
@@ -225,7 +225,7 @@ def test_a_hostile_file_is_refused_in_one_line(file, tmp_path, part):
 def test_a_machine_s_file_is_a_rig_s(file, machine):
     rig = ss.load_rig(file)
     assert rig == machine.rig
-    assert ss.load_machine(file).rig == machine.rig
+    assert ss.read_machine(file).rig == machine.rig
 
 
 def test_another_actuator_is_named_and_is_no_leak(machine):
@@ -250,11 +250,11 @@ def test_what_would_not_be_read_again_is_not_written(machine, tmp_path):
     marks = tuple(JudgedAlarm(f"press-{k}", "repaired", 1.7e9 + k, 1.7e9 + k) for k in range(9000))
     with pytest.raises(InputError, match="must be at most 1000000 bytes, got more"):
         ss.write_machine(replace(machine, alarms=marks), path)
-    assert ss.load_machine(path).alarms == ()
+    assert ss.read_machine(path).alarms == ()
     ss.write_machine(replace(machine, alarms=marks[:7000]), path)
     tracemalloc.start()
     try:
-        assert len(ss.load_machine(path).alarms) == 7000
+        assert len(ss.read_machine(path).alarms) == 7000
         assert ss.load_rig(path) == machine.rig
         assert tracemalloc.get_traced_memory()[1] < 10 * path.stat().st_size
     finally:

@@ -75,7 +75,7 @@ def attack(pair: dict[str, bytes], folder: Path, rounds: int) -> None:
         for (pipe, _), task in zip(pipes, tasks, strict=True):
             pipe.send(task)
         assert [pipe.recv() for pipe, _ in pipes] == ["", "", ""]
-        machine = ss.load_machine(path)
+        machine = ss.read_machine(path)
         assert {learnt.file for learnt in machine.healthy} == {"run1.nc", "run2.nc", "run10.nc", "run11.nc"}
         assert [alarm.alarm for alarm in machine.alarms] == [f"press-{number}"]
     for pipe, process in pipes:
@@ -99,7 +99,7 @@ def test_nothing_is_lost_in_500_rounds(pair, tmp_path):
 
 def test_what_another_wrote_since_is_not_undone(pair, tmp_path):
     path = place(pair, tmp_path)
-    machine = ss.load_machine(path)
+    machine = ss.read_machine(path)
     mark(path, 1)
     before = path.read_bytes()
     with pytest.raises(InputError, match="must be as it was read, got another mark of press-1: load it again"):
@@ -109,7 +109,7 @@ def test_what_another_wrote_since_is_not_undone(pair, tmp_path):
 
 def test_a_recording_that_was_taken_out_since_does_not_come_back(pair, tmp_path):
     path = place(pair, tmp_path)
-    machine = ss.load_machine(path)
+    machine = ss.read_machine(path)
     update_machine(path, lambda known: replace(known, healthy=known.healthy[1:]))
     with pytest.raises(InputError, match=r"got another recording, run1\.nc"):
         ss.write_machine(machine, path)
@@ -117,7 +117,7 @@ def test_a_recording_that_was_taken_out_since_does_not_come_back(pair, tmp_path)
 
 def test_an_edited_text_is_not_undone(pair, tmp_path):
     path = place(pair, tmp_path)
-    machine = ss.load_machine(path)
+    machine = ss.read_machine(path)
     path.write_text(path.read_text().replace('name = "machine"', 'name = "press 7"'))
     with pytest.raises(InputError, match="got another statement of the machine"):
         ss.write_machine(machine, path)
@@ -126,13 +126,13 @@ def test_an_edited_text_is_not_undone(pair, tmp_path):
 def test_a_machine_may_be_written_again_and_again(pair, tmp_path):
     """Its own changes are no other's; a machine that was never read replaces what is there."""
     path = place(pair, tmp_path)
-    machine = ss.load_machine(path)
+    machine = ss.read_machine(path)
     alarms = [JudgedAlarm(f"press-{k}", "valid", 1.7e9, 1.69e9) for k in range(3)]
     for count in range(1, 4):
         ss.write_machine(replace(machine, alarms=tuple(alarms[:count])), path)
-    assert len(ss.load_machine(path).alarms) == 3
+    assert len(ss.read_machine(path).alarms) == 3
     ss.write_machine(replace(machine, origin=None), path)
-    assert ss.load_machine(path).alarms == ()
+    assert ss.read_machine(path).alarms == ()
 
 
 def test_a_writer_that_does_not_end_is_waited_for_a_while(pair, tmp_path, monkeypatch):
@@ -142,7 +142,7 @@ def test_a_writer_that_does_not_end_is_waited_for_a_while(pair, tmp_path, monkey
     path = place(pair, tmp_path)
     monkeypatch.setattr(machine_file, "_LONGEST_WAIT", 0.05)
     with locked(tmp_path / ".press.toml.lock", "busy"), pytest.raises(InputError, match="another process that writes"):
-        ss.write_machine(ss.load_machine(path), path)
+        ss.write_machine(ss.read_machine(path), path)
 
 
 def test_a_change_that_fails_leaves_the_file(pair, tmp_path):

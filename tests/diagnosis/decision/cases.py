@@ -10,7 +10,7 @@ import numpy as np
 from sealscope.diagnosis.inference.observable import Flow, Observable
 from sealscope.diagnosis.inference.onset import Information, Interval, StepTest, step_test
 from sealscope.diagnosis.inference.scatter import Rise
-from sealscope.diagnosis.verdict.evidence import TotalLeakage
+from sealscope.diagnosis.verdict.evidence import Cause, TotalLeakage
 
 #: Flow of the pump, and of a step of one [m^3/s]; L/min of 1 m^3/s.
 PUMP_FLOW, DRIVING, LITRES = 1e-4, 1e-7, 6e4
@@ -41,7 +41,7 @@ class MeasuredLeak:
     excess: float | None = None
     bound: float = 2e-7
     provider: str = "volume balance"
-    separates_pump: bool = False
+    cause: Cause = "piston or pump leak"
     share_after: float = 0.5
     litres: float | None = LITRES
     size_deviation: float = 0.0

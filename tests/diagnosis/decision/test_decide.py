@@ -182,6 +182,7 @@ NAMES = {
     "inference/blocks.py",
     "inference/scatter.py",
     "inference/terms.py",
+    "live/watch.py",
 }
 #: Files that make evidence: the decision, what chooses among several, and what still decides by itself.
 MAKERS = {"decision/decide.py", "decision/combination.py"}

@@ -132,7 +132,7 @@ def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) ->
     >>> with TemporaryDirectory() as folder:
     ...     ss.write(ss.simulate(duration="20 s"), Path(folder, "healthy.nc"))
     ...     path = ss.write_machine(ss.commission(folder), Path(folder, "machine.toml"))
-    ...     ss.load_machine(path)
+    ...     ss.read_machine(path)
     <CommissionedMachine machine: 1 healthy recording>
     """
     target = _resolve(path)
@@ -151,14 +151,14 @@ def update_machine(
     """Read, change and write a machine's file, so that nothing which another process writes meanwhile is lost.
 
     `change` is called once, and once more where the file has changed meanwhile; nobody waits for the first call. Raises
-    InputError as `load_machine`, `write_machine` and `change` do; then the file stays as it was.
+    InputError as `read_machine`, `write_machine` and `change` do; then the file stays as it was.
     """
     target = _resolve(path)
-    machine = load_machine(target)
+    machine = read_machine(target)
     changed = change(machine)
     with locked(_lock_of(target), _BUSY.format(target), _LONGEST_WAIT):
         if machine.origin != Origin(target, frozenset(_parts(_read(target)))):
-            changed = change(load_machine(target))
+            changed = change(read_machine(target))
         _write(changed, target)
     return changed
 
@@ -357,8 +357,8 @@ def _value(value: Any) -> str:
 
 
 @checked_call
-def load_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
-    """Load a machine's file.
+def read_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
+    """Read a machine's file.
 
     Parameters
     ----------
@@ -378,7 +378,7 @@ def load_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
     Examples
     --------
     >>> import sealscope as ss
-    >>> ss.load_machine("absent.toml")
+    >>> ss.read_machine("absent.toml")
     Traceback (most recent call last):
     sealscope.errors.InputError: a machine's file must be readable, got: No such file or directory (absent.toml)
     """

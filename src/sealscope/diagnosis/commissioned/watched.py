@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sealscope.diagnosis.commissioned.machine_file import load_machine
+from sealscope.diagnosis.commissioned.machine_file import read_machine
 from sealscope.diagnosis.learnt import Learnt
 from sealscope.diagnosis.verdict.machine import unstated
 from sealscope.diagnosis.verdict.severity import RepairLimit
@@ -35,7 +35,7 @@ class WatchedMachine:
     rate : float, optional
         Sampling rate [Hz] of logs without a time column.
     limit_lpm : float, optional
-        Leak from which it is to be repaired [L/min], None where it is not stated, or needs an area that is not.
+        Leak from which it is to be repaired [L/min], None where it needs an area that is not stated.
     """
 
     rig: Rig
@@ -49,7 +49,7 @@ def load_watched(rig: str) -> WatchedMachine:
     if not rig.endswith(".toml") or "machine" not in read_toml(Path(rig), "a rig file", rig):
         known = load_rig(rig)
         return WatchedMachine(known, known.channel_map)
-    machine = load_machine(rig)
+    machine = read_machine(rig)
     known = _with_measured_displacement(machine.rig or unstated(), machine.healthy)
     return WatchedMachine(known, machine.channel_map, machine.rate, _limit_lpm(machine.limit, known))
 
@@ -76,8 +76,7 @@ def _with_measured_displacement(rig: Rig, healthy: tuple[Learnt, ...]) -> Rig:
 
 
 def _limit_lpm(text: str | None, rig: Rig) -> float | None:
-    if text is None:
-        return None
+    """Return the repair limit of a machine [L/min], the default one where none is stated; None without its area."""
     limit = RepairLimit.of(text)
     if limit.kind == "flow":
         return limit.value / LITRE_PER_MINUTE

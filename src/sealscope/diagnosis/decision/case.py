@@ -12,7 +12,6 @@ import numpy as np
 from sealscope.diagnosis.decision.events import load_events
 from sealscope.diagnosis.decision.explanations import (
     LEAK_EVENTS,
-    RISE,
     Explanation,
     LeakRise,
     explain,
@@ -20,12 +19,13 @@ from sealscope.diagnosis.decision.explanations import (
 )
 from sealscope.diagnosis.decision.null import HealthyNull, key_of
 from sealscope.diagnosis.inference.observable import LeakMeasure, Observable, Observed
+from sealscope.diagnosis.inference.scatter import RISE
 from sealscope.diagnosis.priors import priors
-from sealscope.diagnosis.verdict.evidence import Cause
+from sealscope.diagnosis.verdict.evidence import AGAINST, WITHIN, Cause
 
 _PRIORS = priors("decision")
-#: The questions: did a leak begin here, is there more than in healthy recordings, or than the rig's file allows?
-WITHIN, AGAINST, LEVEL = "within the recording", "against the baseline", "against the rig's file"
+#: The question beside WITHIN and AGAINST: is there more than the rig's file allows?
+LEVEL = "against the rig's file"
 
 
 class Question(NamedTuple):
@@ -157,7 +157,7 @@ def step_key(provider: str) -> str:
 
 
 def _change_questions(case: Case) -> tuple[Question, ...]:
-    """Return the one question of a provider that measures no leak: did what a leak moves change as it does?"""
+    """Return the question of a provider that measures no leak: whether what a leak moves changed as it does."""
     leak = next(event for event in load_events() if event.name == LEAK_EVENTS[0])
     moved = [own for own in case.judge.observables if leak.does_move(own)]
     rarest = min(moved, key=lambda own: own.chance, default=None)

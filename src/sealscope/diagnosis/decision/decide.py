@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.diagnosis.decision.case import WITHIN, Case, DecisionContext, Question, step_key
+from sealscope.diagnosis.decision.case import Case, DecisionContext, Question, step_key
 from sealscope.diagnosis.decision.explanations import probability_of
 from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.decision.reasons import reason_of
@@ -22,7 +22,7 @@ from sealscope.diagnosis.decision.verdicts import bound_worth_stating, decide_ve
 from sealscope.diagnosis.inference.observable import Flow, LeakMeasure, Observed
 from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.priors import priors
-from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, LEAK, NO_LEAK, RAREST, Cause, Evidence
+from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, LEAK, NO_LEAK, RAREST, WITHIN, Cause, Evidence
 
 _PRIORS = priors("decision")
 
@@ -87,7 +87,7 @@ def _leak_evidence(case: Case, alarm: Question) -> Evidence:
     else:
         pump = probability_of(case.explanations, "pump leak")
         tells_pump = any(own.name == "pump leak" for own in case.observables) and pump < RAREST
-        cause = "piston leak" if leak.separates_pump or tells_pump else "piston or pump leak"
+        cause = "piston leak" if tells_pump and leak.cause == "piston or pump leak" else leak.cause
         onset = leak.step.onset() if alarm.name == WITHIN and leak.step is not None else None
         flow = leak.step_flow if alarm.name == WITHIN else leak.rise_flow
     evidence = Evidence(LEAK, "", cause=cause)

@@ -24,6 +24,7 @@ def reason_of(case: Case, evidence: Evidence, alarm: Question | None, bound: flo
             "event",
             words=other.words,
             onset=_onset_text(other.observable),
+            shown=_shown_text(other),
             sure=100.0 * other.probability,
             rarity=_rarity_text(other.chance),
         )
@@ -111,6 +112,12 @@ def _rivals_text(case: Case, alarm: Question) -> str:
 
 def _onset_text(observable: Observable) -> str:
     return "" if observable.onset is None else text_of("doubt", "onset", seconds=observable.onset.value)
+
+
+def _shown_text(other: OtherEvent) -> str:
+    """Return what shows an event, where its words do not."""
+    name = other.observable.name
+    return "" if name in other.words else text_of("doubt", "shown", name=name)
 
 
 def _rarity_text(chance: float) -> str:

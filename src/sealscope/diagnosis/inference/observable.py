@@ -14,7 +14,7 @@ import numpy as np
 
 from sealscope.diagnosis.inference.onset import Interval, StepTest
 from sealscope.diagnosis.inference.scatter import Rise
-from sealscope.diagnosis.verdict.evidence import LeakCourse, RelativeLeak, TotalLeakage
+from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak, TotalLeakage
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,8 +92,8 @@ class LeakMeasure(Protocol):
         """Name of the detector."""
 
     @property
-    def separates_pump(self) -> bool:
-        """Whether the channels separate the piston's leak from the pump's."""
+    def cause(self) -> Cause:
+        """What a leak is as far as the channels tell."""
 
     @property
     def step(self) -> StepTest | None:

@@ -66,7 +66,7 @@ class Diagnosis(Evidence):
     unused : tuple of str
         Recorded pressures, positions, speeds and flows that no channel is made of.
     pressure_unit : str
-        Unit in which pressures are shown: that of the log, else bar.
+        Unit in which its texts state pressures: that of the log, else bar.
 
     Examples
     --------

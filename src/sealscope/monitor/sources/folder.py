@@ -18,7 +18,13 @@ from sealscope.diagnosis.commissioned.machine import read_of_machine
 from sealscope.diagnosis.commissioned.watched import load_watched
 from sealscope.errors import SealscopeError
 from sealscope.monitor.settings import ActuatorSettings
-from sealscope.monitor.sources.source_block import UNREADABLE_FILE, BlockReceiver, RefusedMessage, SourceBlock
+from sealscope.monitor.sources.source_block import (
+    UNREADABLE_FILE,
+    BlockReceiver,
+    RefusedMessage,
+    SourceBlock,
+    bytes_of,
+)
 from sealscope.monitor.supervisor import DATABASE, PartAway, place_of
 from sealscope.recordings import Recording
 from sealscope.recordings.corrections.samples import correct_samples, without_holes
@@ -35,6 +41,8 @@ _LOOK_S = 0.5
 _PATIENCE = 6.0
 #: A file that is dated so much later than now [s] is dated in the future.
 _AHEAD_S = 60.0
+#: Files that are read to be put in order are kept up to so many bytes.
+_AHEAD_BYTES = 64_000_000
 #: How far recordings of a day without times of day are placed apart [s].
 _APART_S = 1.0
 
@@ -61,6 +69,7 @@ class WatchedFolder:
         self._newest_s = self._end_s = newest_s
         self._met: dict[str, float] = {}  # clock at which a file was met [s]
         self._starts: dict[str, float] = {}  # when the first sample of a file was taken [s since 1970]
+        self._ahead: dict[str, tuple[Recording | None, str]] = {}  # what files hold that are handed over next
         self._handed, self._tried, self._outside = set[str](), set[str](), set[str]()
 
     def blocks(self) -> Iterator[SourceBlock | RefusedMessage]:
@@ -74,12 +83,13 @@ class WatchedFolder:
         self._met = {identity: self._met.get(identity, time.monotonic()) for _, _, identity in files}
         self._handed &= self._met.keys()
         self._tried &= self._met.keys()
+        self._ahead.clear()
         self._starts = {identity: start for identity, start in self._starts.items() if identity in self._met}
         whole = [own for own in files if own[2] not in self._handed and self._is_whole(*own)]
         if len(whole) > 1:  # one that was copied last may have been recorded first
             whole.sort(key=lambda own: self._start_of(*own))
         for written, path, identity in whole:
-            samples, reason = self._read(path)
+            samples, reason = self._ahead.pop(identity) if identity in self._ahead else self._read(path)
             if reason and self._is_patient(written, identity):
                 self._tried.add(identity)
                 continue
@@ -110,7 +120,12 @@ class WatchedFolder:
     def _start_of(self, written: float, path: Path, identity: str) -> float:
         """Return when the first sample of a file was taken [s since 1970]; of one that cannot be read its change."""
         if identity not in self._starts:
-            samples, _ = self._read(path)
+            samples, reason = self._read(path)
+            kept = sum(bytes_of(own) for own, _ in self._ahead.values() if own is not None)
+            if samples is None or kept + bytes_of(samples) < _AHEAD_BYTES:  # others are read once more
+                self._ahead[identity] = samples, reason
+            if reason:
+                return written
             self._starts[identity] = written if samples is None else file_seconds(samples, path)
         return self._starts[identity]
 

@@ -64,13 +64,13 @@ def volume_observables(
     about, recorded = (own.merged(priors("inference")["blocks"]["coarse"]) for own in (blocks, plain))
     first = columns[0]
     orifice = first.names.index(ORIFICE)
-    tests: list[tuple[str, tuple[float, ...], Information, Array | None]] = []
+    tests: list[tuple[str, Sequence[float], Information, Array | None]] = []
     for index, term in enumerate(balances[0].terms):
         if not _is_tested(term, index, first, bool(lost)):
             continue
         coarse = about if term.name in (LEAK, PUMP) else recorded
-        signs = (1.0,) if term.cause in _ONE_WAY and term.name != BIAS else (1.0, -1.0)
-        tests.append((_name_of(term), signs, information(coarse, columns, index), None))
+        both: Sequence[float] = (1.0,) if term.cause in _ONE_WAY and term.name != BIAS else (1.0, -1.0)
+        tests.append((_name_of(term), both, information(coarse, columns, index), None))
     leak = information(about, columns, first.leak)
     shapes = law_shapes(about, columns).items()
     tests += [(f"{LEAK} of exponent {exponent:g}", (1.0,), leak, shape) for exponent, shape in shapes if exponent < 1.0]

@@ -12,7 +12,7 @@ from sealscope.diagnosis.inference.observable import Flow, Remark
 from sealscope.diagnosis.inference.onset import WITHIN_95, Interval, StepTest, course
 from sealscope.diagnosis.inference.pressures.evidence import PRIORS, PressureEvidence, flow_scale
 from sealscope.diagnosis.inference.scatter import Rise, student
-from sealscope.diagnosis.verdict.evidence import LeakCourse, RelativeLeak, TotalLeakage
+from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak, TotalLeakage
 from sealscope.units import LITRE_PER_MINUTE
 
 
@@ -33,8 +33,8 @@ class ResponseLeak:
     reading: PressureEvidence
     levels: Sequence[float] = ()
 
-    #: The conductance of the response is that across the piston.
-    separates_pump: bool = True
+    #: Without a position what leaves the circuit shows alike.
+    cause: Cause = "leak inside or outside"
     ratio: Interval | None = None
     remarks: Sequence[Remark] = ()
     excess: float | None = None

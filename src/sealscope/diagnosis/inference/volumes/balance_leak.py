@@ -13,7 +13,7 @@ from sealscope.diagnosis.inference.onset import BELOW_95, WITHIN_95, Interval, S
 from sealscope.diagnosis.inference.scatter import RecordingSums, Rise, rise
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.priors import priors
-from sealscope.diagnosis.verdict.evidence import LeakCourse, RelativeLeak, TotalLeakage
+from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak, TotalLeakage
 from sealscope.diagnosis.verdict.machine import healthy_leakage
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -36,9 +36,9 @@ class BalanceLeak:
     healthy: Sequence[RecordingSums] = ()
 
     @property
-    def separates_pump(self) -> bool:
-        """Whether the channels separate the piston's leak from the pump's."""
-        return len(self.balance.columns) > 1
+    def cause(self) -> Cause:
+        """What a leak is as far as the channels tell: the pressures at the pump separate its leak from the piston's."""
+        return "piston leak" if len(self.balance.columns) > 1 else "piston or pump leak"
 
     @property
     def step(self) -> StepTest | None:
