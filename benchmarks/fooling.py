@@ -401,7 +401,7 @@ def judge(file: Path, machines_of: dict[bool, list[Machine]], first: int, keys: 
             if (line := by_digest.get(own)) is None:
                 diagnosis = ss.diagnose(record, baseline)
                 line = {"verdict": diagnosis.verdict, "cause": diagnosis.cause, "digest": own}
-                line |= {"by": diagnosis.detectors.detector, "reason": diagnosis.reason}
+                line |= {"by": diagnosis.detector, "reason": diagnosis.reason}
                 by_digest[own] = line
             line = line | {"row": name, "view": view, "leaking": leaking, "machine": number}
             print(json.dumps(line), file=out, flush=True)

@@ -124,7 +124,7 @@ def test_no_leak_passes_a_share_of_the_pumps_flow() -> None:
     own = 2.4e-13 * result.total_leakage.pressure / pump
     assert result.total_leakage.pump_share == pytest.approx(own, rel=0.2)
     text = " ".join(short_text(result).split())
-    assert "% of the pump's flow at 0.11 MPa; the smallest step that would have been found" in text
+    assert "% of the pump's flow at 1.1 bar; the smallest step that would have been found" in text
     assert "L/min" not in text
 
 

@@ -57,7 +57,7 @@ WAY = np.sign(np.cos(4.0 * T))
 STEPS: dict[str, tuple[dict[str, np.ndarray], str | None]] = {
     "nothing": ({}, None),
     "friction": ({"p_A": 5e3 * WAY * LATE, "p_B": -5e3 * WAY * LATE}, "friction change"),
-    "zero of p_A": ({"p_A": 5e3 * LATE}, "sensor fault"),
+    "zero of p_A": ({"p_A": 5.5e3 * LATE}, "sensor fault"),
     "scale of p_B": ({"p_B": 0.03 * (5e5 - 1e5 * WAY) * LATE}, "sensor fault"),
     "load": ({"p_A": 6e3 * LATE, "p_B": -6e3 * LATE}, "changed duty"),
     "oil is lost": ({"p_A": -6e3 * LATE, "p_B": -6e3 * LATE}, "external leak"),

@@ -226,9 +226,9 @@ def test_a_pressure_that_rests_with_the_machine_is_not_stuck() -> None:
 def test_a_folder_is_watched_by_the_samples_that_a_recording_is_judged_by(polled_leak: Recording) -> None:
     """A poll of 10 to 20 ms ended in a gap every few seconds and a rate that changed."""
     from sealscope.diagnosis.live.watch import watch
-    from sealscope.monitor.sources.folder import _on_the_clock
+    from sealscope.recordings.corrections.samples import correct_samples, without_holes
 
-    samples = _on_the_clock(polled_leak, 1.7e9)
+    samples = without_holes(correct_samples(polled_leak).recording)
     part = inspected(polled_leak).part
     assert len(samples) == len(part)
     known = np.isfinite(samples["p_A"])

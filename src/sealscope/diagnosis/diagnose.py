@@ -89,7 +89,7 @@ class Examination:
     @cached_property
     def null(self) -> HealthyNull:
         """What the healthy recordings show of every observable."""
-        leak = self.report(ORDER[0]).leak
+        leak = self.report(ORDER[0]).leak if ORDER[0] in detectors() else None
         return null_of(self.baseline, self.rig, shut=isinstance(leak, BalanceLeak) and leak.balance.shut)
 
     def evidence(self, name: str) -> Evidence:

@@ -168,9 +168,7 @@ def test_lessons_that_no_text_names_are_kept_for_its_copies_while_they_are_few(p
     for _ in range(3):
         ss.write_machine(replace(machine, healthy=machine.healthy[:1]), text)
     assert len(ss.read_machine(copy).healthy) == 4
-    monkeypatch.setattr(
-        "sealscope.diagnosis.commissioned.machine_file._SPARE", 2 * len(format_lesson(machine.healthy[0]).data)
-    )
+    monkeypatch.setattr("sealscope.diagnosis.commissioned.machine_file._SPARE", 0)
     ss.write_machine(replace(machine, healthy=machine.healthy[:1]), text)
     assert len(lessons.read_bytes().splitlines()) == 2
 
@@ -268,7 +266,7 @@ def test_a_main_method_that_cannot_run_is_never_no_leak(machine, monkeypatch):
     def fail(*_: object) -> None:
         raise np.linalg.LinAlgError("Singular matrix")
 
-    monkeypatch.setattr("sealscope.diagnosis.inference.volumes.detector.judge", fail)
+    monkeypatch.setattr("sealscope.diagnosis.inference.volumes.detector.VolumeBalance.observe", fail)
     diagnosis = machine.diagnose(judged)
     assert diagnosis.verdict == "cannot tell"
     assert "volume balance cannot be computed on this recording: singular matrix" in diagnosis.reason

@@ -133,7 +133,7 @@ def explained_by(data: str, name: str) -> object:
 def test_a_leak_within_and_one_against_healthy_recordings_are_one() -> None:
     """A rise as large as the step makes is the same leak; none at all speaks against a step of that size."""
     rises = [Rise(value, 1.0, 30.0) for value in (6.0, 0.0)]
-    rival = observable("volumes: zero of p_A", LEAK.chance)
+    rival = observable("volumes: zero of the flow", LEAK.chance)
     with_rise, without = (
         probability_of(explain([LEAK, rival], rise=LeakRise(rise, 6.0)), *LEAK_EVENTS, data="volumes") for rise in rises
     )

@@ -57,6 +57,8 @@ def _bound_text(case: Case, evidence: Evidence, bound: float) -> str:
     """Return the bound in words, and what would make it closer."""
     leak, ringing = case.leak, case.judge.ringing
     if leak is None:
+        if case.alarms and ringing is not None:
+            return _changed_ringing_text(case, ringing)
         return _ringing_text(evidence, ringing, case.judge.provider)
     average = text_of("bound", "average") if leak.rise is not None else ""
     limit, pump = text_of("bound", "any"), leak.pump_flow[0]
@@ -82,6 +84,15 @@ def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) ->
         key, values = ("unused", {"names": listed(ringing.unused, 4)}) if ringing.unused else ("slow", {"fast": fast})
         text = f"{text_of('bound', key, rate=ringing.rate, **values)}; {text}"
     return text if ringing.healthy else text + text_of("bound", "start")
+
+
+def _changed_ringing_text(case: Case, ringing: Ringing) -> str:
+    """Return how the ringing changed, and how probable a leak is that changed it."""
+    shown = min(case.judge.observables, key=lambda own: own.chance)
+    percent = 100.0 * abs(np.expm1(shown.size))
+    where = _onset_text(shown) or _against_text(ringing)
+    leak = 100.0 * case.leak_probability(case.alarms[0])
+    return text_of("bound", "ringing_changed", what=shown.name, percent=percent, where=where, leak=leak)
 
 
 def _against_text(ringing: Ringing | None) -> str:

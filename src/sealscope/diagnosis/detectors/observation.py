@@ -98,7 +98,9 @@ def _rarities(recording: Recording, rig: Rig | str | os.PathLike[str]) -> Mappin
             failure(balance.name, None, error)
     for shut, report in reports.items():
         rarities |= {f"{SHUT if shut else ''}{key}": rarity for key, rarity in _rarities_in([report]).items()}
-    return rarities if reports else rarities | _rarities_in([run_detector(response, recording, (), rig)])
+    if reports or response not in detectors():
+        return rarities
+    return rarities | _rarities_in([run_detector(response, recording, (), rig)])
 
 
 def _rarities_in(reports: Sequence[Observed]) -> dict[str, float]:
