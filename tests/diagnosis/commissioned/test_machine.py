@@ -228,6 +228,17 @@ def test_a_machine_s_file_is_a_rig_s(file, machine):
     assert ss.read_machine(file).rig == machine.rig
 
 
+def test_a_duty_that_no_healthy_recording_had_is_named(machine):
+    """Its interval is wider, and the reason says of what."""
+    usual, faster = (
+        machine.diagnose(ss.simulate(command=command, duration="20 s", seed=70))
+        for command in ("3 sin(4t)", "5 sin(4t)")
+    )
+    assert "healthy recordings" not in usual.reason
+    assert "the motion is 1.7 times as fast as in the healthy recordings" in faster.reason
+    assert faster.bound_lpm > 2.0 * usual.bound_lpm
+
+
 def test_another_actuator_is_named_and_is_no_leak(machine):
     """A piston 15 % larger: not the machine of the file; the same machine is not suspected."""
     runs = {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from sealscope.diagnosis.inference.observable import Flow, Remark
 from sealscope.diagnosis.inference.onset import BELOW_95, WITHIN_95, Interval, StepTest
-from sealscope.diagnosis.inference.scatter import RecordingSums, Rise, rise
+from sealscope.diagnosis.inference.scatter import RecordingSums, Rise, conditions_beyond, rise
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak, TotalLeakage
@@ -186,7 +186,7 @@ class BalanceLeak:
 
     @property
     def remarks(self) -> Sequence[Remark]:
-        """What the balance says of sizes, zeros and delays."""
+        """What the balance says of sizes, zeros, delays and conditions."""
         balance = self.balance
         size, zero, remarks = balance.size, balance.zero, list[Remark]()
         if size.ratio is not None and size.disagrees:
@@ -195,7 +195,19 @@ class BalanceLeak:
             remarks.append(Remark("zero too high" if zero > 0.0 else "zero too low", {"bar": abs(zero) / 1e5}))
         if (late := balance.delay) is not None and abs(late[0]) > 1.0 / balance.recording.rate + WITHIN_95 * late[1]:
             remarks.append(Remark("x late" if late[0] > 0.0 else "x early", {"ms": 1e3 * abs(late[0])}))
-        return remarks
+        return [*remarks, *self._conditions()]
+
+    def _conditions(self) -> Iterator[Remark]:
+        """Yield the conditions that no healthy recording had."""
+        bar = 1e5
+        for own in conditions_beyond(self.balance.recording_sums, self.healthy):
+            if own.name == "load":
+                values = {"value": own.value / bar, "low": own.low / bar, "high": own.high / bar}
+            elif own.name == "speed":
+                values = {"ratio": own.value / (own.high if own.value > own.high else own.low)}
+            else:
+                values = {"value": own.value, "low": own.low, "high": own.high}
+            yield Remark(f"{own.name} beyond", values)
 
 
 def _quotient(interval: tuple[float, float], unit: float | None) -> tuple[float, float] | None:
