@@ -199,15 +199,14 @@ class BalanceLeak:
 
     def _conditions(self) -> Iterator[Remark]:
         """Yield the conditions that no healthy recording had."""
-        bar = 1e5
-        for own in conditions_beyond(self.balance.recording_sums, self.healthy):
-            if own.name == "load":
-                values = {"value": own.value / bar, "low": own.low / bar, "high": own.high / bar}
-            elif own.name == "speed":
-                values = {"ratio": own.value / (own.high if own.value > own.high else own.low)}
+        for condition in conditions_beyond(self.balance.recording_sums, self.healthy):
+            value, low, high = condition.value, condition.low, condition.high
+            if condition.name == "load":
+                yield Remark("load beyond", {"value": value / 1e5, "low": low / 1e5, "high": high / 1e5})
+            elif condition.name == "speed":
+                yield Remark("speed beyond", {"ratio": value / (high if value > high else low)})
             else:
-                values = {"value": own.value, "low": own.low, "high": own.high}
-            yield Remark(f"{own.name} beyond", values)
+                yield Remark("oil beyond", {"value": value, "low": low, "high": high})
 
 
 def _quotient(interval: tuple[float, float], unit: float | None) -> tuple[float, float] | None:
