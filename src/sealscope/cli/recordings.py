@@ -166,8 +166,8 @@ def _diagnoses(
 
 def _dated(files: Sequence[Path], **options: Any) -> Iterator[Dated | None]:
     """Yield when each recording began [s since 1970] and its diagnosis; None and `options` as of `_diagnoses`."""
-    for own in _diagnoses(files, **options):
-        yield None if own is None else (_began(own), own[1])
+    for result in _diagnoses(files, **options):
+        yield None if result is None else (_began(result), result[1])
 
 
 def _began(own: Judged) -> float | None:
@@ -232,15 +232,15 @@ def report(
         opt.check_folder(check_page(output))
     results, name = 0, None if stated.known is None else stated.known.name
     written: list[tuple[Path, Diagnosis]] = []
-    for own in _diagnoses(files, stated, join, false_alarm):
+    for result in _diagnoses(files, stated, join, false_alarm):
         results += 1
-        page = output if own is None or not several else output / f"{Path(own[1].file).stem}.html"
-        if own is None:
+        page = output if result is None or not several else output / f"{Path(result[1].file).stem}.html"
+        if result is None:
             continue
-        write = partial(write_report, own[0], page, own[1], rig=stated.rig, title=name)
+        write = partial(write_report, result[0], page, result[1], rig=stated.rig, title=name)
         if opt.attempt(page, write) is not None:
-            written.append((page, own[1]))
-            opt.say(f"{own[1].file}: {own[1].verdict} -> {page}")
+            written.append((page, result[1]))
+            opt.say(f"{result[1].file}: {result[1].verdict} -> {page}")
     if several and written:
         write_index(output / "index.html", written)
     if len(written) < results:
@@ -260,7 +260,9 @@ def _report_machine(files: Sequence[Path], machine: opt.StatedMachine, output: P
         raise InputError(f"a page must not replace a recording, got {output}")
     results = list(_diagnoses(paths, machine, False, false_alarm))
     judged = [
-        Judged(own[1], _began(own), partial(machine.read, Path(own[1].file))) for own in results if own is not None
+        Judged(result[1], _began(result), partial(machine.read, Path(result[1].file)))
+        for result in results
+        if result is not None
     ]
     if not judged:
         raise UnreadableFile("no recording could be read, so there is no page")

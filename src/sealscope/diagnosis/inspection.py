@@ -72,9 +72,13 @@ def _inspection(recording: Recording, names: Sequence[str]) -> Inspection:
     chambers = chambers_of(recording)
     part, found, stuck, share = correct_samples(recording)
     findings += found
-    wrong = [own for own in findings if own.channel in chambers and own.code == "constant"]
-    wrong += [own for own in findings if own.channel in stuck and own.code == "stuck"]
-    lost = [own for own in findings if own.channel in chambers and own.code == "clipped" and own.count > len(part) / 2]
+    wrong = [finding for finding in findings if finding.channel in chambers and finding.code == "constant"]
+    wrong += [finding for finding in findings if finding.channel in stuck and finding.code == "stuck"]
+    lost = [
+        finding
+        for finding in findings
+        if finding.channel in chambers and finding.code == "clipped" and finding.count > len(part) / 2
+    ]
     wrong += lost if len(lost) == len(chambers) else []  # else the other one says what it says
     distrust = f"the pressures cannot be trusted: {wrong[0].text}" if wrong else None
     if distrust is None and len(part) >= SHORTEST and (reason := no_readings(part)):

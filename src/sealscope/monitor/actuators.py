@@ -159,7 +159,7 @@ class WatchedActuators:
     """The actuators of a monitor, restored from its database, which keeps estimates of `keep_days` of operation."""
 
     def __init__(self, settings: list[ActuatorSettings], store: MonitorStore, keep_days: float = 90.0) -> None:
-        self.store, self.settings = store, {each.name: each for each in settings}
+        self.store, self.settings = store, {setting.name: setting for setting in settings}
         self._heard = dict.fromkeys(self.settings, time.monotonic())  # when the last block of each came [s]
         self._keep_s = keep_days * 86_400.0
         self._counters, self._counting = Counter[str](), threading.Lock()

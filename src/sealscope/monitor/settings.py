@@ -182,10 +182,10 @@ class MonitorSettings(_Part):
     @model_validator(mode="after")
     def _fits_together(self) -> MonitorSettings:
         actuators, mqtt, page = self.actuator, self.mqtt, self.page
-        topics = [each.topic for each in actuators if each.topic is not None]
-        paths = [each.sparkplug for each in actuators if each.sparkplug is not None]
+        topics = [actuator.topic for actuator in actuators if actuator.topic is not None]
+        paths = [actuator.sparkplug for actuator in actuators if actuator.sparkplug is not None]
         for values, rule in (
-            ([each.name for each in actuators], "actuators must have names of their own"),
+            ([actuator.name for actuator in actuators], "actuators must have names of their own"),
             (topics, "each actuator must have a topic of its own without wildcards"),
             (paths, "each actuator must have a Sparkplug node or device of its own"),
         ):
@@ -204,7 +204,7 @@ class MonitorSettings(_Part):
             if each.nodes and not any(each.nodes.keys() >= {*way} for way in ways):
                 raise ValueError(f"nodes of {each.name!r} must give {in_words(ways)}, got {', '.join(each.nodes)}")
         sends = self.sparkplug is not None or (mqtt is not None and mqtt.alarms_topic is not None)
-        if sends and len({topic_part(each.name) for each in actuators}) < len(actuators):
+        if sends and len({topic_part(actuator.name) for actuator in actuators}) < len(actuators):
             raise ValueError("actuators must have names that differ in more than the letters + # / as topics")
         own = None if self.sparkplug is None else [self.sparkplug.group, self.sparkplug.node]
         if any(path.split("/")[:2] == own for path in paths):

@@ -187,11 +187,11 @@ class CommissionedMachine:
 
     def _leak_in(self, start_s: float, end_s: float) -> JudgedAlarm | None:
         """Return the alarm of a leak that a person found, and that was not repaired, in a time [s since 1970]."""
-        repairs = [own.date_s for own in self.alarms if own.mark == "repaired"]
+        repairs = [alarm.date_s for alarm in self.alarms if alarm.mark == "repaired"]
         words = enumerate(self.alarms, 1)
         found = (own for k, own in words if own.mark != "invalid" and not _is_taken_back(own, self.alarms[k:]))
         leaks = (own for own in found if own.onset_s <= end_s)
-        return next((own for own in leaks if not any(own.onset_s <= at <= start_s for at in repairs)), None)
+        return next((leak for leak in leaks if not any(leak.onset_s <= repair <= start_s for repair in repairs)), None)
 
     def since(self, start_s: float) -> CommissionedMachine:
         """Return the machine without the recordings of before a repair, `start_s` [s since 1970].
@@ -201,14 +201,14 @@ class CommissionedMachine:
         left = tuple(own for own in self.healthy if own.start_s is not None and own.start_s >= start_s)
         if not left:
             raise InputError(f"a machine must keep a healthy recording, got none of {_date(start_s)} or later")
-        alarms = tuple(own for own in self.alarms if own.onset_s >= start_s)
+        alarms = tuple(alarm for alarm in self.alarms if alarm.onset_s >= start_s)
         return replace(self, healthy=left, alarms=alarms)
 
     def __repr__(self) -> str:
         return f"<CommissionedMachine {self.name}: {counted(len(self.healthy), 'healthy recording')}>"
 
     def __str__(self) -> str:
-        alarms = [f"  {'alarm':<14}{own}" for own in self.alarms]
+        alarms = [f"  {'alarm':<14}{alarm}" for alarm in self.alarms]
         return "\n".join([self.summary.text(self.healthy, self.rig), *alarms])
 
 

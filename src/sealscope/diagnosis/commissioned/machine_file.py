@@ -308,9 +308,9 @@ def _tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
     tree["learnt"] = {"problems": summary.problems, "noise": summary.noise, **smallest, "terms": terms}
     tree["healthy"] = [{"file": learnt.file, "lesson": format_lesson(learnt).checksum} for learnt in machine.healthy]
     tree["alarms"] = [
-        {"alarm": own.alarm, "mark": own.mark, "date": _stamp(own.date_s), "onset": _stamp(own.onset_s)}
-        | {"leak_lpm": own.leak_lpm or None, "reason": own.reason or None}
-        for own in machine.alarms
+        {"alarm": alarm.alarm, "mark": alarm.mark, "date": _stamp(alarm.date_s), "onset": _stamp(alarm.onset_s)}
+        | {"leak_lpm": alarm.leak_lpm or None, "reason": alarm.reason or None}
+        for alarm in machine.alarms
     ]
     return tree
 

@@ -65,7 +65,7 @@ class LeakDetector(OutlierMixin, BaseEstimator):  # type: ignore[misc]
 
     def score_samples(self, X: Paths) -> Array:
         """Return the negative score of each file: the lower, the more it leaks; nan where it cannot be judged."""
-        return -np.array([own.score for own in self._diagnoses(X)], dtype=float)
+        return -np.array([diagnosis.score for diagnosis in self._diagnoses(X)], dtype=float)
 
     def decision_function(self, X: Paths) -> Array:
         """Return threshold less score of each file: < 0 for a leak, nan where it cannot be judged."""
@@ -76,7 +76,7 @@ class LeakDetector(OutlierMixin, BaseEstimator):  # type: ignore[misc]
     def predict(self, X: Paths) -> NDArray[np.int64]:
         """Return -1 for each file with a leak, 1 for one without, 0 where it cannot be told."""
         labels = {LEAK: -1, NO_LEAK: 1, CANNOT_TELL: 0}
-        return np.array([labels[own.verdict] for own in self._diagnoses(X)], dtype=np.int64)
+        return np.array([labels[diagnosis.verdict] for diagnosis in self._diagnoses(X)], dtype=np.int64)
 
     def _diagnoses(self, X: Paths) -> list[Diagnosis]:
         check_is_fitted(self)

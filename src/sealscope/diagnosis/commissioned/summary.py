@@ -71,7 +71,7 @@ class Summary:
         """Return it in some ten lines."""
         units = healthy[0].units if healthy else {}
         starts = [own.start_s for own in healthy if own.start_s is not None]
-        dates = sorted(datetime.fromtimestamp(at, UTC).date().isoformat() for at in starts)
+        dates = sorted(datetime.fromtimestamp(start, UTC).date().isoformat() for start in starts)
         span = f", {' to '.join(dict.fromkeys((dates[0], dates[-1])))}" if dates else ""
         noise = []
         for name, value in self.noise.items():
@@ -145,7 +145,7 @@ def about_recording(recording: Recording, inspection: Inspection) -> dict[str, A
         about["oil_degC"] = _rounded(oil)
     about["noise"] = {name: noise for name in part.channels if (noise := _noise(part[name])) > 0.0}
     about["wrong"] = [
-        *(own.text for own in inspection.findings if own.severity != "note"),
+        *(finding.text for finding in inspection.findings if finding.severity != "note"),
         *(text for name in ("p_A", "p_B") if name in part and (text := _below_vacuum(part, name))),
         *(text for name in ("omega", "u") if name in part and (text := _glitches(part, name))),
     ]
@@ -216,8 +216,8 @@ def _collected(healthy: Sequence[Learnt]) -> list[str]:
         for text in own.about.get("wrong", ()):
             kinds.setdefault(text.partition(":")[0], []).append((text, own.file))
     return [
-        f"{max(own)[0]} ({own[0][1] if len(own) == 1 else f'in {len(own)} of {len(healthy)}'})"
-        for own in kinds.values()
+        f"{max(kind)[0]} ({kind[0][1] if len(kind) == 1 else f'in {len(kind)} of {len(healthy)}'})"
+        for kind in kinds.values()
     ]
 
 

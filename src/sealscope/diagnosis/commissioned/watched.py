@@ -67,7 +67,7 @@ def _with_measured_displacement(rig: Rig, healthy: tuple[Learnt, ...]) -> Rig:
     if rig.states(_DISPLACEMENT) or not rig.states(*_AREAS):
         return rig
     lessons = (own.lessons.get(_BALANCE) for own in healthy)
-    scales = [float(own["scale"]) for own in lessons if isinstance(own, Mapping) and "scale" in own]
+    scales = [float(lesson["scale"]) for lesson in lessons if isinstance(lesson, Mapping) and "scale" in lesson]
     measured = [scale for scale in scales if np.isfinite(scale) and scale > 0.0]
     if not measured:
         return rig

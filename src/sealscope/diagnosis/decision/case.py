@@ -159,7 +159,7 @@ def step_key(provider: str) -> str:
 def _change_questions(case: Case) -> tuple[Question, ...]:
     """Return the question of a provider that measures no leak: whether what a leak moves changed as it does."""
     leak = next(event for event in load_events() if event.name == LEAK_EVENTS[0])
-    moved = [own for own in case.judge.observables if leak.does_move(own)]
+    moved = [observable for observable in case.judge.observables if leak.does_move(observable)]
     rarest = min(moved, key=lambda own: own.chance, default=None)
     if rarest is None:
         return ()

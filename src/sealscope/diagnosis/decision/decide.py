@@ -46,7 +46,9 @@ def decide(judge: Observed, reports: Sequence[Observed], null: HealthyNull, cont
     """
     if judge.lack:
         return Evidence(CANNOT_TELL, judge.lack, detector=judge.provider, usable=False)
-    others = [own for own in reports if own is not judge and context.is_weighed and _describes_else(own, judge)]
+    others = [
+        report for report in reports if report is not judge and context.is_weighed and _describes_else(report, judge)
+    ]
     observables = [*judge.observables, *(observable for own in others for observable in own.observables)]
     case = Case(judge, observables, null, context)
     least: float = _PRIORS["explanation"]["leak"]
@@ -86,7 +88,7 @@ def _leak_evidence(case: Case, alarm: Question) -> Evidence:
         onset, flow = shown.onset, None
     else:
         pump = probability_of(case.explanations, "pump leak")
-        tells_pump = any(own.name == "pump leak" for own in case.observables) and pump < RAREST
+        tells_pump = any(observable.name == "pump leak" for observable in case.observables) and pump < RAREST
         cause = "piston leak" if tells_pump and leak.cause == "piston or pump leak" else leak.cause
         onset = leak.step.onset() if alarm.name == WITHIN and leak.step is not None else None
         flow = leak.step_flow if alarm.name == WITHIN else leak.rise_flow
@@ -143,7 +145,7 @@ def _bound_and_worth(case: Case, bound: float) -> tuple[float, float]:
 
 def _findable(case: Case) -> float | None:
     """Return the smallest step within the recording that would have been found [m^3/s]."""
-    within = next((own for own in case.questions if own.name == WITHIN), None)
+    within = next((question for question in case.questions if question.name == WITHIN), None)
     if within is None or case.leak is None or case.leak.step is None:
         return None
     law = case.null.law_chance(step_key(case.leak.provider), within.probability)
@@ -160,14 +162,14 @@ def _with_questions(case: Case, evidence: Evidence, judging: Question | None) ->
         return evidence
     parts = tuple(
         Evidence(
-            LEAK if evidence.verdict == LEAK and own is judging else NO_LEAK,
-            own.name,
-            own.score,
-            own.threshold,
-            detector=own.name,
-            chance=max(own.chance, RAREST),
+            LEAK if evidence.verdict == LEAK and question is judging else NO_LEAK,
+            question.name,
+            question.score,
+            question.threshold,
+            detector=question.name,
+            chance=max(question.chance, RAREST),
         )
-        for own in case.questions
+        for question in case.questions
     )
     return replace(
         evidence,

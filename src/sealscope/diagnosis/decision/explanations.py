@@ -160,7 +160,7 @@ def probability_of(
 
     `data`: given that something happened that moves this kind of data; the chance under the null says whether it did.
     """
-    asked = [own for own in explanations if data is None or data in own.data]
+    asked = [explanation for explanation in explanations if data is None or data in explanation.data]
     total = sum(own.probability for own in asked)
     held = sum(
         own.probability

@@ -105,14 +105,18 @@ def _against_text(ringing: Ringing | None) -> str:
 def _rivals_text(case: Case, alarm: Question) -> str:
     """Return which explanation competes with a leak, and the recording that would separate them."""
     leak = case.leak_probability(alarm)
-    best = next((own for own in case.explanations if not own.has(*LEAK_EVENTS)), None)
+    best = next((explanation for explanation in case.explanations if not explanation.has(*LEAK_EVENTS)), None)
     if best is None:
         return ""
     event = best.events[0]
     if event.cause is None:
         onset = None if case.leak is None or case.leak.step is None else case.leak.step.onset()
         return "" if onset is None else text_of("doubt", "regime", seconds=onset.value)
-    shown = max((own for own in case.observables if event.does_move(own)), key=lambda own: own.score, default=None)
+    shown = max(
+        (observable for observable in case.observables if event.does_move(observable)),
+        key=lambda own: own.score,
+        default=None,
+    )
     separates = text_of("separates", event.cause if has_text("separates", event.cause) else "default")
     onset_text = "" if shown is None else _onset_text(shown)
     share = 100.0 * (1.0 - leak)
@@ -138,4 +142,4 @@ def _rarity_text(chance: float) -> str:
 
 def _remarks(case: Case) -> str:
     leak = case.leak
-    return "" if leak is None else "".join(text_of("remark", own.key, **own.values) for own in leak.remarks)
+    return "" if leak is None else "".join(text_of("remark", remark.key, **remark.values) for remark in leak.remarks)

@@ -163,7 +163,7 @@ class Weighting:
 
     def __init__(self, columns: Sequence[Columns]) -> None:
         self._columns = columns
-        self._known = [np.zeros((len(of.support) + 1, len(of.support) + 1)) for of in columns]
+        self._known = [np.zeros((len(column.support) + 1, len(column.support) + 1)) for column in columns]
         self._count = 0
 
     @property

@@ -359,9 +359,9 @@ class Population:
 
 def sessions_of(starts: Sequence[float | None], pause: float) -> list[int]:
     """Return the session of each recording: a number of its own after every gap [s] longer than `pause`."""
-    dates = sorted(own for own in starts if own is not None)
+    dates = sorted(start for start in starts if start is not None)
     begins = [date for before, date in zip([-np.inf, *dates], dates, strict=False) if date - before > pause]
-    return [-1 if own is None else int(np.searchsorted(begins, own, "right")) for own in starts]
+    return [-1 if start is None else int(np.searchsorted(begins, start, "right")) for start in starts]
 
 
 def _oil_shifts(recordings: Sequence[RecordingSums]) -> tuple[Array, float]:
@@ -369,7 +369,7 @@ def _oil_shifts(recordings: Sequence[RecordingSums]) -> tuple[Array, float]:
 
     Where a temperature is missing none counts, and levels of sessions deviate in their logarithms by the latter.
     """
-    known = [own.oil_degC for own in recordings if own.oil_degC is not None]
+    known = [recording.oil_degC for recording in recordings if recording.oil_degC is not None]
     if len(known) < len(recordings):  # the difference of two sessions has twice the variance of each
         return np.zeros(len(recordings)), float(np.sqrt(0.125) * np.log(priors("inference")["oil"]["warmest"]))
     return np.array(known) - np.mean(known[:-1]), 0.0

@@ -58,7 +58,7 @@ def about_zero(blocks: Blocks, columns: Sequence[Columns]) -> Blocks:
     positions = np.arcsinh(3.0 * far / usual) * np.linspace(-1.0, 1.0, TRIED)
     # the likelihood rises towards a zero from far away, beside which what is believed would hide it
     starts = {TRIED // 2, int(np.argmax([likelihood(position) for position in positions]))}
-    ends = [(positions[max(at - 1, 0)], positions[min(at + 1, TRIED - 1)]) for at in starts]
+    ends = [(positions[max(start - 1, 0)], positions[min(start + 1, TRIED - 1)]) for start in starts]
     fits = [minimize_scalar(cost, bounds=end, method="bounded", options={"xatol": 1e-3}) for end in ends]
     position = min(fits, key=lambda fit: fit.fun).x
     zero, own = width * float(np.sinh(position)), columns[0]

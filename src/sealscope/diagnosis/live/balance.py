@@ -104,7 +104,12 @@ class LiveBalance:
         if not self._balances:
             needed = "x, u, p_A, p_B, p_1 and p_2" if _valved(rig) else "x, p_A, p_B and theta or omega"
             raise InputError(f"a live balance must have {needed}, got {', '.join(names) or 'nothing'}")
-        read = {"x", "p_A", "p_B", *(name for each in self._balances for term in each.terms for name in term.needs)}
+        read = {
+            "x",
+            "p_A",
+            "p_B",
+            *(name for balance in self._balances for term in balance.terms for name in term.needs),
+        }
         read |= {next((name for name in ("theta", "omega") if name in names), "x")}
         self.names = tuple(name for name in names if name in read)
         self.size_error, self.cause = size_error(rig), "piston leak" if _valved(rig) else "piston or pump leak"
@@ -246,6 +251,8 @@ def size_error(rig: Rig) -> float:
 
 def live_equations(rig: Rig, names: Sequence[str]) -> list[Equation]:
     """Return a machine's balances with the terms that have a column: none has what is zero or lies beside the leak."""
-    balances = [own for own in equations(rig, frozenset(names)) if not own.by_command]
-    nuisances = [tuple(term for term in own.terms if term.nuisance and term.name != "pump leak") for own in balances]
+    balances = [equation for equation in equations(rig, frozenset(names)) if not equation.by_command]
+    nuisances = [
+        tuple(term for term in balance.terms if term.nuisance and term.name != "pump leak") for balance in balances
+    ]
     return [own._replace(terms=terms) for own, terms in zip(balances, nuisances, strict=True)]

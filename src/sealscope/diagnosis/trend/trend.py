@@ -130,7 +130,7 @@ class Trend:
     @property
     def repairs(self) -> tuple[TrendPoint, ...]:
         """The first recording of each stretch that began with a fall of the level."""
-        return tuple(self.points[self.rows[own.begin]] for own in self.episodes if own.fell)
+        return tuple(self.points[self.rows[episode.begin]] for episode in self.episodes if episode.fell)
 
     @property
     def next_check(self) -> str:
@@ -263,7 +263,9 @@ def trend(
         raise InputError(f"machine-years to a false alarm must be 0.1 to 1000, got {years!r}")
     if every is not None and not (math.isfinite(every) and every > 0.0):
         raise InputError(f"every must be > 0 s, got {every!r}")
-    readings = [own if isinstance(own, LeakReading) else reading_of(own, rig) for own in recordings]
+    readings = [
+        recording if isinstance(recording, LeakReading) else reading_of(recording, rig) for recording in recordings
+    ]
     points, apart = timeline(readings, every)
     return _judged(points, apart, repair=RepairLimit.of(limit), years=years, healthy=healthy, dated=every is None)
 

@@ -231,9 +231,9 @@ class Diagnosis(Evidence):
         if total:
             total["pressure_Pa"] = total.pop("pressure")
         methods = [
-            {"name": own.detector, "score": own.score, "threshold": own.threshold, "verdict": own.verdict}
-            | {"reason": own.reason, "chance": own.stated_chance, "odds": own.odds}
-            for own in self.methods
+            {"name": method.detector, "score": method.score, "threshold": method.threshold, "verdict": method.verdict}
+            | {"reason": method.reason, "chance": method.stated_chance, "odds": method.odds}
+            for method in self.methods
         ]
         names = ("code", "channel", "count", "first_t", "severity", "text")
         return plain(  # type: ignore[no-any-return]

@@ -54,10 +54,10 @@ class StoredRows:
 
     def add_estimates(self, actuator: str, estimates: Iterable[BlockEstimate], oil_celsius: float | None) -> None:
         """Add the estimates of a block, and the oil's temperature then."""
-        for each in estimates:
-            total, leak = each.total_interval_lpm or (None, None), each.leak_interval_lpm or (None, None)
-            figures = (each.total_lpm, *total, each.leak_lpm, *leak, oil_celsius)
-            row = {"actuator": actuator, "number": each.number, "t": each.t, "status": each.status[:160]}
+        for estimate in estimates:
+            total, leak = estimate.total_interval_lpm or (None, None), estimate.leak_interval_lpm or (None, None)
+            figures = (estimate.total_lpm, *total, estimate.leak_lpm, *leak, oil_celsius)
+            row = {"actuator": actuator, "number": estimate.number, "t": estimate.t, "status": estimate.status[:160]}
             self.estimates.append({**row, **dict(zip(tables.FIGURES, figures, strict=True))})
 
     def add_pending(self, actuator: str, number: int, samples: Recording, follows: bool) -> None:

@@ -85,7 +85,7 @@ class WatchedFolder:
         self._tried &= self._met.keys()
         self._ahead.clear()
         self._starts = {identity: start for identity, start in self._starts.items() if identity in self._met}
-        whole = [own for own in files if own[2] not in self._handed and self._is_whole(*own)]
+        whole = [file for file in files if file[2] not in self._handed and self._is_whole(*file)]
         if len(whole) > 1:  # one that was copied last may have been recorded first
             whole.sort(key=lambda own: self._start_of(*own))
         for written, path, identity in whole:

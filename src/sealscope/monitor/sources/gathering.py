@@ -108,12 +108,14 @@ class ValueGatherer:
     def _whole_blocks(self) -> list[Recording]:
         channels = self._channels.values()
         if self._start is None:
-            if any(each.last() is None for each in channels) or not any(each.values for each in channels):
+            if any(channel.last() is None for channel in channels) or not any(channel.values for channel in channels):
                 return []
             # every channel has a value from there on
-            unknown = [min(each.values) for each in channels if each.held is None]
-            self._start = max(unknown) if unknown else min(min(each.values) for each in channels if each.values)
-        newest = [each.newest for each in channels if each.heard >= self._now() - SILENT_S]
+            unknown = [min(channel.values) for channel in channels if channel.held is None]
+            self._start = (
+                max(unknown) if unknown else min(min(channel.values) for channel in channels if channel.values)
+            )
+        newest = [channel.newest for channel in channels if channel.heard >= self._now() - SILENT_S]
         if not newest or None in newest:
             return []
         blocks: list[Recording] = []

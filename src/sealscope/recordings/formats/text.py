@@ -435,10 +435,10 @@ class _Log:
                 rows, _ = log._rows(number, block[:end], cut)
                 for column, own in zip(columns, dates, strict=True):
                     own.update(either_dates(self._moments(rows, column)))
-                if any(stated_order(own) is not None for own in dates):
+                if any(stated_order(date) is not None for date in dates):
                     break
         order = day_before_month(dates)
-        if all(stated_order(own) is None for own in dates):
+        if all(stated_order(date) is None for date in dates):
             self.order = f"dates read as {'day, month' if order else 'month, day'}: none has a number over 12"
         return order
 
@@ -451,14 +451,14 @@ class _Log:
             for column in self.kinds
         }
         for column, at in words.items():  # each column's blocks are let go before the next is joined
-            first = next((own.first[column] for own in blocks if len(own.words.get(column, ()))), "")
+            first = next((block.first[column] for block in blocks if len(block.words.get(column, ()))), "")
             if at and self.worded[column] > MOST_WORDS * self.total:
                 stamped = self.stamped and self.kinds[column] == "time"
                 raise InputError(f"{_STAMP_RULE if stamped else 'a sample must be a number'}, got {first}")
             if at:
                 many = f"{counted(len(at), 'cell')} without a number read as missing"
                 notes.append(f"column {labels[column].whole}: {many}, first {first}")
-            parts = [own.columns.pop(column) for own in blocks] or [np.empty(0)]
+            parts = [block.columns.pop(column) for block in blocks] or [np.empty(0)]
             if self.stamped and self.kinds[column] == "time":  # blocks before the first stamp have no moments
                 parts = [np.full(part.shape, "NaT", "M8[ns]") if part.dtype.kind == "f" else part for part in parts]
             cells = np.concatenate(parts)

@@ -104,7 +104,7 @@ def _draw(trend: Trend, picture: Picture) -> None:
 def _levels(trend: Trend) -> tuple[float, float]:
     """Return the ends of the axis of levels: a limit is on it where it is near."""
     ends = [value for point in trend.points for value in (point.low, point.high) if value is not None]
-    ends += [end for own in trend.episodes for end in (own.wear.healthy.low, own.wear.healthy.high)]
+    ends += [end for episode in trend.episodes for end in (episode.wear.healthy.low, episode.wear.healthy.high)]
     low, high = min(ends), max(ends)
     if trend.unit == "L/min":
         low = min(low, 0.0)

@@ -153,12 +153,12 @@ def limit_note(trend: Trend) -> str:
 def events(trend: Trend) -> list[str]:
     """Return alarms and repairs, in the order of their times."""
     lines = []
-    for own in trend.episodes:
-        if own.fell:
-            begin = trend.points[trend.rows[own.begin]]
+    for episode in trend.episodes:
+        if episode.fell:
+            begin = trend.points[trend.rows[episode.begin]]
             lines.append(f"{moment(trend, begin.day)} the level fell: a repair, or a part exchanged ({begin.file})")
-        if own.alarm is not None:
-            point = trend.points[trend.rows[own.alarm]]
+        if episode.alarm is not None:
+            point = trend.points[trend.rows[episode.alarm]]
             lines.append(f"{moment(trend, point.day)} alarm ({point.file})")
     return lines
 

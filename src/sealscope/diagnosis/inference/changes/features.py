@@ -42,7 +42,7 @@ def duty_tests(recording: Recording) -> list[StepTest]:
                 return []
             low, high = np.nanpercentile(values, [2.0, 98.0], axis=1)
             sizes.append(np.log(high - low))
-    tests = [_test(recording, own, length) for own in sizes]
+    tests = [_test(recording, size, length) for size in sizes]
     return [test for test in tests if test is not None] if None not in tests else []
 
 

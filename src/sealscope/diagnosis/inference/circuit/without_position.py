@@ -166,7 +166,7 @@ def _rows(increments: list[Array], counts: NDArray[np.bool_], half: float, rate:
 
     missing = np.concatenate([[0], np.cumsum(~counts)])
     first, last = (np.clip(centres + shift, 0, n).astype(int) for shift in (-length, length + 1.0))
-    values = np.column_stack([over(np.where(counts, own, 0.0)) * rate for own in increments])
+    values = np.column_stack([over(np.where(counts, increment, 0.0)) * rate for increment in increments])
     return _WideRows(centres / rate, values, missing[last] == missing[first])
 
 

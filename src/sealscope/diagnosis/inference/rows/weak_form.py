@@ -95,7 +95,7 @@ def rows(increments: Sequence[Array], rate: float, start: float = 0.0) -> Rows:
     stride = stride_samples(rate)
     pieces = len(increments[0]) // stride
     count = max(0, pieces - SPAN + 1)
-    samples = np.concatenate([own[: pieces * stride] for own in increments]).reshape(-1, stride)
+    samples = np.concatenate([increment[: pieces * stride] for increment in increments]).reshape(-1, stride)
     parts: Array = (samples @ _weights(rate)).reshape(len(increments), pieces, SPAN)
     small = np.abs(parts) < LARGEST
     missing = np.zeros(pieces, dtype=bool) if small.all() else np.asarray(~small.all(axis=(0, 2)))

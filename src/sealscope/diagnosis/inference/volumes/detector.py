@@ -105,7 +105,9 @@ class VolumeBalance:
                 RecordedBalance(own.blocks, (own.equation,), (own.columns,), self.rig, recording, own.lost)
                 for own in made
             ]
-            answering = [own for own in candidates if own.equations[0].name == LOCKED or made_good(own)]
+            answering = [
+                candidate for candidate in candidates if candidate.equations[0].name == LOCKED or made_good(candidate)
+            ]
             return min(answering, key=lambda own: BalanceLeak(self.name, own).bound_flow, default=None)
         recorded = self._recorded(recording)
         return None if recorded is None else self._balance(recording, recorded.regime(recorded.odds + odds))
@@ -174,7 +176,7 @@ class VolumeBalance:
         if balance is None:
             return Observed(self.name, lack=_NO_BALANCE["x" in recording].format(recording.duration))
         names = [name for name in balance.columns[0].names if name != TURNING]
-        return self._report(balance, [_sums_of(own, balance.shut) for own in lessons if own["terms"] == names])
+        return self._report(balance, [_sums_of(lesson, balance.shut) for lesson in lessons if lesson["terms"] == names])
 
     def observe_regimes(self, recording: Recording) -> Mapping[bool, Observed]:
         """Return what a recording shows by itself, with the pump in the circuit at rest (False) or cut off (True)."""

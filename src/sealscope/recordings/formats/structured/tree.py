@@ -153,7 +153,7 @@ def _times(by_name: Mapping[str, Any]) -> NDArray[np.float64] | None:
 def _members(value: Any) -> list[Mapping[str, Any]]:
     """Return the structs of an array of them, or the only one."""
     fields = _fields(value) or {}
-    whole = [member for own in fields.values() if (member := _fields(own)) is not None]
+    whole = [member for field in fields.values() if (member := _fields(field)) is not None]
     return whole if whole and all(key.startswith("(") for key in fields) else [fields]
 
 
