@@ -121,7 +121,10 @@ class Recording:
         bridged = None if self.bridged is None else np.array(self.bridged, dtype=bool)
         if t.ndim != 1:
             raise InputError(f"t must be one-dimensional, got shape {t.shape}")
-        for name, values in {**{f"channel {name}": own for name, own in channels.items()}, "bridged": bridged}.items():
+        for name, values in {
+            **{f"channel {name}": series for name, series in channels.items()},
+            "bridged": bridged,
+        }.items():
             if values is not None and values.shape != t.shape:
                 raise InputError(f"{name} must have as many samples as t ({t.size}), got shape {values.shape}")
         if absent := next((name for name in channels if name not in self.units), None):
@@ -137,7 +140,7 @@ class Recording:
             object.__setattr__(self, name, value)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        own = (
+        arguments = (
             self.t,
             dict(self.channels),
             dict(self.units),
@@ -146,7 +149,7 @@ class Recording:
             self.history,
             self.bridged,
         )
-        return type(self), own
+        return type(self), arguments
 
     def __getitem__(self, name: str) -> Array:
         try:
@@ -172,7 +175,7 @@ class Recording:
         rows = []
         for name, values in self.channels.items():
             finite = values[np.isfinite(values)]
-            ends = [f"{of(finite):.6g}" if finite.size else "" for of in (np.min, np.mean, np.max)]
+            ends = [f"{statistic(finite):.6g}" if finite.size else "" for statistic in (np.min, np.mean, np.max)]
             rows.append((name, LONG_NAMES.get(name, ""), self.units[name], *ends, values.size - finite.size))
         heads = ("channel", "", "unit", "least", "mean", "most", "missing")
         lines = ["".join(f"<th>{head}</th>" for head in heads)]
@@ -325,10 +328,10 @@ class Recording:
         """
         from sealscope.recordings.frames import read_pandas
 
-        wanted = Wanted(map or {}, rate)
+        request = Wanted(map or {}, rate)
         try:
             with whole("a data frame", "data frame"):
-                return recording_of(read_pandas(frame, wanted))
+                return recording_of(read_pandas(frame, request))
         except UnreadableFile as error:
             raise InputError(str(error)) from None
 

@@ -62,11 +62,11 @@ def stuck_rows(recording: Recording, name: str) -> NDArray[np.bool_]:
     """Return the rows (n,) in which a pressure stays the same while something else moves; one at rest is no defect."""
     values, rows = recording[name], np.zeros(len(recording), dtype=bool)
     known = np.flatnonzero(np.isfinite(values))
-    others = [recording[other] for other in (*CHAMBERS, "x", "theta") if other != name and other in recording]
+    references = [recording[other] for other in (*CHAMBERS, "x", "theta") if other != name and other in recording]
     for first, length in stuck(values[known]).tolist():
         held = known[first : first + length]
         at_an_end = values[held[0]] in (np.nanmin(values), np.nanmax(values))  # there it is cut off
-        if not at_an_end and (not others or any(_moves_in(other, held) for other in others)):
+        if not at_an_end and (not references or any(_moves_in(other, held) for other in references)):
             rows[held] = True
     return rows
 
@@ -98,9 +98,9 @@ def holding_period(t: Array, values: Array) -> float | None:
     if lengths.size < _PRIORS["runs"] or np.median(lengths) < 2:
         return None
     usual = float(np.median(durations))
-    alike = np.abs(durations / usual - 1.0) <= _PRIORS["spread"]
-    period = float(durations[alike].mean())
-    return period if period >= _PRIORS["shortest"] and np.mean(alike) >= _PRIORS["share"] else None
+    regular = np.abs(durations / usual - 1.0) <= _PRIORS["spread"]
+    period = float(durations[regular].mean())
+    return period if period >= _PRIORS["shortest"] and np.mean(regular) >= _PRIORS["share"] else None
 
 
 def _held_samples(t: Array, values: Array, period: float) -> NDArray[np.bool_]:

@@ -86,25 +86,25 @@ _HALF_A_NUMBER = re.compile(r"[\s+\-\d.,:TeE]{0,40}")
 _NUMBER = re.compile(r"[\s._(-]{0,4}\d{1,4}\b.{0,60}")
 
 
-def read_text(path: Path, wanted: Wanted) -> RecordingFields:
+def read_text(path: Path, request: Wanted) -> RecordingFields:
     """Read the wanted columns of a text log."""
-    return next(read_text_parts(path, wanted, inf))
+    return next(read_text_parts(path, request, inf))
 
 
-def read_text_parts(path: Path, wanted: Wanted, every: float) -> Iterator[RecordingFields]:
+def read_text_parts(path: Path, request: Wanted, every: float) -> Iterator[RecordingFields]:
     """Yield the wanted columns of a text log in parts of `every` seconds at its first rate, in bounded memory.
 
     A log with a time for each channel, one that begins with its last sample and a long table are one part.
     """
     layout = look_at(path)
-    own = None if layout.own is None else parse_description(layout.own)
+    description = None if layout.own is None else parse_description(layout.own)
     times = _times_of_channels(layout.labels)
     choice = None
     with suppress(InputError):
-        choice = choose_columns(layout.labels, wanted, layout.rate)
+        choice = choose_columns(layout.labels, request, layout.rate)
     if choice is None or times:
         try:
-            table = _several_clocks(path, layout, times, wanted)
+            table = _several_clocks(path, layout, times, request)
         except InputError:
             if choice is None:
                 raise
@@ -116,7 +116,7 @@ def read_text_parts(path: Path, wanted: Wanted, every: float) -> Iterator[Record
     def part(blocks: list[_Block], time: LogTime, more: Sequence[str] = ()) -> RecordingFields:
         columns, notes = log.joined(blocks)
         notes = [*layout.notes, *notes, *more]
-        return converted(choice, columns, layout.kind, wanted, notes, layout.about, own, time)
+        return converted(choice, columns, layout.kind, request, notes, layout.about, description, time)
 
     blocks, size, time = log.blocks(), inf, LogTime()
     first = next(blocks, None)
@@ -132,7 +132,7 @@ def read_text_parts(path: Path, wanted: Wanted, every: float) -> Iterator[Record
     yield part(before, time, log.remarks_and_headings())
 
 
-def _several_clocks(path: Path, layout: Layout, times: Sequence[int], wanted: Wanted) -> RecordingFields:
+def _several_clocks(path: Path, layout: Layout, times: Sequence[int], request: Wanted) -> RecordingFields:
     """Read a log in which each channel follows its own one of the columns `times`, or a long table."""
     held: dict[int, NDArray[Any]] = {}
     columns = [column for column in range(len(layout.labels)) if column not in times]
@@ -144,8 +144,8 @@ def _several_clocks(path: Path, layout: Layout, times: Sequence[int], wanted: Wa
         log = _Log(path, layout, used | read, None if times else date)
         cells, notes = log.joined([*log.blocks()])
         held.update(cells)
-        each = [f"{len(read)} columns of times, one for each channel"] if times else []
-        return [*layout.notes, *notes, *log.remarks_and_headings(), *each]
+        note = [f"{len(read)} columns of times, one for each channel"] if times else []
+        return [*layout.notes, *notes, *log.remarks_and_headings(), *note]
 
     def series(column: int, clock: Clock | None = None) -> Series:
         return Series("", layout.labels[column], 0, partial(held.__getitem__, column), clock)
@@ -153,7 +153,7 @@ def _several_clocks(path: Path, layout: Layout, times: Sequence[int], wanted: Wa
     start = exported_from(layout.about)
     clocks = {time: Clock(time, partial(seconds_of_series, series(time), start)) for time in times}
     members = [series(column, clocks[owner[column]] if times else None) for column in columns]
-    return table_of(members, wanted, layout.kind, layout.about, layout.rate, prepare=prepare)
+    return table_of(members, request, layout.kind, layout.about, layout.rate, prepare=prepare)
 
 
 def _times_of_channels(labels: Sequence[Label]) -> list[int]:
@@ -162,8 +162,8 @@ def _times_of_channels(labels: Sequence[Label]) -> list[int]:
     if names.count(names[0]) < 2 or not is_time(labels[0]):
         return []
     times = [column for column, label in enumerate(labels) if is_time(label)]
-    apart = all(after - before > 1 for before, after in zip(times, [*times[1:], len(labels)], strict=True))
-    return times if len({names[column] for column in times}) == 1 and len(times) > 1 and apart else []
+    separate = all(after - before > 1 for before, after in zip(times, [*times[1:], len(labels)], strict=True))
+    return times if len({names[column] for column in times}) == 1 and len(times) > 1 and separate else []
 
 
 def _cut(blocks: Iterable[_Block], size: float) -> Iterator[list[_Block]]:
@@ -209,7 +209,9 @@ class _Block:
 
     def __getitem__(self, rows: slice) -> _Block:
         first, stop, _ = rows.indices(len(self))
-        words = {column: at[(at >= first) & (at < stop)] - first for column, at in self.words.items()}
+        words = {
+            column: indices[(indices >= first) & (indices < stop)] - first for column, indices in self.words.items()
+        }
         return _Block({column: cells[rows] for column, cells in self.columns.items()}, words, self.first)
 
 
@@ -285,7 +287,7 @@ class _Log:
             return None  # where all columns are read, none of these signs is part of a number
         if block.find(b"\r", 0, end) >= 0 and block.count(b"\r", 0, end) != block.count(b"\r\n", 0, end):
             return None
-        wanted = [str(column) for column in self.kinds]
+        names = [str(column) for column in self.kinds]
         for nulls in (self.nulls, ["NaN", *MISSING]):
             try:
                 table = csv.read_csv(
@@ -293,8 +295,8 @@ class _Log:
                     csv.ReadOptions(column_names=[*map(str, range(width))], block_size=end, use_threads=False),
                     csv.ParseOptions(delimiter=layout.delimiter, quote_char=False),
                     csv.ConvertOptions(
-                        include_columns=wanted,
-                        column_types=dict.fromkeys(wanted, float64()),
+                        include_columns=names,
+                        column_types=dict.fromkeys(names, float64()),
                         null_values=nulls,
                         decimal_point=layout.decimal,
                     ),
@@ -315,9 +317,9 @@ class _Log:
         kept = [
             i for i in range(first, len(lines)) if lines[i].strip(blank) and not lines[i].lstrip().startswith(COMMENTS)
         ]
-        own = [i for i in kept if lines[i].strip() not in self.layout.above] if self.layout.above else kept
-        self.repeated += len(kept) - len(own)
-        return own
+        rows = [i for i in kept if lines[i].strip() not in self.layout.above] if self.layout.above else kept
+        self.repeated += len(kept) - len(rows)
+        return rows
 
     def _cells(self, lines: list[str], numbers: Sequence[int], cut: bool) -> list[list[str]]:
         """Split lines into cells; a quotation mark must be closed on its line, but on one that was `cut` short."""
@@ -433,8 +435,8 @@ class _Log:
         with suppress(InputError), self.path.open("rb") as file:  # what is wrong with a row is said where it is read
             for number, block, end, cut in _blocks(file, self.layout.encoding, self.place, lambda: _CHUNK):
                 rows, _ = log._rows(number, block[:end], cut)
-                for column, own in zip(columns, dates, strict=True):
-                    own.update(either_dates(self._moments(rows, column)))
+                for column, column_dates in zip(columns, dates, strict=True):
+                    column_dates.update(either_dates(self._moments(rows, column)))
                 if any(stated_order(date) is not None for date in dates):
                     break
         order = day_before_month(dates)
@@ -447,16 +449,20 @@ class _Log:
         labels, notes, columns = self.layout.labels, list[str](), dict[int, NDArray[Any]]()
         starts, last = [0, *accumulate(map(len, blocks))], [*self.kinds][-1]
         words = {
-            column: [start + at for start, own in zip(starts, blocks, strict=False) for at in own.words.get(column, ())]
+            column: [
+                start + index
+                for start, block in zip(starts, blocks, strict=False)
+                for index in block.words.get(column, ())
+            ]
             for column in self.kinds
         }
-        for column, at in words.items():  # each column's blocks are let go before the next is joined
+        for column, indices in words.items():  # each column's blocks are let go before the next is joined
             first = next((block.first[column] for block in blocks if len(block.words.get(column, ()))), "")
-            if at and self.worded[column] > MOST_WORDS * self.total:
+            if indices and self.worded[column] > MOST_WORDS * self.total:
                 stamped = self.stamped and self.kinds[column] == "time"
                 raise InputError(f"{_STAMP_RULE if stamped else 'a sample must be a number'}, got {first}")
-            if at:
-                many = f"{counted(len(at), 'cell')} without a number read as missing"
+            if indices:
+                many = f"{counted(len(indices), 'cell')} without a number read as missing"
                 notes.append(f"column {labels[column].whole}: {many}, first {first}")
             parts = [block.columns.pop(column) for block in blocks] or [np.empty(0)]
             if self.stamped and self.kinds[column] == "time":  # blocks before the first stamp have no moments

@@ -155,8 +155,8 @@ def day_before_month(columns: Collection[Iterable[str]]) -> bool:
     ranks = {}
     for day_first in (hyphen, not hyphen):
         days = [[_day(text, day_first) for text in column] for column in columns]
-        ends = [day for own in days for day in own if day]
-        ranks[day_first] = any(own != sorted(own) for own in days), max(ends, default=0) - min(ends, default=0)
+        ends = [day for dates in days for day in dates if day]
+        ranks[day_first] = any(dates != sorted(dates) for dates in days), max(ends, default=0) - min(ends, default=0)
     return min(ranks, key=ranks.__getitem__)
 
 

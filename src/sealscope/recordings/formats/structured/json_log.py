@@ -51,7 +51,7 @@ def is_json(head: bytes) -> bool:
     return True
 
 
-def read_json(path: Path, wanted: Wanted) -> RecordingFields:
+def read_json(path: Path, request: Wanted) -> RecordingFields:
     """Read the wanted columns of a JSON file."""
     place = str(path)
     with path.open("rb") as head:
@@ -72,29 +72,29 @@ def read_json(path: Path, wanted: Wanted) -> RecordingFields:
         raise InputError(f"JSON must be plain, got: {str(error)[:80]}") from None
     if not members:
         raise InputError("a recording must have samples, got empty JSON")
-    first, about = members[0], dict[str, str]()
+    first, remarks = members[0], dict[str, str]()
     if len(members) == 1 and isinstance(first, Mapping) and not all(map(_is_cell, first.values())):
-        about = entries((name, value) for name, value in first.items() if isinstance(value, str | int | float))
+        remarks = entries((name, value) for name, value in first.items() if isinstance(value, str | int | float))
         series = list(series_in(_arrays(first, place)))
     else:
         series = _records(members, place)
     if not series:
         raise InputError("JSON must hold records or columns of samples, got none")
-    table = table_of(series, wanted, "JSON", about, stated_rate(about))
+    table = table_of(series, request, "JSON", remarks, stated_rate(remarks))
     note = f"the last value is cut short and left out, after {len(members)} rows"
     return table.with_note(note) if cut else table
 
 
 def _members(text: str) -> Iterator[Any]:
     """Yield the values of a text, one after the other; an array of arrays or objects stands for its members."""
-    at, inside = 0, False
-    while (at := _BETWEEN.match(text, at).end()) < len(text):  # type: ignore[union-attr]
-        if inside and text[at] == "]":
-            inside, at = False, at + 1
-        elif not inside and (opened := _OPENS.match(text, at)):
-            inside, at = True, opened.end()
+    position, inside = 0, False
+    while (position := _BETWEEN.match(text, position).end()) < len(text):  # type: ignore[union-attr]
+        if inside and text[position] == "]":
+            inside, position = False, position + 1
+        elif not inside and (opened := _OPENS.match(text, position)):
+            inside, position = True, opened.end()
         else:
-            member, at = _decoder.raw_decode(text, at)
+            member, position = _decoder.raw_decode(text, position)
             yield member
 
 
