@@ -254,7 +254,7 @@ def uniform_segments(recording: Recording, channels: Sequence[str] | None = None
 
 
 def _even_steps(recording: Recording) -> NDArray[np.bool_]:
-    """Return which intervals (n - 1,) lie between half and one and a half steps of the recording's rate."""
+    """Flag the intervals (n - 1,) between half and one and a half steps of the recording's rate."""
     with np.errstate(invalid="ignore"):
         steps = np.diff(recording.t) * recording.rate
     return np.asarray((steps > _CROWDED) & (steps < _GAP))
@@ -270,7 +270,7 @@ class Rail(NamedTuple):
 
 
 def mostly_clipped(values: Array) -> bool:
-    """Whether more than half of the finite values (n,) are cut off: a chamber that empties into the tank may be."""
+    """Test whether more than half of the finite values (n,) are cut off, as in a chamber that empties into the tank."""
     finite = values[np.isfinite(values)]
     return sum(rail.samples for rail in clipped(finite)) > len(finite) / 2
 

@@ -38,7 +38,7 @@ _SHOWN = {"m": "mm", "rad/s": "rpm", "m^3/s": "L/min", "K": "degC"}
 
 
 def _frozen(values: Any) -> Array:
-    """Return values as doubles that cannot be written: a copy, but of an array that is such doubles and no view."""
+    """Return the values as read-only doubles, without a copy if they are a read-only array of doubles and no view."""
     if type(values) is np.ndarray and values.dtype == np.float64 and values.base is None and not values.flags.writeable:
         return values
     array = np.array(values, dtype=np.float64)
@@ -207,13 +207,13 @@ class Recording:
 
     def between(self, start: float, stop: float) -> Recording:
         """Return the samples with start <= t < stop [s]."""
-        return self._cut((self.t >= start) & (self.t < stop), f"cut to {start:g} s <= t < {stop:g} s")
+        return self._select((self.t >= start) & (self.t < stop), f"cut to {start:g} s <= t < {stop:g} s")
 
     def samples(self, chosen: slice) -> Recording:
         """Return the samples of a slice, times as they are."""
-        return self._cut(chosen, f"cut to samples {chosen.start} to {chosen.stop}")
+        return self._select(chosen, f"cut to samples {chosen.start} to {chosen.stop}")
 
-    def _cut(self, chosen: Any, note: str) -> Recording:
+    def _select(self, chosen: Any, note: str) -> Recording:
         channels = {name: values[chosen] for name, values in self.channels.items()}
         bridged = None if self.bridged is None else self.bridged[chosen]
         return replace(self, t=self.t[chosen], channels=channels, history=(*self.history, note), bridged=bridged)

@@ -58,7 +58,7 @@ def remove_dropouts(recording: Recording) -> Recording:
 
 
 def remove_impossible(recording: Recording) -> Recording:
-    """Mark samples as missing that are beyond what any sensor reads (`quality.flag_impossible`).
+    """Mark samples beyond the range of any sensor as missing (`quality.flag_impossible`).
 
     Where a channel has many of them its unit is wrong: it stays. Returns the recording itself where there are none.
     """
@@ -126,7 +126,7 @@ def filled(recording: Recording, needed: Sequence[str]) -> Recording:
 
 
 def touched(recording: Recording, bounds: Array | NDArray[np.integer]) -> Flags:
-    """Return which blocks between sample `bounds` (n + 1,) hold more bridged samples than `MOST_BRIDGED`, (n,)."""
+    """Flag the blocks (n,) between sample `bounds` (n + 1,) with a share of bridged samples above `MOST_BRIDGED`."""
     bounds = np.asarray(bounds)
     if recording.bridged is None:
         return np.zeros(max(bounds.size - 1, 0), dtype=bool)
@@ -135,7 +135,7 @@ def touched(recording: Recording, bounds: Array | NDArray[np.integer]) -> Flags:
 
 
 def holes(recording: Recording) -> Flags:
-    """Return which rows (n,) lie in bridged gaps of more than a tenth of a test function."""
+    """Flag the rows (n,) in bridged gaps longer than a tenth of a test function."""
     flags = np.zeros(len(recording), dtype=bool)
     if recording.bridged is not None:
         seconds = max(_GAPS["hole"], NEAR / recording.rate)
@@ -165,7 +165,7 @@ def _from_other_cycle(channels: dict[str, Array], needed: Sequence[str], first: 
 
 
 def _unlike(channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, shift: int, half: int) -> float:
-    """Return by what share of its rms the duty beside a gap differs from that `shift` samples away; inf for unknown."""
+    """Compute the relative rms difference of the duty beside a gap from that `shift` samples away; inf for unknown."""
     count = next(iter(channels.values())).size
     window = slice(max(first - half, -shift, 0), min(stop + half, count - shift, count))
     if window.start > first - _END or window.stop < stop + _END:

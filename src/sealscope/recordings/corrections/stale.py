@@ -72,7 +72,7 @@ def stuck_rows(recording: Recording, name: str) -> NDArray[np.bool_]:
 
 
 def _moves_in(values: Array, rows: NDArray[np.intp]) -> bool:
-    """Return whether a channel moves in some rows by more than a share of its range."""
+    """Test whether a channel moves in the given rows by more than a share of its range."""
     whole, part = values[np.isfinite(values)], values[rows][np.isfinite(values[rows])]
     least: float = _PRIORS["moves"]
     return bool(part.size and np.ptp(part) > least * np.ptp(whole))
@@ -104,7 +104,7 @@ def holding_period(t: Array, values: Array) -> float | None:
 
 
 def _held_samples(t: Array, values: Array, period: float) -> NDArray[np.bool_]:
-    """Return which samples (n,) repeat an older one of a channel that takes one every `period` [s]."""
+    """Flag the samples (n,) that repeat an older one, for a channel sampled every `period` [s]."""
     known = np.flatnonzero(np.isfinite(values))
     starts, _ = _runs(values[known])
     times = t[known]
@@ -116,7 +116,7 @@ def _held_samples(t: Array, values: Array, period: float) -> NDArray[np.bool_]:
 
 
 def _repeated_rows(channels: list[Array]) -> NDArray[np.bool_]:
-    """Return which rows (n,) repeat the row before in all channels that move."""
+    """Flag the rows (n,) that repeat the row before in all moving channels."""
     moving = [values for values in channels if np.isfinite(values).any() and np.nanmax(values) > np.nanmin(values)]
     if not moving or moving[0].size < _PRIORS["runs"]:
         return np.zeros(channels[0].size if channels else 0, dtype=bool)

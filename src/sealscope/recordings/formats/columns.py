@@ -37,7 +37,7 @@ REST = "*"
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a caller asks of a table, checked: a map and a rate [Hz]; `file`: how the provenance calls it."""
+    """A caller's request to a table, checked: a map and a rate [Hz]; `file`: its name in the provenance."""
 
     map: ChannelMap
     rate: float | None = None
@@ -48,13 +48,13 @@ class Wanted:
 
     @property
     def infers_rate(self) -> bool:
-        """Whether the time tells the rate, although the table says it: a data frame may have lost rows since."""
+        """True if the rate is inferred from the time and not from the table: a data frame may have lost rows since."""
         return bool(self.map) or not self.file
 
 
 @dataclass
 class ColumnMap:
-    """What to read of the columns with these `labels`, by their numbers.
+    """The choice of columns to read, by their numbers, of a table with these `labels`.
 
     `time`, `time_label`: its column, and the name and unit that hold for it; `channels`: name -> what it is made of;
     `parts`: part of the time -> its column, where several columns hold the time; `date`: the column of the date, where
@@ -120,7 +120,7 @@ def check_call(channel_map: ChannelMap, rate: float | None) -> None:
 
 
 def by_names(channel_map: ChannelMap) -> bool:
-    """Whether a map takes channels by what the columns' names tell."""
+    """Test whether a map takes channels by the meaning of the columns' names."""
     return isinstance(channel_map, str) or REST in channel_map
 
 
@@ -185,7 +185,7 @@ def _find(labels: Sequence[Label], name: str, what: str, mapped: bool = False) -
 
 
 def _mapped(labels: Sequence[Label], channel: str, foreign: str) -> Formula[int]:
-    """Return what a map's text stands for; its unit goes before that of the heading, and this before the name's."""
+    """Parse a map's text to a formula; its unit overrides the heading's unit, and this the unit in the name."""
     what = f"{foreign}, mapped to {channel},"
     blank = foreign.rpartition(" ")
     for name, unit in ((foreign, None), square_brackets(foreign), (blank[0], blank[2])):
@@ -226,7 +226,7 @@ def _checked_unit(channel: str, unit: str | None, what: str) -> tuple[str, str |
 
 
 def _by_map(choice: ColumnMap, columns: Mapping[str, str]) -> None:
-    """Take what a map says."""
+    """Add the channels and the time named by a map to the choice."""
     for channel, foreign in columns.items():
         formula = _mapped(choice.labels, channel, foreign)
         whole = foreign if formula.column is None else choice.labels[formula.column].whole
@@ -325,7 +325,7 @@ def _dates(choice: ColumnMap) -> list[int]:
 
 
 def choose_columns(labels: Sequence[Label], request: Wanted, stated_rate: float | None = None) -> ColumnMap:
-    """Decide which columns are read, and as what.
+    """Choose the columns to read, and the channel of each.
 
     Without a time column the samples have the rate that is wanted, else the `stated_rate` of the file itself [Hz]. A
     map `auto` is what `proposed_map` makes of the labels, for the channels and columns that the map does not name. A

@@ -29,7 +29,7 @@ _STREAMS, _REFERENCES = "#sigstream#", "#refs#"
 
 
 def is_matlab_4(head: bytes) -> bool:
-    """Return whether a file that begins with `head` is a MATLAB 4 file: five integers, and a name that ends in zero."""
+    """Test whether a file that begins with `head` is a MATLAB 4 file: five integers, and a name ending in zero."""
     for machine, order in enumerate("<>" if len(head) > 20 else ""):
         kind, rows, columns, imaginary, length = struct.unpack(f"{order}5i", head[:20])
         if (

@@ -29,7 +29,7 @@ def read_parquet(path: Path, request: Wanted) -> RecordingFields:
         feather = opened.read(6) == b"ARROW1"
     if feather:
         table = library("pyarrow.feather", "Feather", "pyarrow").read_table(path)
-        remarks = _about(table.schema)
+        remarks = _read_remarks(table.schema)
         series = _series(table.schema, table.column, len(table))
         return table_of(series, request, "Feather", remarks, stated_rate(remarks))
     parquet = library("pyarrow.parquet", "Parquet", "pyarrow")
@@ -43,12 +43,12 @@ def read_parquet(path: Path, request: Wanted) -> RecordingFields:
             return file.read(columns=[name]).column(name)
 
     encoded = (schema.metadata or {}).get(_OWN)
-    description, remarks = parse_description(encoded) if encoded else None, _about(schema)
+    description, remarks = parse_description(encoded) if encoded else None, _read_remarks(schema)
     series, size = _series(schema, column, rows), path.stat().st_size
     return table_of(series, request, "Parquet", remarks, stated_rate(remarks), description=description, size=size)
 
 
-def _about(schema: Any) -> dict[str, str]:
+def _read_remarks(schema: Any) -> dict[str, str]:
     """Return the entries that a table has beside its columns, without those that libraries write for themselves."""
     pairs = ((name.decode(errors="replace"), text) for name, text in (schema.metadata or {}).items())
     return entries((name, text.decode(errors="replace")) for name, text in pairs if text[:1] not in b"{")

@@ -89,7 +89,7 @@ def uniform(key: Hashable, count: int, step: float, first: float = 0.0, start: n
 
 
 class RecordingFields(NamedTuple):
-    """What a recording is made of, in the order of its arguments, and the `kind` of the table, in words."""
+    """The arguments of a recording, in their order, and the `kind` of the table, in words."""
 
     t: Array
     channels: dict[str, Array]
@@ -173,7 +173,7 @@ def converted(
     if choice.time is not None and label is not None:
         time = columns[choice.time]
         if choice.parts:
-            time = _joined(choice, columns, label, notes)
+            time = _join_time(choice, columns, label, notes)
         if choice.time == choice.date and not _has_clock(time):
             raise InputError(
                 "a recording must have a time column such as t [s] or be given a rate, "
@@ -212,7 +212,7 @@ def converted(
     return RecordingFields(t, channels, units, rate, provenance, tuple(notes), kind)
 
 
-def _joined(choice: ColumnMap, columns: Mapping[int, NDArray[Any]], label: Label, notes: list[str]) -> NDArray[Any]:
+def _join_time(choice: ColumnMap, columns: Mapping[int, NDArray[Any]], label: Label, notes: list[str]) -> NDArray[Any]:
     """Return the time that several columns hold, and add a line to the notes."""
     assert choice.time is not None
     parts = {part: np.asarray(columns[column], dtype=np.float64) for part, column in choice.parts.items()}
@@ -230,7 +230,7 @@ def _joined(choice: ColumnMap, columns: Mapping[int, NDArray[Any]], label: Label
 
 
 def _has_clock(time: NDArray[Any]) -> bool:
-    """Return whether a column of dates, taken for the time, holds any with a time of the day."""
+    """Test whether a column of dates, taken for the time, holds any with a time of the day."""
     known = time[~np.isnat(time)] if time.dtype.kind == "M" else time[:0]
     return not (known == known.astype("datetime64[D]").astype(known.dtype)).all()
 
@@ -495,7 +495,7 @@ def _plain(value: Any) -> Any:
 
 
 def parse_description(source: str | bytes | Mapping[str, Any]) -> dict[str, Any]:
-    """Return what `description_of` made, of its JSON text or its values; raise InputError where it is damaged."""
+    """Parse the description made by `description_of`, a JSON text or its values; raise InputError if it is damaged."""
     try:
         parsed = source if isinstance(source, Mapping) else json.loads(source)
         version, rate = int(parsed["format"]), float(parsed["rate"])

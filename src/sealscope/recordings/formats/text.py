@@ -114,7 +114,7 @@ def read_text_parts(path: Path, request: Wanted, every: float) -> Iterator[Recor
     log = _Log(path, layout, choice.columns, choice.date)
 
     def part(blocks: list[_Block], time: LogTime, more: Sequence[str] = ()) -> RecordingFields:
-        columns, notes = log.joined(blocks)
+        columns, notes = log.join_blocks(blocks)
         notes = [*layout.notes, *notes, *more]
         return converted(choice, columns, layout.kind, request, notes, layout.about, description, time)
 
@@ -125,7 +125,7 @@ def read_text_parts(path: Path, request: Wanted, every: float) -> Iterator[Recor
         size = max(1, round(every * part([first[:]], time).rate))
         time = LogTime(time.head, time.rate, time.resolution)
     before: list[_Block] = []
-    for blocks_of_part in _cut([] if first is None else chain([first], blocks), size):
+    for blocks_of_part in _split_blocks([] if first is None else chain([first], blocks), size):
         if before:
             yield part(before, time)
         before = blocks_of_part
@@ -142,7 +142,7 @@ def _several_clocks(path: Path, layout: Layout, times: Sequence[int], request: W
         used = {columns[number]: kind for number, kind in kinds.items()}
         read = {owner[column]: "time" for column in used if times}
         log = _Log(path, layout, used | read, None if times else date)
-        cells, notes = log.joined([*log.blocks()])
+        cells, notes = log.join_blocks([*log.blocks()])
         held.update(cells)
         note = [f"{len(read)} columns of times, one for each channel"] if times else []
         return [*layout.notes, *notes, *log.remarks_and_headings(), *note]
@@ -166,7 +166,7 @@ def _times_of_channels(labels: Sequence[Label]) -> list[int]:
     return times if len({names[column] for column in times}) == 1 and len(times) > 1 and separate else []
 
 
-def _cut(blocks: Iterable[_Block], size: float) -> Iterator[list[_Block]]:
+def _split_blocks(blocks: Iterable[_Block], size: float) -> Iterator[list[_Block]]:
     """Yield blocks that together have `size` rows, the last ones fewer."""
     held: list[_Block] = []
     room = size
@@ -388,7 +388,7 @@ class _Log:
         return block
 
     def _is_stamped(self, cells: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
-        """Return whether the time holds stamps, by its first cell; it may be a time of the day beside a date."""
+        """Test whether the time holds stamps, by its first cell; it may be a time of the day beside a date."""
         index = next((i for i, cell in enumerate(cells) if not is_missing(cell)), None)
         if self.stamped is None and index is not None:
             self.stamped = not is_number(cells[index], self.layout.decimal) and is_stamp(cells[index])
@@ -428,7 +428,7 @@ class _Log:
             raise InputError(f"{_STAMP_RULE}, got {cells[bad]!r} {where(bad)}") from None
 
     def _day_before_month(self) -> bool:
-        """Return whether the day is before the month in all dates of the log, read up to the first that tells."""
+        """Test whether the day is before the month in the dates of the log, read up to the first unambiguous one."""
         log = _Log(self.path, self.layout, self.kinds, self.date)
         columns = [column for column, kind in self.kinds.items() if kind == "time"]
         dates: list[dict[str, None]] = [{} for _ in columns]
@@ -444,7 +444,7 @@ class _Log:
             self.order = f"dates read as {'day, month' if order else 'month, day'}: none has a number over 12"
         return order
 
-    def joined(self, blocks: list[_Block]) -> tuple[dict[int, NDArray[Any]], list[str]]:
+    def join_blocks(self, blocks: list[_Block]) -> tuple[dict[int, NDArray[Any]], list[str]]:
         """Return the columns of blocks, which let go of them, and lines for the history; refuse many words."""
         labels, notes, columns = self.layout.labels, list[str](), dict[int, NDArray[Any]]()
         starts, last = [0, *accumulate(map(len, blocks))], [*self.kinds][-1]

@@ -335,7 +335,7 @@ def _first_row(lines: Sequence[str], body: Sequence[str], delimiter: str, decima
 
 
 def _has_prefixes(body: Sequence[str]) -> bool:
-    """Return whether the numbers of a log end in prefixes of powers of ten, by any delimiter."""
+    """Test whether the numbers of a log end in prefixes of powers of ten, by any delimiter."""
     return any(map(_QUANTITY.search, body)) and any(
         has_prefixes([cells_of(line, sign) for line in body]) for sign in "\t;|,"
     )

@@ -38,7 +38,7 @@ def described(labels: Sequence[Label], rows: Sequence[Sequence[str]]) -> list[La
                 names.setdefault(_key(label), cell)
         elif typed is not None and typed < len(cells):
             names.setdefault(_plain(cells[0]), cells[typed])
-    return [_named(label, names.get(_key(label), "")) for label in labels]
+    return [_rename_label(label, names.get(_key(label), "")) for label in labels]
 
 
 def _plain(text: str) -> str:
@@ -50,7 +50,7 @@ def _key(label: Label) -> str:
     return _plain(label.name.rpartition(" ")[2] or label.name)
 
 
-def _named(label: Label, name: str) -> Label:
+def _rename_label(label: Label, name: str) -> Label:
     if not name or len(name) > _LONGEST or _plain(name) == _key(label):
         return label
     typed = Label.parse(name)

@@ -44,7 +44,7 @@ class Label:
 
 
 def is_unit(text: str) -> bool:
-    """Return whether a text is a known unit."""
+    """Test whether a text is a known unit."""
     try:
         parse_unit(text)
     except InputError:

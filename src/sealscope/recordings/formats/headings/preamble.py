@@ -30,7 +30,7 @@ _QUANTITY = re.compile(r"(?P<number>[+-]?\d{1,12}(?:[.,]\d{1,12})?(?:[eE][+-]?\d
 
 
 def stated_rate(remarks: Mapping[str, str]) -> float | None:
-    """Return the sampling rate [Hz] that a file's entries state, as a rate or as an interval; None without."""
+    """Find the sampling rate [Hz] in a file's entries, stated by a rate or an interval; None without."""
     for name, text in remarks.items():
         label = Label.parse(name)
         if label.unit is None and (ending := _ENDING.fullmatch(label.name)):  # SamplePeriod_ms
@@ -53,7 +53,7 @@ def stated_rate(remarks: Mapping[str, str]) -> float | None:
 
 
 def exported_from(remarks: Mapping[str, str]) -> np.datetime64 | None:
-    """Return the moment at which a TwinCAT Scope export says that it begins, None where it does not."""
+    """Find the stated start of a TwinCAT Scope export; None without."""
     for name, entry in remarks.items():
         match = _FILETIME.match(entry) if name.casefold().startswith(("starttime", "start time")) else None
         if match is not None:

@@ -91,7 +91,7 @@ def map_options(channel_map: Mapping[str, str]) -> str:
 
 
 def is_time(label: Label) -> bool:
-    """Return whether a column's name says that it holds the time."""
+    """Test whether a column holds the time, by its name."""
     guess = _guess(label)
     return guess is not None and guess.kind == "time"
 
@@ -103,12 +103,12 @@ def unit_of_time(label: Label) -> str | None:
 
 
 def knows(text: str) -> bool:
-    """Return whether a text holds a known word of a script that writes no blanks between words."""
+    """Test whether a text holds a known word of a script without blanks between words."""
     return any(word in text for word in _UNSPACED)
 
 
 def measures(text: str) -> bool:
-    """Return whether a heading says what is measured, in one of the languages known here."""
+    """Test whether a heading names a measured quantity, in one of the languages known here."""
     return _guess(Label.parse(text)) is not None
 
 
@@ -132,14 +132,14 @@ def split_unit(name: str) -> tuple[str, str | None]:
 
 
 def ends_in(name: str, words: str) -> bool:
-    """Return whether the last words of a column's name are these: `ch2` of `ADC1_Channel_2`, `Pa` of `Main_Pa`."""
+    """Test whether a column's name ends in these words: `ch2` of `ADC1_Channel_2`, `Pa` of `Main_Pa`."""
     tokens = ([token.casefold() for token in _TOKEN.findall(_plain(text))] for text in (name, words))
     name_tokens, ending = (["channel" if token in WORDS["input"] else token for token in text] for text in tokens)
     return words[:1].isalpha() and 0 < len(ending) <= len(name_tokens) and name_tokens[-len(ending) :] == ending
 
 
 def is_recorded(label: Label) -> bool:
-    """Return whether a column is a measured pressure, position or speed, by its name or its unit."""
+    """Test whether a column is a measured pressure, position or speed, by its name or its unit."""
     if len(label.name) > _LONGEST_NAME:
         return False
     name, ending = split_unit(label.name)
@@ -171,7 +171,7 @@ def _words_of(name: str) -> set[str]:
 
 
 def _side_of_head(labels: Sequence[Label]) -> str:
-    """Return which chamber the columns called head are of: A beside a rod, B beside a cap; empty where unknown."""
+    """Return the chamber of the columns called head: A beside a rod, B beside a cap; empty where unknown."""
     words = {word for label in labels if len(label.name) <= _LONGEST_NAME for word in _words_of(label.name)}
     if not words & _SIDE["head"]:
         return ""
@@ -179,7 +179,7 @@ def _side_of_head(labels: Sequence[Label]) -> str:
 
 
 def _guess(label: Label, head: str = "") -> _Guess | None:
-    """Return what a column's name tells; `head`: the chamber that the word head stands for."""
+    """Guess the meaning of a column from its name; `head`: the chamber that the word head stands for."""
     if len(label.name) > _LONGEST_NAME:
         return None
     name, unit = split_unit(label.name)
@@ -213,17 +213,17 @@ def _guess(label: Label, head: str = "") -> _Guess | None:
 
 
 def _commands(unit: str) -> bool:
-    """Return whether a command may have a unit."""
+    """Test whether a command may have this unit."""
     return is_scaled(unit) or same_dimension(unit, "V")
 
 
 def is_scaled(unit: str) -> bool:
-    """Return whether a unit is a share of full scale, or the current of a valve or of a controller's output."""
+    """Test whether a unit is a share of full scale, or the current of a valve or of a controller's output."""
     return unit in _SHARES or same_dimension(unit, "A")
 
 
 def _guess_at_valve(label: Label, kind: str) -> _Guess | None:
-    """Return what a name tells of a pressure `before` or `behind` a valve; None for any other column."""
+    """Guess a pressure `before` or `behind` a valve from a column's name; None for any other column."""
     name, ending = split_unit(label.name)
     unit = ending if label.unit is None else label.unit
     words = _words_of(name if label.unit is None else label.name)

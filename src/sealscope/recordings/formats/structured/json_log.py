@@ -33,7 +33,7 @@ _decoder = json.JSONDecoder()
 
 
 def is_json(head: bytes) -> bool:
-    """Return whether a file that begins with `head` is JSON: an object, or an array, but no heading in brackets."""
+    """Test whether a file that begins with `head` is JSON: an object, or an array, but no heading in brackets."""
     encoding = encoding_of(head)
     text = "" if encoding is None else head.decode(encoding, errors="replace").lstrip("\ufeff \t\r\n\x1e")
     if not _BEGINS.match(text):
@@ -163,7 +163,7 @@ def _records(members: Sequence[Any], place: str) -> list[Series]:
 
 
 def _block_length(member: Mapping[str, Any]) -> int | None:
-    """Return how many samples a block of columns holds: arrays of one length, one of which is the time."""
+    """Return the number of samples of a block of columns: arrays of one length, among them the time; else None."""
     if not all(isinstance(value, list) for value in member.values()):
         return None
     lengths = set(map(len, member.values()))
@@ -171,7 +171,7 @@ def _block_length(member: Mapping[str, Any]) -> int | None:
 
 
 def _array(cells: Sequence[Any], name: str) -> NDArray[Any]:
-    """Return cells as doubles (n,), missing ones as NaN; as texts where some are texts."""
+    """Convert cells to doubles (n,), with NaN for missing ones, or to texts if any is a text."""
     if any(isinstance(cell, str) for cell in cells):
         texts = ["" if cell is None or is_missing(str(cell)) else str(cell) for cell in cells]
         check_texts(len(texts), max(map(len, texts)), name)

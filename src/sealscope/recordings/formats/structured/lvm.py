@@ -57,7 +57,7 @@ class _Packet:
 
 
 def is_lvm(head: bytes) -> bool:
-    """Return whether a file that begins with `head` is a LabVIEW measurement file: the mark begins a line."""
+    """Test whether a file that begins with `head` is a LabVIEW measurement file: the mark begins a line."""
     return any(f"{end}{_END}".encode(encoding) in head for end in "\n\r" for encoding in ("ascii", "utf-16-le"))
 
 
@@ -149,7 +149,7 @@ def _series(packets: Sequence[_Packet], x_columns: str) -> list[Series]:
 
 
 def _begins(packets: Sequence[_Packet], day_first: bool) -> list[float]:
-    """Return what is added to the times of each packet [s], where its own do not go on and the moments are known."""
+    """Compute the offset of each packet's times [s]: 0 if they go on from packet to packet or a moment is unknown."""
     moments = [packet.moment(0, day_first) for packet in packets]
     firsts = [packet.number("x0", 0) for packet in packets]
     known = [moment for moment in moments if moment is not None]

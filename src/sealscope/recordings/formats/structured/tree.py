@@ -136,7 +136,7 @@ def _column_names(fields: Mapping[str, Any]) -> list[str]:
 
 
 def _times(by_name: Mapping[str, Any]) -> NDArray[np.float64] | None:
-    """Return the times (n,) [s] that fields hold, as numbers or as start, increment and length; None without."""
+    """Read the times (n,) [s] from fields: numbers, or a start, increment and length; None without."""
     if "signals" not in by_name and "data" not in by_name:
         return None
     time = by_name.get("time")
@@ -202,6 +202,6 @@ def number_of(value: Any) -> float | None:
 
 
 def entry_of(value: Any) -> str:
-    """Return the only text or number that a value holds as an entry about a recording; empty where it holds neither."""
+    """Format a value, a single text or number, for an entry about a recording; empty for any other value."""
     number = number_of(value)
     return _text(value) if number is None else f"{number:.12g}"
