@@ -110,8 +110,10 @@ def _process() -> _Process:
     return _Process()
 
 
-def apart(work: Callable[..., T], *arguments: Any, limit: float, memory: int = MOST_MEMORY, disk: int = LARGEST) -> T:
-    """Return ``work(*arguments)``, carried out in a process of its own; arguments and result are pickled.
+def run_apart(
+    work: Callable[..., T], *arguments: Any, limit: float, memory: int = MOST_MEMORY, disk: int = LARGEST
+) -> T:
+    """Run ``work(*arguments)`` in a process of its own and return the result; arguments and result are pickled.
 
     `limit`: longest time that it may take [s]; `memory`: most that it may take [bytes], `MOST_MEMORY` and half the
     machine's at most; `disk`: longest file that it may write [bytes]. Raises CrashedApartError where the process
@@ -134,10 +136,10 @@ def apart(work: Callable[..., T], *arguments: Any, limit: float, memory: int = M
 
 
 def file_apart(work: Callable[..., T], file: Path, *arguments: Any, **limits: Any) -> T:
-    """Run ``work(file, *arguments)`` by `apart`; errors name the file by the path given here."""
+    """Run ``work(file, *arguments)`` by `run_apart`; errors name the file by the path given here."""
     place = file.absolute()  # the process may work in another folder
     try:
-        return apart(work, place, *arguments, **limits)
+        return run_apart(work, place, *arguments, **limits)
     except UnreadableFile as error:
         raise UnreadableFile(str(error).replace(str(place), str(file))) from error
 

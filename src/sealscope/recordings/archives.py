@@ -1,6 +1,6 @@
 """Recordings in an archive (.gz, .bz2, .xz, .zst, .zip, .tar), unpacked into a private folder while they are read.
 
-A process of its own unpacks (`apart`), and stops where more comes out than a file of this size may hold.
+A process of its own unpacks (`run_apart`), and stops where more comes out than a file of this size may hold.
 """
 
 from __future__ import annotations
