@@ -14,7 +14,7 @@ import pytest
 
 import sealscope as ss
 from sealscope.campaigns.execution.workers import in_order
-from sealscope.recordings.apart import apart
+from sealscope.recordings.apart import run_apart
 
 from .conftest import SOURCES
 from .test_full_disk import PLAN
@@ -87,7 +87,7 @@ def test_none_runs_where_files_are_read_apart(planted: Path, run: Ran) -> None:
     names = files(planted)
     for name in names:
         ss.read(planted / name, map="auto")
-    loaded = apart(eval, LOADED, limit=10.0)
+    loaded = run_apart(eval, LOADED, limit=10.0)
     assert {"numpy", "h5py", "pyarrow", "python_calamine", "matio", "pickle"} <= set(loaded)
     done = run(loaded, COMMAND, "inspect", *names, "--map", "auto")
     assert done.stderr == ""

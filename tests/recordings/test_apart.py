@@ -18,27 +18,27 @@ import pytest
 
 from sealscope.errors import UnreadableFile
 from sealscope.recordings import Recording, read, write
-from sealscope.recordings.apart import CrashedApartError, apart
+from sealscope.recordings.apart import CrashedApartError, run_apart
 
 
 def test_results_and_errors_come_back() -> None:
-    assert apart(operator.add, 2, 3, limit=10.0) == 5
+    assert run_apart(operator.add, 2, 3, limit=10.0) == 5
     with pytest.raises(RuntimeError, match=r"math domain error|nonnegative"):
-        apart(math.sqrt, -1.0, limit=10.0)
+        run_apart(math.sqrt, -1.0, limit=10.0)
     with pytest.raises(UnreadableFile, match="no such file"):
-        apart(read, "nowhere.csv", limit=10.0)
+        run_apart(read, "nowhere.csv", limit=10.0)
 
 
 def test_a_crash_and_a_loop_end_there(capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(CrashedApartError, match="crashed"):
-        apart(os.abort, limit=10.0)
-    apart(operator.add, 1, 1, limit=10.0)  # the start is over
+        run_apart(os.abort, limit=10.0)
+    run_apart(operator.add, 1, 1, limit=10.0)  # the start is over
     begin = time.perf_counter()
     with pytest.raises(CrashedApartError, match=r"took over 0\.3 s"):
-        apart(time.sleep, 60.0, limit=0.3)
+        run_apart(time.sleep, 60.0, limit=0.3)
     assert time.perf_counter() - begin < 20.0
-    assert apart(operator.mul, 2, 3, limit=10.0) == 6
-    assert apart(print, "noise", limit=10.0) is None
+    assert run_apart(operator.mul, 2, 3, limit=10.0) == 6
+    assert run_apart(print, "noise", limit=10.0) is None
     output = capfd.readouterr()
     assert output.out == output.err == ""
 
@@ -48,7 +48,7 @@ def test_a_file_whose_library_crashes_is_refused(tmp_path: Path, monkeypatch: py
     path = tmp_path / "log.mat"
     path.write_bytes(b"MATLAB 5.0 MAT-file" + bytes(200))
     monkeypatch.setattr(
-        "sealscope.recordings.files.file_apart", lambda work, *_, limit, **more: apart(work, limit=limit)
+        "sealscope.recordings.files.file_apart", lambda work, *_, limit, **more: run_apart(work, limit=limit)
     )
     with pytest.raises(UnreadableFile, match=r"must be whole, got: the library that reads it crashed.*log"):
         read(path)
@@ -59,7 +59,7 @@ def test_hdf5_with_our_own_mark_is_read_apart_too(tmp_path: Path, monkeypatch: p
 
     def observed(work: object, file: Path, kind: str, *arguments: object, **limits: Any) -> object:
         kinds.append(kind)
-        return apart(work, file, kind, *arguments, **limits)  # type: ignore[arg-type]
+        return run_apart(work, file, kind, *arguments, **limits)  # type: ignore[arg-type]
 
     t = np.arange(100) / 100.0
     write(Recording(t, {"p_A": np.sin(t)}, {"p_A": "Pa"}, 100.0), path)
@@ -71,36 +71,36 @@ def test_hdf5_with_our_own_mark_is_read_apart_too(tmp_path: Path, monkeypatch: p
 def test_memory_is_limited_for_each_request() -> None:
     pytest.importorskip("resource")
     with pytest.raises(MemoryError):
-        apart(bytearray, 2**30, limit=10.0, memory=2**29)
-    assert len(apart(bytearray, 2**28, limit=10.0, memory=2**30)) == 2**28
+        run_apart(bytearray, 2**30, limit=10.0, memory=2**29)
+    assert len(run_apart(bytearray, 2**28, limit=10.0, memory=2**30)) == 2**28
 
 
 def test_files_are_limited_and_removed_with_the_process(tmp_path: Path) -> None:
     """What a reader keeps in its temporary folder does not outlive it, however it ends."""
     pytest.importorskip("resource")
     with pytest.raises(RuntimeError, match="File too large"):
-        apart(Path.write_bytes, tmp_path / "large", bytes(2**20), limit=10.0, disk=2**19)
-    folder = Path(apart(tempfile.mkdtemp, limit=10.0))
+        run_apart(Path.write_bytes, tmp_path / "large", bytes(2**20), limit=10.0, disk=2**19)
+    folder = Path(run_apart(tempfile.mkdtemp, limit=10.0))
     assert folder.is_dir()
     with pytest.raises(CrashedApartError, match="crashed"):
-        apart(os.abort, limit=10.0)
+        run_apart(os.abort, limit=10.0)
     assert not folder.exists()
 
 
 def test_a_long_work_holds_no_other_thread_up() -> None:
     with ThreadPoolExecutor() as threads:
-        long = threads.submit(apart, time.sleep, 1.0, limit=10.0)
-        while threads.submit(apart, operator.add, 1, 1, limit=10.0).result() == 2 and not long.running():
+        long = threads.submit(run_apart, time.sleep, 1.0, limit=10.0)
+        while threads.submit(run_apart, operator.add, 1, 1, limit=10.0).result() == 2 and not long.running():
             pass
-        assert apart(operator.add, 2, 3, limit=10.0) == 5
+        assert run_apart(operator.add, 2, 3, limit=10.0) == 5
         assert not long.done()
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="asks Linux for the state of a process")
 def test_work_whose_program_was_killed_ends_at_its_limit(tmp_path: Path) -> None:
     """It does not see the end of its standard input while it works."""
-    text = "import os, time\nfrom sealscope.recordings.apart import apart\n"
-    text += "print(apart(os.getpid, limit=9.0), flush=True)\napart(time.sleep, 60.0, limit=0.5)\n"
+    text = "import os, time\nfrom sealscope.recordings.apart import run_apart\n"
+    text += "print(run_apart(os.getpid, limit=9.0), flush=True)\nrun_apart(time.sleep, 60.0, limit=0.5)\n"
     environment = {**os.environ, "TMPDIR": str(tmp_path)}
     with subprocess.Popen([sys.executable, "-c", text], stdout=subprocess.PIPE, text=True, env=environment) as program:
         assert program.stdout is not None

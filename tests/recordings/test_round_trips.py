@@ -157,17 +157,17 @@ def test_parquet_without_pyarrow_names_the_extra(tmp_path: Path, monkeypatch: py
     import sys
 
     from sealscope.errors import MissingExtra
-    from sealscope.recordings.apart import CrashedApartError, apart
+    from sealscope.recordings.apart import CrashedApartError, run_apart
 
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(MissingExtra, match=r"pip install 'sealscope\[io\]'"):
         write(plain(), tmp_path / "log.parquet")
     (tmp_path / "foreign.parquet").write_bytes(b"PAR1 and more")
-    apart(exec, "__import__('sys').modules['pyarrow'] = None", limit=10.0)
+    run_apart(exec, "__import__('sys').modules['pyarrow'] = None", limit=10.0)
     try:
         with pytest.raises(MissingExtra, match=r"pip install 'sealscope\[io\]'"):
             read(tmp_path / "foreign.parquet")
     finally:
         with pytest.raises(CrashedApartError):
-            apart(os.abort, limit=10.0)
+            run_apart(os.abort, limit=10.0)
     assert [entry.name for entry in tmp_path.iterdir()] == ["foreign.parquet"]

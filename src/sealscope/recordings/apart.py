@@ -69,7 +69,7 @@ class _Process:
         return self._process.poll() is None
 
     def ask(self, request: bytes, limit: float) -> tuple[Any, str | None, bool]:
-        """Return what the work gave or raised, the traceback of what it raised, and whether the process is spent."""
+        """Run a request and return its result or error, the error's traceback, and True for a spent process."""
         process = self._process
         assert process.stdin is not None and process.stdout is not None
         overdue = Timer(limit + 1.0 + _START * self._fresh, process.kill)  # it ends itself at its limit
@@ -110,8 +110,10 @@ def _process() -> _Process:
     return _Process()
 
 
-def apart(work: Callable[..., T], *arguments: Any, limit: float, memory: int = MOST_MEMORY, disk: int = LARGEST) -> T:
-    """Return ``work(*arguments)``, carried out in a process of its own; arguments and result are pickled.
+def run_apart(
+    work: Callable[..., T], *arguments: Any, limit: float, memory: int = MOST_MEMORY, disk: int = LARGEST
+) -> T:
+    """Run ``work(*arguments)`` in a process of its own and return the result; arguments and result are pickled.
 
     `limit`: longest time that it may take [s]; `memory`: most that it may take [bytes], `MOST_MEMORY` and half the
     machine's at most; `disk`: longest file that it may write [bytes]. Raises CrashedApartError where the process
@@ -134,10 +136,10 @@ def apart(work: Callable[..., T], *arguments: Any, limit: float, memory: int = M
 
 
 def file_apart(work: Callable[..., T], file: Path, *arguments: Any, **limits: Any) -> T:
-    """Return ``work(file, *arguments)`` as `apart` does; what it raises names the file as it is given here."""
+    """Run ``work(file, *arguments)`` by `run_apart`; errors name the file by the path given here."""
     place = file.absolute()  # the process may work in another folder
     try:
-        return apart(work, place, *arguments, **limits)
+        return run_apart(work, place, *arguments, **limits)
     except UnreadableFile as error:
         raise UnreadableFile(str(error).replace(str(place), str(file))) from error
 
@@ -158,7 +160,7 @@ def _limit(seconds: float, memory: int, disk: int) -> None:
 
 
 def _is_spent() -> bool:
-    """Return whether this process keeps more memory than one that waits for work may hold."""
+    """Test whether this process holds more memory than a waiting process may."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[5])  # of data, which the limit counts
     except OSError:
@@ -187,7 +189,7 @@ def _serve() -> None:
 
 
 def _carried_out(work: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[Any, str | None]:
-    """Return what the work gives, and None; or what it raised, as a kind that the program knows, and where."""
+    """Run the work and return (result, None), or (error, traceback) with an error of a kind known to the program."""
     try:
         return work(*arguments), None
     except (SealscopeError, MemoryError) as error:

@@ -1,6 +1,6 @@
 """Recordings in an archive (.gz, .bz2, .xz, .zst, .zip, .tar), unpacked into a private folder while they are read.
 
-A process of its own unpacks (`apart`), and stops where more comes out than a file of this size may hold.
+A process of its own unpacks (`run_apart`), and stops where more comes out than a file of this size may hold.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ _CHUNK, _MEMORY = 2**20, 2**30
 
 
 def is_workbook(path: Path) -> bool:
-    """Return whether a ZIP archive is a spreadsheet."""
+    """Test whether a ZIP archive is a spreadsheet."""
     with whole("a zip archive", path):
-        return _apart(_is_workbook, path)
+        return _run_limited(_is_workbook, path)
 
 
-def _apart(work: Callable[..., T], path: Path, *arguments: Any) -> T:
+def _run_limited(work: Callable[..., T], path: Path, *arguments: Any) -> T:
     limit = _LONGEST + path.stat().st_size / _SLOWEST
     return file_apart(work, path, *arguments, limit=limit, memory=_MEMORY)
 
@@ -58,7 +58,7 @@ def unpacked(path: Path, kind: str, most: int) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="sealscope-") as folder:
         most = min(most, shutil.disk_usage(folder).free // 2)
         with whole(f"a {kind} archive", path):
-            target = _apart(_unpack, path, kind, Path(folder), most)
+            target = _run_limited(_unpack, path, kind, Path(folder), most)
         yield target
 
 

@@ -70,7 +70,7 @@ def fundamental(signal: Array, t: Array, cycle: float) -> float:
     size = max(1, round(cycle / (t[1] - t[0])))
     count = t.size // size
     turned = (signal - signal.mean()) * np.exp(-2j * np.pi * t / cycle)
-    each = turned[: count * size].reshape(count, size).mean(axis=1)
-    phase = np.unwrap(np.angle(each))
-    slope = np.polyfit(t[: count * size].reshape(count, size).mean(axis=1), phase, 1, w=np.abs(each))[0]
+    phasors = turned[: count * size].reshape(count, size).mean(axis=1)
+    phase = np.unwrap(np.angle(phasors))
+    slope = np.polyfit(t[: count * size].reshape(count, size).mean(axis=1), phase, 1, w=np.abs(phasors))[0]
     return 1.0 / cycle + float(slope) / (2.0 * np.pi)

@@ -32,11 +32,11 @@ from sealscope.storage.unpacking import most_unpacked
 #: `formats.toml`: the formats that are read, and what is known by its first bytes or its suffix and not read.
 _TABLES: dict[str, dict[str, Any]] = tomllib.loads(Path(__file__).with_name("formats.toml").read_text("utf-8"))
 _FORMATS, _PROPRIETARY = _TABLES["read"], _TABLES["proprietary"]
-_BEGINS = {kind: re.compile(own["begins"].encode()) for kind, own in _FORMATS.items() if "begins" in own}
+_BEGINS = {kind: re.compile(entry["begins"].encode()) for kind, entry in _FORMATS.items() if "begins" in entry}
 _ARCHIVES = {kind: re.compile(begins.encode()) for kind, begins in _TABLES["archives"].items()}
 _FOREIGN = {re.compile(begins.encode()): words for begins, words in _TABLES["foreign"].items()}
 #: Suffix -> format of any file, and of a file to write.
-_SUFFIXES = {suffix: kind for kind, own in _FORMATS.items() for suffix in own["suffixes"]}
+_SUFFIXES = {suffix: kind for kind, entry in _FORMATS.items() for suffix in entry["suffixes"]}
 SUFFIXES = {suffix: kind for suffix, kind in _SUFFIXES.items() if kind in ("netcdf", "text", "parquet")}
 #: Formats that are read in the program itself; the others' libraries end it, or fill its memory, on some files.
 _TEXTS = ("text", "lvm")
@@ -82,8 +82,8 @@ def _member(kind: str, verb: str) -> Callable[..., Any]:
     return getattr(module, f"{verb}_{kind}")  # type: ignore[no-any-return]
 
 
-def _read_here(file: Path, kind: str, wanted: Wanted) -> RecordingFields:
-    return _member(kind, "read")(file, wanted)  # type: ignore[no-any-return]
+def _read_here(file: Path, kind: str, request: Wanted) -> RecordingFields:
+    return _member(kind, "read")(file, request)  # type: ignore[no-any-return]
 
 
 @checked_call
@@ -139,9 +139,9 @@ def read(
     [300000.0, 350000.0, 300000.0]
     """
     file = Path(path)
-    wanted = Wanted(map or {}, rate, file.name)
+    request = Wanted(map or {}, rate, file.name)
     with _inner(file) as (inner, kind):
-        return _read(inner, kind, wanted)
+        return _read(inner, kind, request)
 
 
 @checked_call
@@ -189,22 +189,22 @@ def read_parts(
     [0.8, 0.8, 0.4]
     """
     file = Path(path)
-    wanted = Wanted(map or {}, rate, file.name)
+    request = Wanted(map or {}, rate, file.name)
     if not (isfinite(every) and every > 0):
         raise InputError(f"every must be > 0 s and finite, got {every:g}")
-    return _parts(file, every, wanted)
+    return _parts(file, every, request)
 
 
-def _parts(file: Path, every: float, wanted: Wanted) -> Iterator[Recording]:
+def _parts(file: Path, every: float, request: Wanted) -> Iterator[Recording]:
     with _inner(file) as (inner, kind):
         if kind != "text":
-            whole_file = _read(inner, kind, wanted)
+            whole_file = _read(inner, kind, request)
             size = max(1, round(every * whole_file.rate))
             for first in range(0, len(whole_file), size):
                 yield whole_file.samples(slice(first, first + size))
             return
         with whole("a text file", inner):
-            for fields in read_text_parts(inner, wanted, every):
+            for fields in read_text_parts(inner, request, every):
                 yield recording_of(fields)
 
 
@@ -228,16 +228,16 @@ def _inner(file: Path) -> Iterator[tuple[Path, str]]:
             raise UnreadableFile(str(error).replace(str(inner), f"{inner.name} in {file}")) from error
 
 
-def _read(file: Path, kind: str, wanted: Wanted) -> Recording:
+def _read(file: Path, kind: str, request: Wanted) -> Recording:
     """Read a file that is no archive: by a process of its own where the format is none of text."""
     with whole(f"{_FORMATS[kind]['words']} file", file):
         if kind in _TEXTS:
-            fields = _read_here(file, kind, wanted)
+            fields = _read_here(file, kind, request)
         else:
             size = file.stat().st_size
             limit = _LONGEST + size / (_SLOWEST_SHEETS if kind in ("spreadsheet", "json") else _SLOWEST)
             memory = _MEMORY + _MEMORY_SHARE * size
-            fields = file_apart(_read_here, file, kind, wanted, limit=limit, memory=memory, disk=most_unpacked(file))
+            fields = file_apart(_read_here, file, kind, request, limit=limit, memory=memory, disk=most_unpacked(file))
         if _SUFFIXES.get(file.suffix.lower(), kind) != kind:
             fields = fields.with_note(f"name ends in {file.suffix}, content is {fields.kind}")
         return recording_of(fields)

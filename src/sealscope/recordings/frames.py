@@ -35,7 +35,7 @@ def to_pandas(
     return frame  # type: ignore[no-any-return]
 
 
-def read_pandas(frame: pandas.DataFrame, wanted: Wanted) -> RecordingFields:
+def read_pandas(frame: pandas.DataFrame, request: Wanted) -> RecordingFields:
     """Read the wanted columns of a data frame; an index other than row numbers is a column, too."""
     pandas = library("pandas", "a data frame", "pandas")
     if not isinstance(frame, pandas.DataFrame):
@@ -53,11 +53,11 @@ def read_pandas(frame: pandas.DataFrame, wanted: Wanted) -> RecordingFields:
         label = Label.parse(name, unit if isinstance(unit, str) else elapsed)
         series.append(Series("", label, len(frame), partial(_values, pandas.api.types, column, name)))
     try:
-        own = parse_description({"format": FORMAT_VERSION, **frame.attrs})
+        description = parse_description({"format": FORMAT_VERSION, **frame.attrs})
     except InputError:  # it is not of our making
-        own = None
-    about = entries((name, value) for name, value in frame.attrs.items() if isinstance(value, str | int | float))
-    return table_of(series, wanted, "pandas", about, stated_rate(about), own=own)
+        description = None
+    remarks = entries((name, value) for name, value in frame.attrs.items() if isinstance(value, str | int | float))
+    return table_of(series, request, "pandas", remarks, stated_rate(remarks), description=description)
 
 
 def _values(types: Any, series: Any, name: str) -> NDArray[Any]:

@@ -53,7 +53,7 @@ def _means(values: Array, every: int) -> Array:
 
 
 def lack_of_chambers(recording: Recording) -> str | None:
-    """Return that a recording has no chamber pressure, and the columns not used with the map that would read them."""
+    """Describe a lack of chamber pressures, with the unused columns and a map that would read them; None otherwise."""
     if chambers_of(recording):
         return None
     unused = [line for line in recording.history if line.startswith(UNUSED)]

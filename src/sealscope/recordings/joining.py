@@ -108,7 +108,9 @@ def join(recordings: Sequence[Recording], *, names: Sequence[str] | None = None)
     if len(recordings) < 2:
         raise InputError(f"recordings to join must be two or more, got {len(recordings)}")
     first = recordings[0]
-    names = names or [str(own.provenance.get("file", f"recording {k}")) for k, own in enumerate(recordings, 1)]
+    names = names or [
+        str(recording.provenance.get("file", f"recording {k}")) for k, recording in enumerate(recordings, 1)
+    ]
     for name, other in zip(names, recordings, strict=True):
         if len(other) == 0:
             raise InputError(f"a recording to join must have samples, got none ({name})")

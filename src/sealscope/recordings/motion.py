@@ -27,12 +27,12 @@ _LEVELS = 2**15
 
 
 def constant(values: Array) -> bool:
-    """Return whether all samples (n,) have one value; NaN equals nothing."""
+    """Test whether all samples (n,) have one value; NaN equals nothing."""
     return bool(np.ptp(values) == 0)
 
 
 def moves(values: Array) -> bool:
-    """Return whether a reading (n,) has no missing sample and at least two values."""
+    """Test whether a reading (n,) has no missing sample and at least two values."""
     return values.size > 1 and bool(np.isfinite(values).all()) and not constant(values)
 
 
@@ -61,7 +61,7 @@ def find_holds(values: Array, rate: float, before: float = math.nan) -> Holds:
 
 
 def does_not_move(recording: Recording) -> str | None:
-    """Say which chamber pressure of a recording without missing samples stays constant, and when; None for none.
+    """Describe a chamber pressure that stays constant in a recording without missing samples, and when; None for none.
 
     A pressure is constant where it is held (`find_holds`), or where it is a straight line to within `ROUNDING`
     throughout. A recording too short to tell and a constant channel, which `inspect` reports, give None.

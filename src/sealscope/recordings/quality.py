@@ -227,9 +227,9 @@ def flag_impossible(values: Array, unit: str) -> NDArray[np.bool_]:
 
 def _every(present: NDArray[np.intp]) -> int:
     """Return k where only each k-th row has a value, as of a slower channel among others; else 0."""
-    apart = np.diff(present)
-    usual = int(np.median(apart)) if present.size >= 3 else 0
-    return usual if usual >= 2 and np.mean(apart == usual) > 0.95 else 0
+    steps = np.diff(present)
+    usual = int(np.median(steps)) if present.size >= 3 else 0
+    return usual if usual >= 2 and np.mean(steps == usual) > 0.95 else 0
 
 
 def _ordinal(number: int) -> str:
@@ -254,7 +254,7 @@ def uniform_segments(recording: Recording, channels: Sequence[str] | None = None
 
 
 def _even_steps(recording: Recording) -> NDArray[np.bool_]:
-    """Return which intervals (n - 1,) lie between half and one and a half steps of the recording's rate."""
+    """Flag the intervals (n - 1,) between half and one and a half steps of the recording's rate."""
     with np.errstate(invalid="ignore"):
         steps = np.diff(recording.t) * recording.rate
     return np.asarray((steps > _CROWDED) & (steps < _GAP))
@@ -270,7 +270,7 @@ class Rail(NamedTuple):
 
 
 def mostly_clipped(values: Array) -> bool:
-    """Whether more than half of the finite values (n,) are cut off: a chamber that empties into the tank may be."""
+    """Test whether more than half of the finite values (n,) are cut off, as in a chamber that empties into the tank."""
     finite = values[np.isfinite(values)]
     return sum(rail.samples for rail in clipped(finite)) > len(finite) / 2
 
@@ -295,14 +295,14 @@ def clipped(values: Array, held: NDArray[np.intp] | None = None, low: bool = Tru
         return []
     fine = spacing(levels)
     rails = []
-    for side, top, others in (("high", -1, slice(-6, -1)), ("low", 0, slice(1, 6))):
+    for side, top, neighbours in (("high", -1, slice(-6, -1)), ("low", 0, slice(1, 6))):
         if side == "low" and not low:
             continue
         runs = runs_of(values == levels[top])
         first, length = runs[np.argmax(runs[:, 1])]
         before, after = values[max(first - 1, 0)], values[min(first + length, values.size - 1)]
         drop = max(abs(before - levels[top]), abs(after - levels[top]))
-        piled = counts[top] >= _FEWEST_AT_RAIL and counts[top] > 5 * counts[others].max()
+        piled = counts[top] >= _FEWEST_AT_RAIL and counts[top] > 5 * counts[neighbours].max()
         entered = length >= 3 and drop > (1.5 if length >= _LONG_RUN else 3.5) * fine
         if (piled and entered) or (starts == levels[top]).any():
             rails.append(Rail(side, float(levels[top]), int(counts[top]), int(runs[0, 0])))
@@ -349,8 +349,8 @@ def hum(values: Array, rate: float) -> list[tuple[float, float, float]]:
         bins = np.arange(int((mains - _HUM["around"]) / step), int((mains + _HUM["around"]) / step) + 2)
         off, amplitudes = np.abs(bins * step - mains), np.sqrt(squares[bins])
         near = off <= max(0.1, 0.5 * rate / count)
-        beside = (off > max(0.5, 2.5 * rate / count)) & (off <= _HUM["around"])
-        peak, rest = float(amplitudes[near].max(initial=0.0)), amplitudes[beside]
+        surroundings = (off > max(0.5, 2.5 * rate / count)) & (off <= _HUM["around"])
+        peak, rest = float(amplitudes[near].max(initial=0.0)), amplitudes[surroundings]
         if rest.size >= 10 and peak > _HUM["over_rest"] * rest.max() and peak > _HUM["over_median"] * np.median(rest):
             lines.append((mains, peak, min(1.0, peak**2 / 2 / power)))
     return lines

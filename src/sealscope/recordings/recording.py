@@ -38,7 +38,7 @@ _SHOWN = {"m": "mm", "rad/s": "rpm", "m^3/s": "L/min", "K": "degC"}
 
 
 def _frozen(values: Any) -> Array:
-    """Return values as doubles that cannot be written: a copy, but of an array that is such doubles and no view."""
+    """Return the values as read-only doubles, without a copy if they are a read-only array of doubles and no view."""
     if type(values) is np.ndarray and values.dtype == np.float64 and values.base is None and not values.flags.writeable:
         return values
     array = np.array(values, dtype=np.float64)
@@ -121,7 +121,10 @@ class Recording:
         bridged = None if self.bridged is None else np.array(self.bridged, dtype=bool)
         if t.ndim != 1:
             raise InputError(f"t must be one-dimensional, got shape {t.shape}")
-        for name, values in {**{f"channel {name}": own for name, own in channels.items()}, "bridged": bridged}.items():
+        for name, values in {
+            **{f"channel {name}": series for name, series in channels.items()},
+            "bridged": bridged,
+        }.items():
             if values is not None and values.shape != t.shape:
                 raise InputError(f"{name} must have as many samples as t ({t.size}), got shape {values.shape}")
         if absent := next((name for name in channels if name not in self.units), None):
@@ -137,7 +140,7 @@ class Recording:
             object.__setattr__(self, name, value)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        own = (
+        arguments = (
             self.t,
             dict(self.channels),
             dict(self.units),
@@ -146,7 +149,7 @@ class Recording:
             self.history,
             self.bridged,
         )
-        return type(self), own
+        return type(self), arguments
 
     def __getitem__(self, name: str) -> Array:
         try:
@@ -172,7 +175,7 @@ class Recording:
         rows = []
         for name, values in self.channels.items():
             finite = values[np.isfinite(values)]
-            ends = [f"{of(finite):.6g}" if finite.size else "" for of in (np.min, np.mean, np.max)]
+            ends = [f"{statistic(finite):.6g}" if finite.size else "" for statistic in (np.min, np.mean, np.max)]
             rows.append((name, LONG_NAMES.get(name, ""), self.units[name], *ends, values.size - finite.size))
         heads = ("channel", "", "unit", "least", "mean", "most", "missing")
         lines = ["".join(f"<th>{head}</th>" for head in heads)]
@@ -204,13 +207,13 @@ class Recording:
 
     def between(self, start: float, stop: float) -> Recording:
         """Return the samples with start <= t < stop [s]."""
-        return self._cut((self.t >= start) & (self.t < stop), f"cut to {start:g} s <= t < {stop:g} s")
+        return self._select((self.t >= start) & (self.t < stop), f"cut to {start:g} s <= t < {stop:g} s")
 
     def samples(self, chosen: slice) -> Recording:
         """Return the samples of a slice, times as they are."""
-        return self._cut(chosen, f"cut to samples {chosen.start} to {chosen.stop}")
+        return self._select(chosen, f"cut to samples {chosen.start} to {chosen.stop}")
 
-    def _cut(self, chosen: Any, note: str) -> Recording:
+    def _select(self, chosen: Any, note: str) -> Recording:
         channels = {name: values[chosen] for name, values in self.channels.items()}
         bridged = None if self.bridged is None else self.bridged[chosen]
         return replace(self, t=self.t[chosen], channels=channels, history=(*self.history, note), bridged=bridged)
@@ -325,10 +328,10 @@ class Recording:
         """
         from sealscope.recordings.frames import read_pandas
 
-        wanted = Wanted(map or {}, rate)
+        request = Wanted(map or {}, rate)
         try:
             with whole("a data frame", "data frame"):
-                return recording_of(read_pandas(frame, wanted))
+                return recording_of(read_pandas(frame, request))
         except UnreadableFile as error:
             raise InputError(str(error)) from None
 

@@ -30,7 +30,7 @@ def even_clock(recording: Recording) -> Recording:
     leaps, the longest is kept.
     """
     kept = _ordered_rows(recording.t)
-    kept = kept[_together(recording.t[kept], recording.rate)]
+    kept = kept[_densest_stretch(recording.t[kept], recording.rate)]
     if kept.size < 2:
         return recording.samples(slice(0, kept.size))
     t = recording.t[kept]
@@ -44,14 +44,14 @@ def even_clock(recording: Recording) -> Recording:
 
 
 def is_uneven(recording: Recording) -> bool:
-    """Whether `even_clock` interpolates the samples of a recording."""
+    """Test whether `even_clock` would interpolate the samples of a recording."""
     kept = _ordered_rows(recording.t)
     steps = np.diff(recording.t[kept]) * recording.rate
     return bool(steps.size and np.sqrt(np.mean((steps - np.round(steps)) ** 2)) > _PRIORS["scatter"])
 
 
 def _ordered_rows(t: Array) -> NDArray[np.intp]:
-    """Return the rows whose times rise; where many do not, those of the longest run that does."""
+    """Find the rows with rising times; if many are out of order, the rows of the longest rising run."""
     timed = np.flatnonzero(np.isfinite(t))
     if timed.size < 2:
         return timed
@@ -64,7 +64,7 @@ def _ordered_rows(t: Array) -> NDArray[np.intp]:
     return np.asarray(run[np.r_[True, np.diff(t[run]) > 0.0]])
 
 
-def _together(t: Array, rate: float) -> slice:
+def _densest_stretch(t: Array, rate: float) -> slice:
     """Return the stretch of times (n,) with the most samples of which gaps take no more than `MOST_LOST`."""
     surplus = np.arange(t.size) - (1.0 - MOST_LOST) * rate * (t - t[:1].sum())
     best_after = np.maximum.accumulate(surplus[::-1])[::-1]

@@ -58,13 +58,13 @@ def remove_dropouts(recording: Recording) -> Recording:
 
 
 def remove_impossible(recording: Recording) -> Recording:
-    """Mark samples as missing that are beyond what any sensor reads (`quality.flag_impossible`).
+    """Mark samples beyond the range of any sensor as missing (`quality.flag_impossible`).
 
     Where a channel has many of them its unit is wrong: it stays. Returns the recording itself where there are none.
     """
     flags = {name: flag_impossible(values, recording.units[name]) for name, values in recording.channels.items()}
-    wrong = {name: own & (np.mean(own) <= LONGEST_SHARE) for name, own in flags.items() if len(own)}
-    if not any(own.any() for own in wrong.values()):
+    wrong = {name: mask & (np.mean(mask) <= LONGEST_SHARE) for name, mask in flags.items() if len(mask)}
+    if not any(mask.any() for mask in wrong.values()):
         return recording
     channels = {name: np.where(wrong[name], np.nan, values) for name, values in recording.channels.items()}
     return replace(recording, channels=channels)
@@ -126,7 +126,7 @@ def filled(recording: Recording, needed: Sequence[str]) -> Recording:
 
 
 def touched(recording: Recording, bounds: Array | NDArray[np.integer]) -> Flags:
-    """Return which blocks between sample `bounds` (n + 1,) hold more bridged samples than `MOST_BRIDGED`, (n,)."""
+    """Flag the blocks (n,) between sample `bounds` (n + 1,) with a share of bridged samples above `MOST_BRIDGED`."""
     bounds = np.asarray(bounds)
     if recording.bridged is None:
         return np.zeros(max(bounds.size - 1, 0), dtype=bool)
@@ -135,7 +135,7 @@ def touched(recording: Recording, bounds: Array | NDArray[np.integer]) -> Flags:
 
 
 def holes(recording: Recording) -> Flags:
-    """Return which rows (n,) lie in bridged gaps of more than a tenth of a test function."""
+    """Flag the rows (n,) in bridged gaps longer than a tenth of a test function."""
     flags = np.zeros(len(recording), dtype=bool)
     if recording.bridged is not None:
         seconds = max(_GAPS["hole"], NEAR / recording.rate)
@@ -165,16 +165,16 @@ def _from_other_cycle(channels: dict[str, Array], needed: Sequence[str], first: 
 
 
 def _unlike(channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, shift: int, half: int) -> float:
-    """Return by what share of its rms the duty beside a gap differs from that `shift` samples away; inf for unknown."""
+    """Compute the relative rms difference of the duty beside a gap from that `shift` samples away; inf for unknown."""
     count = next(iter(channels.values())).size
-    own = slice(max(first - half, -shift, 0), min(stop + half, count - shift, count))
-    if own.start > first - _END or own.stop < stop + _END:
+    window = slice(max(first - half, -shift, 0), min(stop + half, count - shift, count))
+    if window.start > first - _END or window.stop < stop + _END:
         return math.inf
     if not all(np.isfinite(channels[name][first + shift : stop + shift]).all() for name in needed):
         return math.inf
     signals = [channels[name] for name in (("u",) if "u" in needed else chambers_of(needed))]
     signal = signals[0] - signals[1] if len(signals) == 2 else signals[0]
-    here, there = signal[own], signal[own.start + shift : own.stop + shift]
+    here, there = signal[window], signal[window.start + shift : window.stop + shift]
     known = np.isfinite(here) & np.isfinite(there)
     if np.count_nonzero(known) < _END:
         return math.inf
@@ -187,8 +187,8 @@ def _copy(values: Array, first: int, stop: int, shift: int) -> None:
     ends = (slice(first - _END, first), slice(stop, stop + _END))
     before, after = (_mean(values[end]) - _mean(values[end.start + shift : end.stop + shift]) for end in ends)
     other = values[first + shift : stop + shift] + np.linspace(before, after, stop - first)
-    own = values[first:stop]
-    own[np.isnan(own)] = other[np.isnan(own)]
+    target = values[first:stop]
+    target[np.isnan(target)] = other[np.isnan(target)]
 
 
 def _line(values: Array, rows: Flags) -> None:

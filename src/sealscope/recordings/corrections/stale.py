@@ -62,17 +62,17 @@ def stuck_rows(recording: Recording, name: str) -> NDArray[np.bool_]:
     """Return the rows (n,) in which a pressure stays the same while something else moves; one at rest is no defect."""
     values, rows = recording[name], np.zeros(len(recording), dtype=bool)
     known = np.flatnonzero(np.isfinite(values))
-    others = [recording[other] for other in (*CHAMBERS, "x", "theta") if other != name and other in recording]
+    references = [recording[other] for other in (*CHAMBERS, "x", "theta") if other != name and other in recording]
     for first, length in stuck(values[known]).tolist():
         held = known[first : first + length]
         at_an_end = values[held[0]] in (np.nanmin(values), np.nanmax(values))  # there it is cut off
-        if not at_an_end and (not others or any(_moves_in(other, held) for other in others)):
+        if not at_an_end and (not references or any(_moves_in(other, held) for other in references)):
             rows[held] = True
     return rows
 
 
 def _moves_in(values: Array, rows: NDArray[np.intp]) -> bool:
-    """Return whether a channel moves in some rows by more than a share of its range."""
+    """Test whether a channel moves in the given rows by more than a share of its range."""
     whole, part = values[np.isfinite(values)], values[rows][np.isfinite(values[rows])]
     least: float = _PRIORS["moves"]
     return bool(part.size and np.ptp(part) > least * np.ptp(whole))
@@ -98,13 +98,13 @@ def holding_period(t: Array, values: Array) -> float | None:
     if lengths.size < _PRIORS["runs"] or np.median(lengths) < 2:
         return None
     usual = float(np.median(durations))
-    alike = np.abs(durations / usual - 1.0) <= _PRIORS["spread"]
-    period = float(durations[alike].mean())
-    return period if period >= _PRIORS["shortest"] and np.mean(alike) >= _PRIORS["share"] else None
+    regular = np.abs(durations / usual - 1.0) <= _PRIORS["spread"]
+    period = float(durations[regular].mean())
+    return period if period >= _PRIORS["shortest"] and np.mean(regular) >= _PRIORS["share"] else None
 
 
 def _held_samples(t: Array, values: Array, period: float) -> NDArray[np.bool_]:
-    """Return which samples (n,) repeat an older one of a channel that takes one every `period` [s]."""
+    """Flag the samples (n,) that repeat an older one, for a channel sampled every `period` [s]."""
     known = np.flatnonzero(np.isfinite(values))
     starts, _ = _runs(values[known])
     times = t[known]
@@ -116,7 +116,7 @@ def _held_samples(t: Array, values: Array, period: float) -> NDArray[np.bool_]:
 
 
 def _repeated_rows(channels: list[Array]) -> NDArray[np.bool_]:
-    """Return which rows (n,) repeat the row before in all channels that move."""
+    """Flag the rows (n,) that repeat the row before in all moving channels."""
     moving = [values for values in channels if np.isfinite(values).any() and np.nanmax(values) > np.nanmin(values)]
     if not moving or moving[0].size < _PRIORS["runs"]:
         return np.zeros(channels[0].size if channels else 0, dtype=bool)

@@ -39,7 +39,7 @@ def with_signed_speed(recording: Recording) -> tuple[Recording, list[Finding]]:
 
 
 def _has_one_sign(values: Array) -> bool:
-    """Return whether a channel (n,) is on one side of zero, to within its noise."""
+    """Test whether a channel (n,) stays on one side of zero, to within its noise."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return False

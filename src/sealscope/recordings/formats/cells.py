@@ -45,23 +45,23 @@ _MOST_UNITS = 64
 
 
 def is_missing(cell: str) -> bool:
-    """Return whether a cell stands for a missing sample."""
+    """Test whether a cell stands for a missing sample."""
     return cell.strip().lower() in MISSING
 
 
 def is_number(cell: str, decimal: str) -> bool:
-    """Return whether the cell is a number with this decimal sign."""
+    """Test whether the cell is a number with this decimal sign."""
     cell = cell.strip()
     return len(cell) <= _LONGEST_NUMBER and bool(_NUMBER[decimal].fullmatch(cell) or is_grouped(cell, decimal))
 
 
 def is_grouped(cell: str, decimal: str) -> bool:
-    """Return whether the cell is a number with signs between its thousands."""
+    """Test whether the cell is a number with signs between its thousands."""
     return _GROUPED[decimal].fullmatch(cell.strip()) is not None
 
 
 def is_value(cell: str, decimal: str) -> bool:
-    """Return whether the cell is a number or a moment."""
+    """Test whether the cell is a number or a moment."""
     return is_number(cell, decimal) or is_stamp(cell)
 
 
@@ -94,7 +94,7 @@ def _number(cell: str, pointed: str, decimal: str) -> float:
 
 
 def has_prefixes(rows: Sequence[Sequence[str]]) -> bool:
-    """Return whether numbers end in prefixes of powers of ten, and not in a unit: a column has several, or a `k`."""
+    """Test whether numbers end in prefixes of powers of ten, and not in a unit: a column has several, or a `k`."""
     found: dict[int, set[str]] = {}
     for row in rows:
         for column, cell in enumerate(row):

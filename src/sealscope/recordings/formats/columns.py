@@ -37,7 +37,7 @@ REST = "*"
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a caller asks of a table, checked: a map and a rate [Hz]; `file`: how the provenance calls it."""
+    """A caller's request to a table, checked: a map and a rate [Hz]; `file`: its name in the provenance."""
 
     map: ChannelMap
     rate: float | None = None
@@ -48,13 +48,13 @@ class Wanted:
 
     @property
     def infers_rate(self) -> bool:
-        """Whether the time tells the rate, although the table says it: a data frame may have lost rows since."""
+        """True if the rate is inferred from the time and not from the table: a data frame may have lost rows since."""
         return bool(self.map) or not self.file
 
 
 @dataclass
 class ColumnMap:
-    """What to read of the columns with these `labels`, by their numbers.
+    """The choice of columns to read, by their numbers, of a table with these `labels`.
 
     `time`, `time_label`: its column, and the name and unit that hold for it; `channels`: name -> what it is made of;
     `parts`: part of the time -> its column, where several columns hold the time; `date`: the column of the date, where
@@ -78,7 +78,7 @@ class ColumnMap:
     @property
     def channel_of(self) -> dict[int, str]:
         """Column -> a channel that is made of it."""
-        return {column: name for name, made in self.channels.items() for column in made.factors}
+        return {column: name for name, formula in self.channels.items() for column in formula.factors}
 
     @property
     def columns(self) -> dict[int, str]:
@@ -120,13 +120,15 @@ def check_call(channel_map: ChannelMap, rate: float | None) -> None:
 
 
 def by_names(channel_map: ChannelMap) -> bool:
-    """Whether a map takes channels by what the columns' names tell."""
+    """Test whether a map takes channels by the meaning of the columns' names."""
     return isinstance(channel_map, str) or REST in channel_map
 
 
 def stated_columns(channel_map: ChannelMap) -> dict[str, str]:
     """Return the part of a map that names channels and their columns."""
-    return {} if isinstance(channel_map, str) else {name: own for name, own in channel_map.items() if name != REST}
+    return (
+        {} if isinstance(channel_map, str) else {name: column for name, column in channel_map.items() if name != REST}
+    )
 
 
 def counted(count: int, noun: str) -> str:
@@ -183,7 +185,7 @@ def _find(labels: Sequence[Label], name: str, what: str, mapped: bool = False) -
 
 
 def _mapped(labels: Sequence[Label], channel: str, foreign: str) -> Formula[int]:
-    """Return what a map's text stands for; its unit goes before that of the heading, and this before the name's."""
+    """Parse a map's text to a formula; its unit overrides the heading's unit, and this the unit in the name."""
     what = f"{foreign}, mapped to {channel},"
     blank = foreign.rpartition(" ")
     for name, unit in ((foreign, None), square_brackets(foreign), (blank[0], blank[2])):
@@ -198,10 +200,10 @@ def _mapped(labels: Sequence[Label], channel: str, foreign: str) -> Formula[int]
         formula = Formula({foreign: 1.0})
     factors: dict[int, float] = {}
     for name, factor in formula.factors.items():
-        own = what if name == foreign else f"{name} of {what}"
-        column = _find(labels, name, own, mapped=True)
+        phrase = what if name == foreign else f"{name} of {what}"
+        column = _find(labels, name, phrase, mapped=True)
         if column is None:
-            raise InputError(f"{own} must be a column, got columns {_columns_of(labels)}")
+            raise InputError(f"{phrase} must be a column, got columns {_columns_of(labels)}")
         factors[column] = factors.get(column, 0.0) + factor
     units = {_unit_of(labels[column], channel) for column in factors}
     if formula.unit is None and len(units) > 1:
@@ -224,19 +226,19 @@ def _checked_unit(channel: str, unit: str | None, what: str) -> tuple[str, str |
 
 
 def _by_map(choice: ColumnMap, columns: Mapping[str, str]) -> None:
-    """Take what a map says."""
+    """Add the channels and the time named by a map to the choice."""
     for channel, foreign in columns.items():
-        made = _mapped(choice.labels, channel, foreign)
-        whole = foreign if made.column is None else choice.labels[made.column].whole
+        formula = _mapped(choice.labels, channel, foreign)
+        whole = foreign if formula.column is None else choice.labels[formula.column].whole
         if channel == "t":
-            if made.column is None:
+            if formula.column is None:
                 raise InputError(f"t must be a column and its unit, such as t=time ms, got {foreign}")
-            choice.time, choice.time_label = made.column, Label(whole, whole, made.unit)
+            choice.time, choice.time_label = formula.column, Label(whole, whole, formula.unit)
             continue
-        kind = "formula" if made.column is None else "column"
-        unit, note = _checked_unit(channel, made.unit, f"{kind} {whole}, read as {channel},")
-        choice.channels[channel] = replace(made, unit=unit)
-        if made.column is None or choice.labels[made.column].name != channel:
+        kind = "formula" if formula.column is None else "column"
+        unit, note = _checked_unit(channel, formula.unit, f"{kind} {whole}, read as {channel},")
+        choice.channels[channel] = replace(formula, unit=unit)
+        if formula.column is None or choice.labels[formula.column].name != channel:
             choice.names[channel] = whole
         choice.notes.append(note or f"{kind} {whole} read as {channel} in {unit}")
 
@@ -247,12 +249,12 @@ def _by_own_names(choice: ColumnMap) -> None:
     for channel in CHANNEL_UNITS:
         if channel in choice.channels:
             continue
-        own = _find(labels, channel, f"channel {channel}")
-        own = _inside(labels, channel) if own is None else own
-        if own is not None and own != choice.time and own not in choice.channel_of:
-            unit, note = _checked_unit(channel, _unit_of(labels[own], channel), f"column {labels[own].whole}")
-            choice.channels[channel] = Formula({own: 1.0}, 0.0, unit)
-            choice.names |= {} if labels[own].name == channel else {channel: labels[own].whole}
+        column = _find(labels, channel, f"channel {channel}")
+        column = _inside(labels, channel) if column is None else column
+        if column is not None and column != choice.time and column not in choice.channel_of:
+            unit, note = _checked_unit(channel, _unit_of(labels[column], channel), f"column {labels[column].whole}")
+            choice.channels[channel] = Formula({column: 1.0}, 0.0, unit)
+            choice.names |= {} if labels[column].name == channel else {channel: labels[column].whole}
             choice.notes += [note] if note else []
     if choice.time is None and (time := _find_time(labels)) is not None:
         label = labels[time]
@@ -280,10 +282,10 @@ def _find_time(labels: Sequence[Label]) -> int | None:
         _find(labels, "t", "t")  # which must be one column
         return exact
     known = [
-        [i for i, own in enumerate(labels) if name in (own.whole.casefold(), own.name.casefold())]
+        [i for i, label in enumerate(labels) if name in (label.whole.casefold(), label.name.casefold())]
         for name in WORDS["time"]
     ]
-    known.append([i for i, own in enumerate(labels) if is_time(own) and own.name.casefold() not in WORDS["date"]])
+    known.append([i for i, label in enumerate(labels) if is_time(label) and label.name.casefold() not in WORDS["date"]])
     matches = next(filter(None, known), [])
     return next((i for i in matches if labels[i].unit is not None), matches[0] if matches else None)
 
@@ -305,7 +307,9 @@ def _split_time(choice: ColumnMap) -> None:
         choice.time, choice.parts = time, parts
         return
     if choice.time is None and choice.rate is None:
-        timed = [i for i, own in enumerate(labels) if i not in used and own.unit and same_dimension(own.unit, "s")]
+        timed = [
+            i for i, label in enumerate(labels) if i not in used and label.unit and same_dimension(label.unit, "s")
+        ]
         dates = _dates(choice)
         if dates or len(timed) == 1:  # `x-axis` over `second`, as oscilloscopes write
             choice.time = (dates or timed)[0]
@@ -320,21 +324,21 @@ def _dates(choice: ColumnMap) -> list[int]:
     return [i for i in named if i not in choice.channel_of]
 
 
-def choose_columns(labels: Sequence[Label], wanted: Wanted, stated_rate: float | None = None) -> ColumnMap:
-    """Decide which columns are read, and as what.
+def choose_columns(labels: Sequence[Label], request: Wanted, stated_rate: float | None = None) -> ColumnMap:
+    """Choose the columns to read, and the channel of each.
 
     Without a time column the samples have the rate that is wanted, else the `stated_rate` of the file itself [Hz]. A
     map `auto` is what `proposed_map` makes of the labels, for the channels and columns that the map does not name. A
     mapped channel comes before a column that bears the channel's own name. Raises InputError where a mapped column is
     missing, where no column is a channel, where there is neither time nor rate, and for a unit of another dimension.
     """
-    choice, columns, rate = ColumnMap(labels, stated_rate), stated_columns(wanted.map), wanted.rate
-    if by_names(wanted.map):
-        taken: set[int] = set()
+    choice, columns, rate = ColumnMap(labels, stated_rate), stated_columns(request.map), request.rate
+    if by_names(request.map):
+        mapped: set[int] = set()
         for channel, foreign in columns.items():
             with suppress(InputError):  # said where the map is gone through
-                taken.update(_mapped(labels, channel, foreign).factors)
-        free = [Label("", "") if column in taken else label for column, label in enumerate(labels)]
+                mapped.update(_mapped(labels, channel, foreign).factors)
+        free = [Label("", "") if column in mapped else label for column, label in enumerate(labels)]
         columns = {**proposed_map(free), **columns}
     _by_map(choice, columns)
     _by_own_names(choice)
@@ -362,8 +366,10 @@ def choose_columns(labels: Sequence[Label], wanted: Wanted, stated_rate: float |
         choice.date = next((i for i in _dates(choice) if i not in used), None)
     left = [label for i, label in enumerate(labels) if i not in used and i != choice.date and label.whole]
     if left:
-        own = {*choice.channels, "t"}
-        guess = map_options({name: column for name, column in proposed_map(labels).items() if name not in own})
+        channel_names = {*choice.channels, "t"}
+        guess = map_options(
+            {name: column for name, column in proposed_map(labels).items() if name not in channel_names}
+        )
         hint = f"; map auto would also read {guess}" if guess else ""
         choice.notes.append(f"{UNUSED}: {listed((label.whole for label in left), 40)}{hint}")
     if rate is not None:

@@ -29,7 +29,7 @@ _STREAMS, _REFERENCES = "#sigstream#", "#refs#"
 
 
 def is_matlab_4(head: bytes) -> bool:
-    """Return whether a file that begins with `head` is a MATLAB 4 file: five integers, and a name that ends in zero."""
+    """Test whether a file that begins with `head` is a MATLAB 4 file: five integers, and a name ending in zero."""
     for machine, order in enumerate("<>" if len(head) > 20 else ""):
         kind, rows, columns, imaginary, length = struct.unpack(f"{order}5i", head[:20])
         if (
@@ -46,7 +46,7 @@ def is_matlab_4(head: bytes) -> bool:
     return False
 
 
-def read_matlab(path: Path, wanted: Wanted) -> RecordingFields:
+def read_matlab(path: Path, request: Wanted) -> RecordingFields:
     """Read the wanted series of a MATLAB file; raise MissingExtra where mat-io is absent."""
     import h5py
 
@@ -55,7 +55,7 @@ def read_matlab(path: Path, wanted: Wanted) -> RecordingFields:
         with h5py.File(path, "r") as file:
             _refuse_elsewhere(file)
             if _STREAMS in file:
-                return table_of(list(_streamed_series(file)), wanted, "MATLAB", size=size)
+                return table_of(list(_streamed_series(file)), request, "MATLAB", size=size)
     matio = library("matio", "a MATLAB file", "mat-io")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # on classes that have no meaning here
@@ -64,8 +64,8 @@ def read_matlab(path: Path, wanted: Wanted) -> RecordingFields:
                 raise InputError(f"{name} must have at most {MAX_VALUES} values, got the shape {shape}")
         held = matio.load_from_mat(path, add_table_attrs=True)
     values = {name: value for name, value in held.items() if not name.startswith("__")}
-    about = entries((name, entry_of(value)) for name, value in values.items())
-    return table_of(list(series_in(values)), wanted, "MATLAB", about, stated_rate(about), size=size)
+    remarks = entries((name, entry_of(value)) for name, value in values.items())
+    return table_of(list(series_in(values)), request, "MATLAB", remarks, stated_rate(remarks), size=size)
 
 
 def _refuse_elsewhere(file: Any) -> None:

@@ -19,7 +19,7 @@ from sealscope.recordings.formats.libraries import library
 from sealscope.recordings.formats.table import Clock, RecordingFields, Series, table_of
 
 
-def read_mdf(path: Path, wanted: Wanted) -> RecordingFields:
+def read_mdf(path: Path, request: Wanted) -> RecordingFields:
     """Read the wanted channels in physical values; frames of a bus that nobody has decoded are no channels."""
     with _opened(library("asammdf", "MDF", "asammdf").MDF, path) as file:
         moment = np.datetime64(file.header.start_time.astimezone(UTC).replace(tzinfo=None), "us")
@@ -40,8 +40,8 @@ def read_mdf(path: Path, wanted: Wanted) -> RecordingFields:
                     label = Label.parse(channel.name, file.get_channel_unit(group=number, index=index) or None)
                     series.append(Series(name, label, count, partial(_values, file, number, index), clock))
         header = ("author", "department", "project", "subject", "comment")
-        about = entries((name, getattr(file.header, name, "")) for name in header)
-        return table_of(series, wanted, f"MDF {file.version}", about, size=path.stat().st_size)
+        remarks = entries((name, getattr(file.header, name, "")) for name in header)
+        return table_of(series, request, f"MDF {file.version}", remarks, size=path.stat().st_size)
 
 
 def _opened(MDF: Any, path: Path) -> Any:

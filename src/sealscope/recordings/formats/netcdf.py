@@ -36,7 +36,7 @@ OWN = "sealscope_format"
 _ORDER = {name: place for place, name in enumerate(LONG_NAMES)}
 
 
-def read_netcdf(path: Path, wanted: Wanted) -> RecordingFields:
+def read_netcdf(path: Path, request: Wanted) -> RecordingFields:
     """Read the wanted one-dimensional data sets, and fields of tables, of all groups of a NetCDF-4 or HDF5 file."""
     import h5py
 
@@ -57,11 +57,13 @@ def read_netcdf(path: Path, wanted: Wanted) -> RecordingFields:
                 for field in data.dtype.names
                 if data.dtype[field].kind in "fiub"
             ]
-        own = _description(file) if OWN in file.attrs else None
-        said = {} if own else {name: value for name, value in file.attrs.items() if not name.startswith("_")}
-        about = entries((name, entry_of(_text(value) or value)) for name, value in said.items())
+        description = _description(file) if OWN in file.attrs else None
+        file_attributes = (
+            {} if description else {name: value for name, value in file.attrs.items() if not name.startswith("_")}
+        )
+        remarks = entries((name, entry_of(_text(value) or value)) for name, value in file_attributes.items())
         kind = "NetCDF" if "_NCProperties" in file.attrs else "HDF5"
-        return table_of(series, wanted, kind, about, stated_rate(about), own=own, size=size)
+        return table_of(series, request, kind, remarks, stated_rate(remarks), description=description, size=size)
 
 
 def _field(data: Any, name: str, field: str) -> NDArray[Any]:
@@ -144,12 +146,12 @@ def _texts(data: Any, name: str, size: int) -> list[str]:
 
 def _description(file: Any) -> dict[str, Any]:
     history, provenance = (_text(file.attrs[name]) for name in ("history", "provenance"))
-    said = {"format": _number(file.attrs[OWN]), "rate": _number(file.attrs["rate"])}
+    header = {"format": _number(file.attrs[OWN]), "rate": _number(file.attrs["rate"])}
     try:
         lines = json.loads(history or "[]")
     except ValueError:  # another tool has added its own line, as the CF conventions ask
         lines = (history or "").splitlines()
-    return parse_description({**said, "provenance": json.loads(provenance or "{}"), "history": lines})
+    return parse_description({**header, "provenance": json.loads(provenance or "{}"), "history": lines})
 
 
 def attributes(description: Mapping[str, Any]) -> dict[str, Any]:

@@ -22,16 +22,16 @@ from sealscope.recordings.formats.table import RecordingFields, Series, check_te
 _OWN = b"sealscope"
 
 
-def read_parquet(path: Path, wanted: Wanted) -> RecordingFields:
+def read_parquet(path: Path, request: Wanted) -> RecordingFields:
     """Read the wanted columns of a Parquet or Feather table; raise MissingExtra where pyarrow is absent."""
     library("pyarrow", "Parquet", "pyarrow")
     with path.open("rb") as opened:
         feather = opened.read(6) == b"ARROW1"
     if feather:
         table = library("pyarrow.feather", "Feather", "pyarrow").read_table(path)
-        about = _about(table.schema)
+        remarks = _read_remarks(table.schema)
         series = _series(table.schema, table.column, len(table))
-        return table_of(series, wanted, "Feather", about, stated_rate(about))
+        return table_of(series, request, "Feather", remarks, stated_rate(remarks))
     parquet = library("pyarrow.parquet", "Parquet", "pyarrow")
     with parquet.ParquetFile(path) as file:
         schema, rows = file.schema_arrow, file.metadata.num_rows
@@ -42,13 +42,13 @@ def read_parquet(path: Path, wanted: Wanted) -> RecordingFields:
         with parquet.ParquetFile(path, read_dictionary=texts) as file:  # a text that repeats is held but once
             return file.read(columns=[name]).column(name)
 
-    own = (schema.metadata or {}).get(_OWN)
-    description, about = parse_description(own) if own else None, _about(schema)
+    encoded = (schema.metadata or {}).get(_OWN)
+    description, remarks = parse_description(encoded) if encoded else None, _read_remarks(schema)
     series, size = _series(schema, column, rows), path.stat().st_size
-    return table_of(series, wanted, "Parquet", about, stated_rate(about), own=description, size=size)
+    return table_of(series, request, "Parquet", remarks, stated_rate(remarks), description=description, size=size)
 
 
-def _about(schema: Any) -> dict[str, str]:
+def _read_remarks(schema: Any) -> dict[str, str]:
     """Return the entries that a table has beside its columns, without those that libraries write for themselves."""
     pairs = ((name.decode(errors="replace"), text) for name, text in (schema.metadata or {}).items())
     return entries((name, text.decode(errors="replace")) for name, text in pairs if text[:1] not in b"{")

@@ -22,7 +22,7 @@ from sealscope.storage.unpacking import check_unpacked, most_unpacked
 _CHUNK = 2**20
 
 
-def read_spreadsheet(path: Path, wanted: Wanted) -> RecordingFields:
+def read_spreadsheet(path: Path, request: Wanted) -> RecordingFields:
     """Read the wanted columns of the first sheet that holds them: hidden sheets last, those with most rows first."""
     _check_members(path)
     workbook = library("python_calamine", "a spreadsheet", "python-calamine").CalamineWorkbook.from_path(str(path))
@@ -34,13 +34,13 @@ def read_spreadsheet(path: Path, wanted: Wanted) -> RecordingFields:
     for number, sheet in enumerate(sheets):
         check_size(sheet.total_height, sheet.total_width)
         try:
-            table = _read_sheet(sheet, wanted, str(path))
+            table = _read_sheet(sheet, request, str(path))
         except InputError as error:
             reason = reason if number else error
             continue
         table = table._replace(kind="spreadsheet", provenance=table.provenance | {"format": "spreadsheet"})
-        others = [name for name in workbook.sheet_names if name != sheet.name]
-        return table.with_note(f"sheet {sheet.name} read, not {listed(others, 4)}") if others else table
+        unread = [name for name in workbook.sheet_names if name != sheet.name]
+        return table.with_note(f"sheet {sheet.name} read, not {listed(unread, 4)}") if unread else table
     raise reason
 
 
@@ -57,14 +57,14 @@ def _check_members(path: Path) -> None:
                     pass
 
 
-def _read_sheet(sheet: Any, wanted: Wanted, place: str) -> RecordingFields:
+def _read_sheet(sheet: Any, request: Wanted, place: str) -> RecordingFields:
     with tempfile.TemporaryDirectory(prefix="sealscope-") as folder:
         text = Path(folder) / "sheet.tsv"
         with text.open("w", encoding="utf-8", newline="\n") as file:
             for row in sheet.iter_rows():
                 file.write("\t".join(map(_cell, row)) + "\n")
         try:
-            return read_text(text, wanted)
+            return read_text(text, request)
         except InputError as error:
             line, sheet_place = str(error), f"sheet {sheet.name}, {place}"
             shown = line.replace(str(text), sheet_place) if str(text) in line else f"{line} ({sheet_place})"

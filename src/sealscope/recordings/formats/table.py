@@ -89,7 +89,7 @@ def uniform(key: Hashable, count: int, step: float, first: float = 0.0, start: n
 
 
 class RecordingFields(NamedTuple):
-    """What a recording is made of, in the order of its arguments, and the `kind` of the table, in words."""
+    """The arguments of a recording, in their order, and the `kind` of the table, in words."""
 
     t: Array
     channels: dict[str, Array]
@@ -106,31 +106,31 @@ class RecordingFields(NamedTuple):
 
 def table_of(
     series: Sequence[Series],
-    wanted: Wanted,
+    request: Wanted,
     kind: str,
-    about: Mapping[str, str] | None = None,
+    remarks: Mapping[str, str] | None = None,
     rate: float | None = None,
     *,
-    own: Mapping[str, Any] | None = None,
+    description: Mapping[str, Any] | None = None,
     prepare: Prepare | None = None,
     size: int | None = None,
 ) -> RecordingFields:
-    """Return a recording of the series that are `wanted`; raise InputError where they cannot be brought together.
+    """Build the fields of a recording from the requested series; raise InputError where they do not fit together.
 
-    `kind`: the format, in words; `about`: what the file says of the recording; `rate` [Hz]: that it states, for series
-    without a clock; `own`: what Sealscope wrote beside the samples; `prepare`: reads all columns that are used
-    together; `size`: bytes of a file that may be compressed.
+    `kind`: the format, in words; `remarks`: the file's entries about the recording; `rate` [Hz]: the rate it states,
+    for series without a clock; `description`: what Sealscope wrote beside the samples; `prepare`: reads all columns
+    that are used together; `size`: bytes of a file that may be compressed.
     """
     members, notes = _distinct(_timed(series))
     labels = [member.label for member in members]
     clocked = any(member.clock is not None for member in members) and not any(label.name == "t" for label in labels)
     try:
-        choice = choose_columns([*labels, _CLOCK_LABEL] if clocked else labels, wanted, rate)
+        choice = choose_columns([*labels, _CLOCK_LABEL] if clocked else labels, request, rate)
     except InputError:
         if (long := _long_columns([member.label for member in series])) is None:
             raise
         pivoted, more = _pivoted(series, long, prepare)
-        table = table_of(pivoted, wanted, kind, about)
+        table = table_of(pivoted, request, kind, remarks)
         return table._replace(history=(*more, *table.history))
     kinds = {column: how for column, how in choice.columns.items() if column < len(members)}
     chosen = {column: members[column] for column in kinds}
@@ -139,7 +139,7 @@ def table_of(
     check_size(max(member.count for member in chosen.values()), len(choice.columns), size)
     if choice.time == len(members):
         columns, more = _on_one_clock(choice, chosen)
-        return converted(choice, columns, kind, wanted, [*notes, *more], about, own)
+        return converted(choice, columns, kind, request, [*notes, *more], remarks, description)
     last = chosen[[*kinds][-1]]
     for member in chosen.values():
         if member.count != last.count:
@@ -147,24 +147,24 @@ def table_of(
                 f"{member.path} must have as many samples as {last.path} ({last.count}), got {member.count}"
             )
     columns = {column: _samples(chosen[column], how == "time") for column, how in kinds.items()}
-    return converted(choice, columns, kind, wanted, notes, about, own)
+    return converted(choice, columns, kind, request, notes, remarks, description)
 
 
 def converted(
     choice: ColumnMap,
     columns: Mapping[int, NDArray[Any]],
     kind: str,
-    wanted: Wanted,
+    request: Wanted,
     notes: Sequence[str] = (),
-    about: Mapping[str, str] | None = None,
-    own: Mapping[str, Any] | None = None,
+    remarks: Mapping[str, str] | None = None,
+    description: Mapping[str, Any] | None = None,
     log: LogTime | None = None,
 ) -> RecordingFields:
     """Convert the columns (n,) of a table, doubles or the time as datetime64, to the fields of a recording.
 
     `log`: what the parts before this one tell of the time, where it is one of a log.
     """
-    label, start, about = choice.time_label, dict[str, Any](), about or {}
+    label, start, remarks = choice.time_label, dict[str, Any](), remarks or {}
     count = len(next(iter(columns.values())))
     if count == 0:
         raise InputError("a recording must have samples, got a header and no rows")
@@ -173,44 +173,46 @@ def converted(
     if choice.time is not None and label is not None:
         time = columns[choice.time]
         if choice.parts:
-            time = _joined(choice, columns, label, notes)
+            time = _join_time(choice, columns, label, notes)
         if choice.time == choice.date and not _has_clock(time):
             raise InputError(
                 "a recording must have a time column such as t [s] or be given a rate, "
                 f"got dates alone in column {label.whole}"
             )
-        if own is None and falling(time):
+        if description is None and falling(time):
             time, columns = time[::-1], {column: cells[::-1] for column, cells in columns.items()}
             notes.append("rows begin with the last sample: taken in the order of time")
     channels, units, in_log = {}, {}, {}
-    for name, made in choice.channels.items():
-        unit = made.unit or COUNTS
+    for name, formula in choice.channels.items():
+        unit = formula.unit or COUNTS
         in_log[name] = "" if unit in (COUNTS, CHANNEL_UNITS[name]) else unit
         units[name] = COUNTS if unit == COUNTS else CHANNEL_UNITS[name]
-        channels[name] = to_si(made.values(columns), unit, units[name], name=name)
+        channels[name] = to_si(formula.values(columns), unit, units[name], name=name)
         if not any(channels[name] is cells for cells in columns.values()):
             channels[name].setflags(write=False)  # made here: a recording takes it as it is
     if label is None:
         assert choice.rate is not None
         t, rate = np.arange(count) / choice.rate, choice.rate
-    elif own is not None and not wanted.infers_rate:
-        t, rate = time, own["rate"]
+    elif description is not None and not request.infers_rate:
+        t, rate = time, description["rate"]
     else:
         t, rate, start, more = time_base(time, label.unit, label.whole, choice.rate, log)
         notes += more
-        if not start and (begin := exported_from(about)) is not None:
+        if not start and (begin := exported_from(remarks)) is not None:
             start = {"start": iso_moment(begin)}
-        if own is not None and abs(rate / own["rate"] - 1.0) <= _SAME_RATE:
-            rate = own["rate"]
-    if own is not None:
-        return RecordingFields(t, channels, units, rate, own["provenance"], (*own["history"], *notes), kind)
-    said = {"file": wanted.file, "format": kind, **start, "about": dict(about), "columns": choice.names}
-    said |= {"unused": list(choice.unused), "log_units": {name: unit for name, unit in in_log.items() if unit}}
-    provenance = {key: value for key, value in said.items() if value or key in start}
+        if description is not None and abs(rate / description["rate"] - 1.0) <= _SAME_RATE:
+            rate = description["rate"]
+    if description is not None:
+        return RecordingFields(
+            t, channels, units, rate, description["provenance"], (*description["history"], *notes), kind
+        )
+    details = {"file": request.file, "format": kind, **start, "about": dict(remarks), "columns": choice.names}
+    details |= {"unused": list(choice.unused), "log_units": {name: unit for name, unit in in_log.items() if unit}}
+    provenance = {key: value for key, value in details.items() if value or key in start}
     return RecordingFields(t, channels, units, rate, provenance, tuple(notes), kind)
 
 
-def _joined(choice: ColumnMap, columns: Mapping[int, NDArray[Any]], label: Label, notes: list[str]) -> NDArray[Any]:
+def _join_time(choice: ColumnMap, columns: Mapping[int, NDArray[Any]], label: Label, notes: list[str]) -> NDArray[Any]:
     """Return the time that several columns hold, and add a line to the notes."""
     assert choice.time is not None
     parts = {part: np.asarray(columns[column], dtype=np.float64) for part, column in choice.parts.items()}
@@ -228,7 +230,7 @@ def _joined(choice: ColumnMap, columns: Mapping[int, NDArray[Any]], label: Label
 
 
 def _has_clock(time: NDArray[Any]) -> bool:
-    """Return whether a column of dates, taken for the time, holds any with a time of the day."""
+    """Test whether a column of dates, taken for the time, holds any with a time of the day."""
     known = time[~np.isnat(time)] if time.dtype.kind == "M" else time[:0]
     return not (known == known.astype("datetime64[D]").astype(known.dtype)).all()
 
@@ -290,8 +292,8 @@ def _distinct(series: Sequence[Series]) -> tuple[list[Series], list[str]]:
     repeated, notes = {name for name, times in Counter(names).items() if times > 1} & known, []
     if repeated:
         group = first[min(repeated)].group
-        others = listed(dict.fromkeys(member.group for member in series if member.group != group), 4)
-        notes.append(f"channels of group {group} read, not those of the same name of {others}")
+        other_groups = listed(dict.fromkeys(member.group for member in series if member.group != group), 4)
+        notes.append(f"channels of group {group} read, not those of the same name of {other_groups}")
     named = []
     for name, member in zip(names, series, strict=True):
         shown = member.label.name if first[name] is member else member.path
@@ -354,31 +356,31 @@ def _on_one_clock(choice: ColumnMap, chosen: dict[int, Series]) -> tuple[dict[in
 def _brought(values: Array, member: Series, t: Array, start: np.datetime64 | None) -> tuple[Array, str]:
     """Return the samples of `member` at the times `t` (n,) after `start`, and what was done to them, if anything."""
     assert member.clock is not None
-    own, begin = member.clock.read()
+    times, begin = member.clock.read()
     if begin is not None and start is not None:
-        own = own + float((begin - start) / np.timedelta64(1, "ns")) / 1e9
-    timed = np.isfinite(own)
-    own, values = own[timed], values[timed]
+        times = times + float((begin - start) / np.timedelta64(1, "ns")) / 1e9
+    timed = np.isfinite(times)
+    times, values = times[timed], values[timed]
     steps = np.diff(t)
-    if own.shape == t.shape and np.all(np.abs(own - t) <= _SAME * (np.median(steps) if steps.size else 0.0)):
+    if times.shape == t.shape and np.all(np.abs(times - t) <= _SAME * (np.median(steps) if steps.size else 0.0)):
         return values, ""
     present = np.isfinite(values)
-    own, values = own[present], values[present]
-    if own.size < 2 or not np.all(np.diff(own) > 0):
+    times, values = times[present], values[present]
+    if times.size < 2 or not np.all(np.diff(times) > 0):
         raise InputError(f"the times of {member.path} must increase, got times that do not")
-    rate, base_rate = nominal_rate(own), nominal_rate(t)
+    rate, base_rate = nominal_rate(times), nominal_rate(t)
     if rate > base_rate:
         how = f"at {rate:g} Hz: averaged over each interval of {base_rate:g} Hz"
-        return _averaged(values, own, t, 1.0 / base_rate), how
-    result = np.interp(t, own, values, left=np.nan, right=np.nan)
-    after = np.clip(np.searchsorted(own, t), 1, own.size - 1)
-    result[(own[after] - own[after - 1] > _GAP * float(np.median(np.diff(own)))) & (own[after] != t)] = np.nan
+        return _averaged(values, times, t, 1.0 / base_rate), how
+    result = np.interp(t, times, values, left=np.nan, right=np.nan)
+    after = np.clip(np.searchsorted(times, t), 1, times.size - 1)
+    result[(times[after] - times[after - 1] > _GAP * float(np.median(np.diff(times)))) & (times[after] != t)] = np.nan
     return result, f"at {rate:g} Hz: interpolated linearly to {base_rate:g} Hz"
 
 
-def _averaged(values: Array, own: Array, t: Array, step: float) -> Array:
-    """Return means (n,) of `values` (m,), taken at `own` (m,), over the interval of length `step` around each time."""
-    begin, end = np.searchsorted(own, t - 0.5 * step), np.searchsorted(own, t + 0.5 * step)
+def _averaged(values: Array, times: Array, t: Array, step: float) -> Array:
+    """Average `values` (m,), taken at `times` (m,), over the interval of length `step` around each time of `t` (n,)."""
+    begin, end = np.searchsorted(times, t - 0.5 * step), np.searchsorted(times, t + 0.5 * step)
     total = np.concatenate(([0.0], np.cumsum(values)))
     with np.errstate(invalid="ignore"):
         return np.asarray((total[end] - total[begin]) / np.where(end > begin, end - begin, np.nan))
@@ -387,7 +389,9 @@ def _averaged(values: Array, own: Array, t: Array, step: float) -> Array:
 def _long_columns(labels: Sequence[Label]) -> dict[str, int] | None:
     """Return the columns of names, values, units and validity of a long table; None for any other table."""
     names = [label.name.strip().casefold() for label in labels]
-    known = {kind: [at for at, own in enumerate(names) if own in words] for kind, words in WORDS["long"].items()}
+    known = {
+        kind: [column for column, name in enumerate(names) if name in words] for kind, words in WORDS["long"].items()
+    }
     long = {kind: columns[0] for kind, columns in known.items() if columns}
     if "_field" in names:  # of InfluxDB, beside columns that may be called name
         long["name"] = names.index("_field")
@@ -403,8 +407,8 @@ def _pivoted(
     if "timestring" in {label.name.casefold() for label in labels}:  # WinCC's moments have their fraction beside them
         days = Label("Time_ms", "t", "microday since 1899-12-30")
         labels = [days if label.name.casefold() == "time_ms" else label for label in labels]
-    wanted = Wanted({"u": f"#{value + 1} count"})
-    choice = choose_columns(labels, wanted)
+    request = Wanted({"u": f"#{value + 1} count"})
+    choice = choose_columns(labels, request)
     choice.notes.clear()
     kinds = dict.fromkeys(texts, "texts") | ({long["valid"]: "any"} if "valid" in long else {})
     kinds |= choice.columns | {value: "any"}
@@ -415,8 +419,8 @@ def _pivoted(
     if "valid" in long:
         invalid = _samples(series[long["valid"]]) == 0.0
         columns[value] = np.where(invalid, np.nan, columns[value])
-        said = f"{counted(int(np.count_nonzero(invalid)), 'value')} that the file calls invalid read as missing"
-        notes += [said] if invalid.any() else []
+        note = f"{counted(int(np.count_nonzero(invalid)), 'value')} that the file calls invalid read as missing"
+        notes += [note] if invalid.any() else []
     times = columns[[*choice.columns][-1]]
     cells = [np.array([str(cell).strip() for cell in series[column].values().tolist()]) for column in texts]
     keys = np.char.add(np.char.add(cells[0], "\n"), cells[1]) if len(cells) > 1 else cells[0]
@@ -427,17 +431,17 @@ def _pivoted(
     ends = np.cumsum(np.bincount(rows, minlength=len(names)))
 
     def member(number: int) -> Series:
-        own = order[ends[number - 1] if number else 0 : ends[number]]
+        selected = order[ends[number - 1] if number else 0 : ends[number]]
 
         @cache
         def fields() -> RecordingFields:
-            timed = own[~np.isnat(times[own]) if times.dtype.kind == "M" else np.isfinite(times[own])]
+            timed = selected[~np.isnat(times[selected]) if times.dtype.kind == "M" else np.isfinite(times[selected])]
             held = {column: cells[timed] for column, cells in columns.items()}
             words = np.isinf(held[value])
             if np.count_nonzero(words) > MOST_WORDS * words.size:
                 raise InputError(f"{label.whole[:40]} must hold numbers, got text")
             held[value][words] = np.nan
-            return converted(choice, held, "", wanted)
+            return converted(choice, held, "", request)
 
         def clock() -> tuple[Array, np.datetime64 | None]:
             begin = fields().provenance
@@ -445,12 +449,12 @@ def _pivoted(
                 return fields().t, np.datetime64(round(begin["start_epoch_s"] * 1e9), "ns")
             if "start" in begin:
                 return fields().t, np.datetime64(begin["start"]).astype("datetime64[ns]")
-            known = times[own] if times.dtype.kind == "M" else times[:0]  # times of the day
+            known = times[selected] if times.dtype.kind == "M" else times[:0]  # times of the day
             return fields().t, np.nanmin(known) if known.size else None
 
         own_name, _, own_unit = str(names[number]).partition("\n")
         label = Label.parse(own_name[:200], own_unit[:40] or None)
-        return Series("", label, own.size, lambda: fields().channels["u"], Clock(number, clock))
+        return Series("", label, selected.size, lambda: fields().channels["u"], Clock(number, clock))
 
     ordered = [member(int(number)) for number in np.argsort(first) if str(names[number]).strip()]
     return ordered, [*notes, f"long table: {counted(len(rows), 'row')} of {counted(len(ordered), 'name')}"]
@@ -490,10 +494,10 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"got a {type(value).__name__}")
 
 
-def parse_description(said: str | bytes | Mapping[str, Any]) -> dict[str, Any]:
-    """Return what `description_of` made, of its JSON text or its values; raise InputError where it is damaged."""
+def parse_description(source: str | bytes | Mapping[str, Any]) -> dict[str, Any]:
+    """Parse the description made by `description_of`, a JSON text or its values; raise InputError if it is damaged."""
     try:
-        parsed = said if isinstance(said, Mapping) else json.loads(said)
+        parsed = source if isinstance(source, Mapping) else json.loads(source)
         version, rate = int(parsed["format"]), float(parsed["rate"])
         provenance, history = dict(parsed["provenance"]), [str(line) for line in parsed["history"]]
     except (ValueError, TypeError, KeyError, IndexError, OverflowError, RecursionError) as error:

@@ -19,7 +19,7 @@ from sealscope.recordings.formats.table import Clock, RecordingFields, Series, t
 _UNITS = ("unit_string", "NI_UnitDescription", "units", "unit", "Unit")
 
 
-def read_tdms(path: Path, wanted: Wanted) -> RecordingFields:
+def read_tdms(path: Path, request: Wanted) -> RecordingFields:
     """Read the wanted channels; one with the waveform's interval (``wf_increment``) has a clock."""
     nptdms = library("nptdms", "TDMS", "npTDMS")
     library("nptdms.log", "TDMS", "npTDMS").log_manager.set_level(logging.ERROR)  # a last segment cut short is read
@@ -27,16 +27,18 @@ def read_tdms(path: Path, wanted: Wanted) -> RecordingFields:
         series = []
         for group in file.groups():
             for channel in group.channels():
-                said = channel.properties
-                label = Label.parse(channel.name, next((str(said[key]) for key in _UNITS if said.get(key)), None))
+                properties = channel.properties
+                label = Label.parse(
+                    channel.name, next((str(properties[key]) for key in _UNITS if properties.get(key)), None)
+                )
                 values = partial(channel.__getitem__, slice(None))
-                series.append(Series(group.name, label, len(channel), values, _clock(said, len(channel))))
-        about, *others = (
+                series.append(Series(group.name, label, len(channel), values, _clock(properties, len(channel))))
+        remarks, *group_remarks = (
             entries((name, value) for name, value in member.properties.items() if isinstance(value, str | int | float))
             for member in (file, *file.groups())
         )
-        stated = next(filter(None, map(stated_rate, (about, *others))), None)
-        return table_of(series, wanted, "TDMS", about, stated, size=path.stat().st_size)
+        stated = next(filter(None, map(stated_rate, (remarks, *group_remarks))), None)
+        return table_of(series, request, "TDMS", remarks, stated, size=path.stat().st_size)
 
 
 def _clock(properties: Mapping[str, Any], count: int) -> Clock | None:

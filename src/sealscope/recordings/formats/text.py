@@ -86,25 +86,25 @@ _HALF_A_NUMBER = re.compile(r"[\s+\-\d.,:TeE]{0,40}")
 _NUMBER = re.compile(r"[\s._(-]{0,4}\d{1,4}\b.{0,60}")
 
 
-def read_text(path: Path, wanted: Wanted) -> RecordingFields:
+def read_text(path: Path, request: Wanted) -> RecordingFields:
     """Read the wanted columns of a text log."""
-    return next(read_text_parts(path, wanted, inf))
+    return next(read_text_parts(path, request, inf))
 
 
-def read_text_parts(path: Path, wanted: Wanted, every: float) -> Iterator[RecordingFields]:
+def read_text_parts(path: Path, request: Wanted, every: float) -> Iterator[RecordingFields]:
     """Yield the wanted columns of a text log in parts of `every` seconds at its first rate, in bounded memory.
 
     A log with a time for each channel, one that begins with its last sample and a long table are one part.
     """
     layout = look_at(path)
-    own = None if layout.own is None else parse_description(layout.own)
+    description = None if layout.own is None else parse_description(layout.own)
     times = _times_of_channels(layout.labels)
     choice = None
     with suppress(InputError):
-        choice = choose_columns(layout.labels, wanted, layout.rate)
+        choice = choose_columns(layout.labels, request, layout.rate)
     if choice is None or times:
         try:
-            table = _several_clocks(path, layout, times, wanted)
+            table = _several_clocks(path, layout, times, request)
         except InputError:
             if choice is None:
                 raise
@@ -114,9 +114,9 @@ def read_text_parts(path: Path, wanted: Wanted, every: float) -> Iterator[Record
     log = _Log(path, layout, choice.columns, choice.date)
 
     def part(blocks: list[_Block], time: LogTime, more: Sequence[str] = ()) -> RecordingFields:
-        columns, notes = log.joined(blocks)
+        columns, notes = log.join_blocks(blocks)
         notes = [*layout.notes, *notes, *more]
-        return converted(choice, columns, layout.kind, wanted, notes, layout.about, own, time)
+        return converted(choice, columns, layout.kind, request, notes, layout.about, description, time)
 
     blocks, size, time = log.blocks(), inf, LogTime()
     first = next(blocks, None)
@@ -125,14 +125,14 @@ def read_text_parts(path: Path, wanted: Wanted, every: float) -> Iterator[Record
         size = max(1, round(every * part([first[:]], time).rate))
         time = LogTime(time.head, time.rate, time.resolution)
     before: list[_Block] = []
-    for blocks_of_part in _cut([] if first is None else chain([first], blocks), size):
+    for blocks_of_part in _split_blocks([] if first is None else chain([first], blocks), size):
         if before:
             yield part(before, time)
         before = blocks_of_part
     yield part(before, time, log.remarks_and_headings())
 
 
-def _several_clocks(path: Path, layout: Layout, times: Sequence[int], wanted: Wanted) -> RecordingFields:
+def _several_clocks(path: Path, layout: Layout, times: Sequence[int], request: Wanted) -> RecordingFields:
     """Read a log in which each channel follows its own one of the columns `times`, or a long table."""
     held: dict[int, NDArray[Any]] = {}
     columns = [column for column in range(len(layout.labels)) if column not in times]
@@ -142,10 +142,10 @@ def _several_clocks(path: Path, layout: Layout, times: Sequence[int], wanted: Wa
         used = {columns[number]: kind for number, kind in kinds.items()}
         read = {owner[column]: "time" for column in used if times}
         log = _Log(path, layout, used | read, None if times else date)
-        cells, notes = log.joined([*log.blocks()])
+        cells, notes = log.join_blocks([*log.blocks()])
         held.update(cells)
-        each = [f"{len(read)} columns of times, one for each channel"] if times else []
-        return [*layout.notes, *notes, *log.remarks_and_headings(), *each]
+        note = [f"{len(read)} columns of times, one for each channel"] if times else []
+        return [*layout.notes, *notes, *log.remarks_and_headings(), *note]
 
     def series(column: int, clock: Clock | None = None) -> Series:
         return Series("", layout.labels[column], 0, partial(held.__getitem__, column), clock)
@@ -153,7 +153,7 @@ def _several_clocks(path: Path, layout: Layout, times: Sequence[int], wanted: Wa
     start = exported_from(layout.about)
     clocks = {time: Clock(time, partial(seconds_of_series, series(time), start)) for time in times}
     members = [series(column, clocks[owner[column]] if times else None) for column in columns]
-    return table_of(members, wanted, layout.kind, layout.about, layout.rate, prepare=prepare)
+    return table_of(members, request, layout.kind, layout.about, layout.rate, prepare=prepare)
 
 
 def _times_of_channels(labels: Sequence[Label]) -> list[int]:
@@ -162,11 +162,11 @@ def _times_of_channels(labels: Sequence[Label]) -> list[int]:
     if names.count(names[0]) < 2 or not is_time(labels[0]):
         return []
     times = [column for column, label in enumerate(labels) if is_time(label)]
-    apart = all(after - before > 1 for before, after in zip(times, [*times[1:], len(labels)], strict=True))
-    return times if len({names[column] for column in times}) == 1 and len(times) > 1 and apart else []
+    separate = all(after - before > 1 for before, after in zip(times, [*times[1:], len(labels)], strict=True))
+    return times if len({names[column] for column in times}) == 1 and len(times) > 1 and separate else []
 
 
-def _cut(blocks: Iterable[_Block], size: float) -> Iterator[list[_Block]]:
+def _split_blocks(blocks: Iterable[_Block], size: float) -> Iterator[list[_Block]]:
     """Yield blocks that together have `size` rows, the last ones fewer."""
     held: list[_Block] = []
     room = size
@@ -209,7 +209,9 @@ class _Block:
 
     def __getitem__(self, rows: slice) -> _Block:
         first, stop, _ = rows.indices(len(self))
-        words = {column: at[(at >= first) & (at < stop)] - first for column, at in self.words.items()}
+        words = {
+            column: indices[(indices >= first) & (indices < stop)] - first for column, indices in self.words.items()
+        }
         return _Block({column: cells[rows] for column, cells in self.columns.items()}, words, self.first)
 
 
@@ -285,7 +287,7 @@ class _Log:
             return None  # where all columns are read, none of these signs is part of a number
         if block.find(b"\r", 0, end) >= 0 and block.count(b"\r", 0, end) != block.count(b"\r\n", 0, end):
             return None
-        wanted = [str(column) for column in self.kinds]
+        names = [str(column) for column in self.kinds]
         for nulls in (self.nulls, ["NaN", *MISSING]):
             try:
                 table = csv.read_csv(
@@ -293,8 +295,8 @@ class _Log:
                     csv.ReadOptions(column_names=[*map(str, range(width))], block_size=end, use_threads=False),
                     csv.ParseOptions(delimiter=layout.delimiter, quote_char=False),
                     csv.ConvertOptions(
-                        include_columns=wanted,
-                        column_types=dict.fromkeys(wanted, float64()),
+                        include_columns=names,
+                        column_types=dict.fromkeys(names, float64()),
                         null_values=nulls,
                         decimal_point=layout.decimal,
                     ),
@@ -315,9 +317,9 @@ class _Log:
         kept = [
             i for i in range(first, len(lines)) if lines[i].strip(blank) and not lines[i].lstrip().startswith(COMMENTS)
         ]
-        own = [i for i in kept if lines[i].strip() not in self.layout.above] if self.layout.above else kept
-        self.repeated += len(kept) - len(own)
-        return own
+        rows = [i for i in kept if lines[i].strip() not in self.layout.above] if self.layout.above else kept
+        self.repeated += len(kept) - len(rows)
+        return rows
 
     def _cells(self, lines: list[str], numbers: Sequence[int], cut: bool) -> list[list[str]]:
         """Split lines into cells; a quotation mark must be closed on its line, but on one that was `cut` short."""
@@ -386,7 +388,7 @@ class _Log:
         return block
 
     def _is_stamped(self, cells: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
-        """Return whether the time holds stamps, by its first cell; it may be a time of the day beside a date."""
+        """Test whether the time holds stamps, by its first cell; it may be a time of the day beside a date."""
         index = next((i for i, cell in enumerate(cells) if not is_missing(cell)), None)
         if self.stamped is None and index is not None:
             self.stamped = not is_number(cells[index], self.layout.decimal) and is_stamp(cells[index])
@@ -426,15 +428,15 @@ class _Log:
             raise InputError(f"{_STAMP_RULE}, got {cells[bad]!r} {where(bad)}") from None
 
     def _day_before_month(self) -> bool:
-        """Return whether the day is before the month in all dates of the log, read up to the first that tells."""
+        """Test whether the day is before the month in the dates of the log, read up to the first unambiguous one."""
         log = _Log(self.path, self.layout, self.kinds, self.date)
         columns = [column for column, kind in self.kinds.items() if kind == "time"]
         dates: list[dict[str, None]] = [{} for _ in columns]
         with suppress(InputError), self.path.open("rb") as file:  # what is wrong with a row is said where it is read
             for number, block, end, cut in _blocks(file, self.layout.encoding, self.place, lambda: _CHUNK):
                 rows, _ = log._rows(number, block[:end], cut)
-                for column, own in zip(columns, dates, strict=True):
-                    own.update(either_dates(self._moments(rows, column)))
+                for column, column_dates in zip(columns, dates, strict=True):
+                    column_dates.update(either_dates(self._moments(rows, column)))
                 if any(stated_order(date) is not None for date in dates):
                     break
         order = day_before_month(dates)
@@ -442,21 +444,25 @@ class _Log:
             self.order = f"dates read as {'day, month' if order else 'month, day'}: none has a number over 12"
         return order
 
-    def joined(self, blocks: list[_Block]) -> tuple[dict[int, NDArray[Any]], list[str]]:
+    def join_blocks(self, blocks: list[_Block]) -> tuple[dict[int, NDArray[Any]], list[str]]:
         """Return the columns of blocks, which let go of them, and lines for the history; refuse many words."""
         labels, notes, columns = self.layout.labels, list[str](), dict[int, NDArray[Any]]()
         starts, last = [0, *accumulate(map(len, blocks))], [*self.kinds][-1]
         words = {
-            column: [start + at for start, own in zip(starts, blocks, strict=False) for at in own.words.get(column, ())]
+            column: [
+                start + index
+                for start, block in zip(starts, blocks, strict=False)
+                for index in block.words.get(column, ())
+            ]
             for column in self.kinds
         }
-        for column, at in words.items():  # each column's blocks are let go before the next is joined
+        for column, indices in words.items():  # each column's blocks are let go before the next is joined
             first = next((block.first[column] for block in blocks if len(block.words.get(column, ()))), "")
-            if at and self.worded[column] > MOST_WORDS * self.total:
+            if indices and self.worded[column] > MOST_WORDS * self.total:
                 stamped = self.stamped and self.kinds[column] == "time"
                 raise InputError(f"{_STAMP_RULE if stamped else 'a sample must be a number'}, got {first}")
-            if at:
-                many = f"{counted(len(at), 'cell')} without a number read as missing"
+            if indices:
+                many = f"{counted(len(indices), 'cell')} without a number read as missing"
                 notes.append(f"column {labels[column].whole}: {many}, first {first}")
             parts = [block.columns.pop(column) for block in blocks] or [np.empty(0)]
             if self.stamped and self.kinds[column] == "time":  # blocks before the first stamp have no moments

@@ -152,8 +152,8 @@ def _look(body: Sequence[str]) -> tuple[str, str, int]:
 def _header_labels(line: str, delimiter: str, width: int = 0) -> list[str]:
     if delimiter == " ":
         labels = _SPACED_LABEL.findall(line)
-        apart = re.split(r"\s{2,}|\t", line.strip())  # names with a blank, in columns that two part
-        return apart if len(labels) != width == len(apart) else labels
+        columns = re.split(r"\s{2,}|\t", line.strip())  # names with a blank, in columns that two part
+        return columns if len(labels) != width == len(columns) else labels
     return [cell.strip() for cell in cells_of(line, delimiter)]
 
 
@@ -187,11 +187,11 @@ def _heading(lines: Sequence[str], first: int, delimiter: str, width: int, decim
             break
         rows.append(row)
     if rows:
-        labels, taken = _keyed(rows) or _stacked(rows)
-        own = [
+        labels, depth = _keyed(rows) or _stacked(rows)
+        label_lines = [
             line for line, row in zip(above, rows, strict=False) if row[0].strip().casefold() in WORDS["row"]["label"]
         ]
-        return described(labels, [cells_of(line, delimiter) for line in [*own, *above[taken:]][::-1]]), taken
+        return described(labels, [cells_of(line, delimiter) for line in [*label_lines, *above[depth:]][::-1]]), depth
     if above[0].startswith(COMMENTS) and not above[0].startswith(OWN_MARK):
         commented = names(above[0].lstrip('#%/!" ').rstrip('"'))
         return ([Label.parse(name) for name in commented], 1) if commented else ([], 0)
@@ -201,34 +201,35 @@ def _heading(lines: Sequence[str], first: int, delimiter: str, width: int, decim
 def _keyed(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int] | None:
     """Return (labels, rows taken) where rows, lowest first, say what they hold: `Name`, `Unit`; else None."""
     keys = [row[0].strip().rstrip(":").casefold() for row in rows]
-    at = next((i for i, key in enumerate(keys) if key in WORDS["row"]["name"] and _width(rows[i]) > 1), None)
+    heading = next((i for i, key in enumerate(keys) if key in WORDS["row"]["name"] and _width(rows[i]) > 1), None)
     unit = next((i for i, key in enumerate(keys) if key in WORDS["row"]["unit"]), None)
-    if at is None or unit is None:
+    if heading is None or unit is None:
         return None
-    texts = [rows[0][0] if _width(rows[0]) == 1 else rows[at][0], *rows[at][1:]]  # a name of the first column alone
+    # a name of the first column alone
+    texts = [rows[0][0] if _width(rows[0]) == 1 else rows[heading][0], *rows[heading][1:]]
     units = chain([None], _unit_cells(rows[unit][1:]) or [], repeat(None))
-    return [Label.parse(name, given) for name, given in zip(texts, units, strict=False)], max(at, unit) + 1
+    return [Label.parse(name, unit_text) for name, unit_text in zip(texts, units, strict=False)], max(heading, unit) + 1
 
 
 def _stacked(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int]:
     """Return (labels, rows taken) of rows, lowest first: names, units below or above, groups over them, rulers."""
     skipped = next((i for i, row in enumerate(rows[:-1]) if not _tells_nothing(row)), len(rows) - 1)
     row, *over = rows[skipped:]
-    texts, taken = list(row), skipped + 1
+    texts, depth = list(row), skipped + 1
     units = (_numbered_units(row) or _unit_cells(row)) if over else None
     if units is not None:
-        texts, over, taken = list(over[0]), over[1:], taken + 1
+        texts, over, depth = list(over[0]), over[1:], depth + 1
     elif over and (units := _unit_cells(over[0])) is not None and None not in units and len(units) == len(row) > 1:
-        over, taken = over[1:], taken + 1
+        over, depth = over[1:], depth + 1
     else:
         units = []
     known = {name.casefold() for name in CHANNEL_UNITS}
     if over and not any(Label.parse(text).name.casefold() in known for text in texts) and any(map(measures, over[0])):
         groups = accumulate(chain(over[0], repeat("")), lambda before, cell: cell.strip() or before, initial="")
         texts = [f"{group} {text}".strip() for text, group in zip(texts, islice(groups, 1, None), strict=False)]
-        taken += 1
+        depth += 1
     labels = [Label.parse(name, unit) for name, unit in zip(texts, chain(units, repeat(None)), strict=False)]
-    return x_y_pairs(labels), taken
+    return x_y_pairs(labels), depth
 
 
 def _numbered_units(row: Sequence[str]) -> list[str | None] | None:
@@ -277,7 +278,7 @@ def layout_of(head: bytes, encoding: str, whole: bool, place: str) -> Layout:
         likely = max("\t;,|", key=content[0].count) if any(sign in content[0] for sign in "\t;,|") else " "
         names = _header_labels(content[0], delimiter if width > 1 else likely)
         raise InputError(f"a recording must have samples, got no row of numbers after {', '.join(names)[:80]}")
-    labels, taken = _heading(lines, first, delimiter, width, decimal)
+    labels, depth = _heading(lines, first, delimiter, width, decimal)
     notes: list[str] = []
     if not labels:
         labels = [Label(str(i + 1), str(i + 1)) for i in range(width)]
@@ -285,7 +286,7 @@ def layout_of(head: bytes, encoding: str, whole: bool, place: str) -> Layout:
     if cell_units:
         labels = with_units(labels, cell_units, place)
     above = [line for line in written[:first] if line.strip()]
-    remarks = above[: len(above) - taken]
+    remarks = above[: len(above) - depth]
     plain = [line for line in remarks if not line.startswith(COMMENTS)]
     unused = len(plain) - len(of_lines(plain, delimiter))
     if unused > 0:
@@ -320,7 +321,7 @@ def _first_row(lines: Sequence[str], body: Sequence[str], delimiter: str, decima
     numeric = [
         i for i in range(width) if 2 * sum(row[i] for row in values) > sum(not is_missing(row[i]) for row in rows)
     ]
-    worded = any(not own[0] and not is_missing(row[0]) for row, own in zip(rows, values, strict=True))
+    worded = any(not numbers[0] and not is_missing(row[0]) for row, numbers in zip(rows, values, strict=True))
     least = max(1, min(width, (numeric or [0])[-1] + 1))
     for index, line in enumerate(lines):
         cells = cells_of(line, delimiter) if _is_content(line) else []
@@ -334,7 +335,7 @@ def _first_row(lines: Sequence[str], body: Sequence[str], delimiter: str, decima
 
 
 def _has_prefixes(body: Sequence[str]) -> bool:
-    """Return whether the numbers of a log end in prefixes of powers of ten, by any delimiter."""
+    """Test whether the numbers of a log end in prefixes of powers of ten, by any delimiter."""
     return any(map(_QUANTITY.search, body)) and any(
         has_prefixes([cells_of(line, sign) for line in body]) for sign in "\t;|,"
     )

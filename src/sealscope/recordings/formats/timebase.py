@@ -67,7 +67,7 @@ _Seconds = tuple[Array, dict[str, Any], list[str]]
 
 @dataclass
 class LogTime:
-    """What the parts of a log that were read before tell of its time.
+    """The time of a log, known from the parts read before.
 
     `head`: their first times, without a unit; `rate`: of the samples [Hz]; `resolution`: of times that these share [s];
     `last`: the last time, as the file has it, and where it is, `end` [s].
@@ -98,7 +98,7 @@ def _parsed_stamp(text: str) -> dict[str, str | None] | None:
 
 
 def is_stamp(text: str) -> bool:
-    """Return whether `text` is a date stamp or the time of a day that `stamps` can read."""
+    """Test whether `text` is a date stamp or the time of a day that `stamps` can read."""
     return _parsed_stamp(text) is not None
 
 
@@ -134,7 +134,7 @@ def either_dates(cells: Iterable[str]) -> dict[str, None]:
 
 
 def stated_order(dates: Iterable[str]) -> bool | None:
-    """Return whether the day is before the month in the first of the `either_dates` that tells; None where none does.
+    """Test whether the day is before the month in the first unambiguous one of the `either_dates`; None without.
 
     It has one number over 12.
     """
@@ -143,7 +143,7 @@ def stated_order(dates: Iterable[str]) -> bool | None:
 
 
 def day_before_month(columns: Collection[Iterable[str]]) -> bool:
-    """Return whether the day stands before the month in the `either_dates` of columns that follow one rule.
+    """Decide whether the day stands before the month in the `either_dates` of columns that follow one rule.
 
     By their `stated_order`; else in the order in which no column goes back; else in which they span less time; else
     before a hyphen and not before a stroke.
@@ -155,8 +155,8 @@ def day_before_month(columns: Collection[Iterable[str]]) -> bool:
     ranks = {}
     for day_first in (hyphen, not hyphen):
         days = [[_day(text, day_first) for text in column] for column in columns]
-        ends = [day for own in days for day in own if day]
-        ranks[day_first] = any(own != sorted(own) for own in days), max(ends, default=0) - min(ends, default=0)
+        ends = [day for dates in days for day in dates if day]
+        ranks[day_first] = any(dates != sorted(dates) for dates in days), max(ends, default=0) - min(ends, default=0)
     return min(ranks, key=ranks.__getitem__)
 
 
@@ -183,18 +183,18 @@ def _is_moment(text: str) -> bool:
 
 
 def counts_from_1970(clock: float) -> bool:
-    """Return whether a clock [s] is that of a date, as opposed to one that counts from the start of a machine."""
+    """Test whether a clock [s] counts from 1970, and not from the start of a machine."""
     return _EARLIEST_EPOCH < clock < _LATEST_EPOCH
 
 
 def iso_moment(moment: np.datetime64) -> str:
-    """Format a moment as an ISO stamp with as many decimals as it has: `2024-05-31T12:00:00.25`."""
+    """Format a moment as an ISO stamp, without trailing zeros: `2024-05-31T12:00:00.25`."""
     text = str(moment)
     return text.rstrip("0").rstrip(".") if "." in text else text
 
 
 def clock_text(clock: float) -> str:
-    """Format a clock [s] as a date and time of the day in UTC where it counts from 1970, else as seconds."""
+    """Format a clock [s]: the date and time of the day in UTC if it counts from 1970, else seconds."""
     if not counts_from_1970(clock):
         return f"{clock:.0f} s"
     return str(np.datetime64(round(clock), "s")).replace("T", " ") + " UTC"
@@ -255,7 +255,7 @@ def _shortest(value: float, slack: float) -> float:
 
 
 def falling(times: NDArray[Any]) -> bool:
-    """Return whether every time (n,) is before the one above it, as in logs that begin with the last sample."""
+    """Test whether every time (n,) is before the one above it, as in logs that begin with the last sample."""
     return len(times) > 1 and bool(np.all(times[1:] < times[:-1]))
 
 

@@ -38,7 +38,7 @@ def described(labels: Sequence[Label], rows: Sequence[Sequence[str]]) -> list[La
                 names.setdefault(_key(label), cell)
         elif typed is not None and typed < len(cells):
             names.setdefault(_plain(cells[0]), cells[typed])
-    return [_named(label, names.get(_key(label), "")) for label in labels]
+    return [_rename_label(label, names.get(_key(label), "")) for label in labels]
 
 
 def _plain(text: str) -> str:
@@ -50,12 +50,12 @@ def _key(label: Label) -> str:
     return _plain(label.name.rpartition(" ")[2] or label.name)
 
 
-def _named(label: Label, name: str) -> Label:
+def _rename_label(label: Label, name: str) -> Label:
     if not name or len(name) > _LONGEST or _plain(name) == _key(label):
         return label
     typed = Label.parse(name)
-    own = label.name.rpartition(" ")[2]
-    return replace(label, name=typed.name, unit=label.unit or typed.unit, called=own)
+    last_word = label.name.rpartition(" ")[2]
+    return replace(label, name=typed.name, unit=label.unit or typed.unit, called=last_word)
 
 
 def scope_heading(lines: Sequence[str], delimiter: str) -> tuple[list[Label], int] | None:
@@ -71,9 +71,9 @@ def scope_heading(lines: Sequence[str], delimiter: str) -> tuple[list[Label], in
     properties = {row[0]: row for row in rows[begin:]}
     names, units, labels = properties["Name"], properties.get("Unit", []), []
     for column, name in enumerate(names):
-        given = units[column] if column < len(units) else ""
-        measured = _MEASURED.fullmatch(given)
-        unit = (measured[1] if measured else given).strip()
+        text = units[column] if column < len(units) else ""
+        measured = _MEASURED.fullmatch(text)
+        unit = (measured[1] if measured else text).strip()
         labels.append(Label("t [ms]", "t", "ms") if name == "Name" else Label.parse(name, unit or None))
     return labels, sum(1 for line in lines[begin:] if line.strip())
 
@@ -91,11 +91,11 @@ def x_y_pairs(labels: Sequence[Label]) -> list[Label]:
     heads = [_PAIRED["x"].fullmatch(label.name.replace("_", " ")) for label in times]
     tails = [_PAIRED["y"].fullmatch(label.name.replace("_", " ")) for label in values]
     bare = all(head is not None and not head["name"] for head in heads)
-    alike = all(
+    same_names = all(
         head is not None and tail is not None and head["name"].casefold() == tail["name"].casefold()
         for head, tail in zip(heads, tails, strict=True)
     )
-    if not (bare or alike):
+    if not (bare or same_names):
         return list(labels)
     result = []
     for time, value, tail in zip(times, values, tails, strict=True):

@@ -44,7 +44,7 @@ class Label:
 
 
 def is_unit(text: str) -> bool:
-    """Return whether a text is a known unit."""
+    """Test whether a text is a known unit."""
     try:
         parse_unit(text)
     except InputError:
@@ -70,12 +70,12 @@ def _round_brackets_or_stroke(text: str) -> tuple[str, str | None]:
         if end > 1 and text[end - 1].isspace() and unit[:1].isspace() and all(unit[1:].split("/")):
             ends.append((end - 1, end + 1))
     depth = opened = 0
-    for at in range(len(text) - 1, -1, -1) if text.endswith(")") else ():
-        depth += {")": 1, "(": -1}.get(text[at], 0)
-        opened += text[at] == "("
+    for index in range(len(text) - 1, -1, -1) if text.endswith(")") else ():
+        depth += {")": 1, "(": -1}.get(text[index], 0)
+        opened += text[index] == "("
         if depth == 0:
             if opened <= 2:
-                ends.append((len(text[:at].rstrip()), at))
+                ends.append((len(text[:index].rstrip()), index))
             break
     end, begin = min(ends, default=(0, 0))
     if not end:

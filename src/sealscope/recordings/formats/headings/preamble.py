@@ -29,9 +29,9 @@ _OIL = re.compile(r"temp|oil|öl|oel|fluid|huile|olio|aceite", re.IGNORECASE)
 _QUANTITY = re.compile(r"(?P<number>[+-]?\d{1,12}(?:[.,]\d{1,12})?(?:[eE][+-]?\d{1,3})?)\s*(?P<unit>\S{0,10}).*")
 
 
-def stated_rate(about: Mapping[str, str]) -> float | None:
-    """Return the sampling rate [Hz] that a file's entries state, as a rate or as an interval; None without."""
-    for name, text in about.items():
+def stated_rate(remarks: Mapping[str, str]) -> float | None:
+    """Find the sampling rate [Hz] in a file's entries, stated by a rate or an interval; None without."""
+    for name, text in remarks.items():
         label = Label.parse(name)
         if label.unit is None and (ending := _ENDING.fullmatch(label.name)):  # SamplePeriod_ms
             label = Label(name, ending["name"], ending["unit"])
@@ -52,9 +52,9 @@ def stated_rate(about: Mapping[str, str]) -> float | None:
     return None
 
 
-def exported_from(about: Mapping[str, str]) -> np.datetime64 | None:
-    """Return the moment at which a TwinCAT Scope export says that it begins, None where it does not."""
-    for name, entry in about.items():
+def exported_from(remarks: Mapping[str, str]) -> np.datetime64 | None:
+    """Find the stated start of a TwinCAT Scope export; None without."""
+    for name, entry in remarks.items():
         match = _FILETIME.match(entry) if name.casefold().startswith(("starttime", "start time")) else None
         if match is not None:
             return np.datetime64(int(match[1]) * 100 - _FROM_1601_TO_1970, "ns")
@@ -75,8 +75,8 @@ def entries(pairs: Iterable[tuple[object, object]]) -> dict[str, str]:
 
 def remarks_of(provenance: Mapping[str, object]) -> dict[str, str]:
     """Return the entries that a recording's provenance holds, whoever has written it."""
-    about = provenance.get("about")
-    return entries(about.items()) if isinstance(about, Mapping) else {}
+    remarks = provenance.get("about")
+    return entries(remarks.items()) if isinstance(remarks, Mapping) else {}
 
 
 def of_lines(lines: Sequence[str], delimiter: str) -> dict[str, str]:

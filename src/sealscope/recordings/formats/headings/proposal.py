@@ -53,19 +53,23 @@ def proposed_map(labels: Sequence[Label]) -> dict[str, str]:
     A column that bears a channel's own name is left out, and a channel that several columns could be. A unit at the end
     of a name (``PA_bar``) becomes the column's unit.
     """
-    own = {label.name.casefold() for label in labels} & {name.casefold() for name in CHANNEL_UNITS}
+    channel_names = {label.name.casefold() for label in labels} & {name.casefold() for name in CHANNEL_UNITS}
     head = _side_of_head(labels)
     candidates: dict[str, list[tuple[Label, _Guess]]] = {}
     for label in labels:
-        guess = None if label.name.casefold() in own else _guess(label, head)
+        guess = None if label.name.casefold() in channel_names else _guess(label, head)
         if guess is not None and guess.channel is not None:
             candidates.setdefault(guess.channel, []).append((label, guess))
-    if "p_A" not in candidates and "p_B" not in candidates and not {"p_a", "p_b"} & own:
+    if "p_A" not in candidates and "p_B" not in candidates and not {"p_a", "p_b"} & channel_names:
         for channel, pumped in (("p_A", "p_1"), ("p_B", "p_2")):  # pressures 1 and 2 alone are those of the chambers
             if pumped in candidates:
                 candidates[channel] = candidates.pop(pumped)
-    driven = ({*candidates} | own) & {"omega", "theta"}
-    if ("u" in candidates or "u" in own) and not driven and not {"p_1", "p_2"} & ({*candidates} | own):
+    driven = ({*candidates} | channel_names) & {"omega", "theta"}
+    if (
+        ("u" in candidates or "u" in channel_names)
+        and not driven
+        and not {"p_1", "p_2"} & ({*candidates} | channel_names)
+    ):
         for channel, kind in (("p_1", "before"), ("p_2", "behind")):  # of a valve, whose command is recorded
             candidates[channel] = [(label, guess) for label in labels if (guess := _guess_at_valve(label, kind))]
     result = {}
@@ -75,7 +79,7 @@ def proposed_map(labels: Sequence[Label]) -> dict[str, str]:
             columns = [column for column in columns if column[1].kind == "command"]
         if len(columns) > 1:  # what is made of another column gives way to it
             columns = [column for column in columns if not _words_of(column[0].name) & _KIND["made"]]
-        if len(columns) == 1 and channel.casefold() not in own:
+        if len(columns) == 1 and channel.casefold() not in channel_names:
             label, guess = columns[0]
             result[channel] = label.whole + (f"[{guess.unit}]" if guess.unit not in (None, label.unit) else "")
     return {} if set(result) <= {"t"} else result
@@ -87,7 +91,7 @@ def map_options(channel_map: Mapping[str, str]) -> str:
 
 
 def is_time(label: Label) -> bool:
-    """Return whether a column's name says that it holds the time."""
+    """Test whether a column holds the time, by its name."""
     guess = _guess(label)
     return guess is not None and guess.kind == "time"
 
@@ -99,12 +103,12 @@ def unit_of_time(label: Label) -> str | None:
 
 
 def knows(text: str) -> bool:
-    """Return whether a text holds a known word of a script that writes no blanks between words."""
+    """Test whether a text holds a known word of a script without blanks between words."""
     return any(word in text for word in _UNSPACED)
 
 
 def measures(text: str) -> bool:
-    """Return whether a heading says what is measured, in one of the languages known here."""
+    """Test whether a heading names a measured quantity, in one of the languages known here."""
     return _guess(Label.parse(text)) is not None
 
 
@@ -122,20 +126,20 @@ def split_unit(name: str) -> tuple[str, str | None]:
         if kind is not None and not _words_of(before) & _MEASURED[kind]:  # x_s may as well be a set point
             continue
         known = (*CHANNEL_UNITS.values(), "s", "m/s")
-        if is_familiar(unit) and (is_scaled(unit) or any(same_dimension(unit, own) for own in known)):
+        if is_familiar(unit) and (is_scaled(unit) or any(same_dimension(unit, known_unit) for known_unit in known)):
             return before, unit
     return name, None
 
 
 def ends_in(name: str, words: str) -> bool:
-    """Return whether the last words of a column's name are these: `ch2` of `ADC1_Channel_2`, `Pa` of `Main_Pa`."""
+    """Test whether a column's name ends in these words: `ch2` of `ADC1_Channel_2`, `Pa` of `Main_Pa`."""
     tokens = ([token.casefold() for token in _TOKEN.findall(_plain(text))] for text in (name, words))
-    own, wanted = (["channel" if token in WORDS["input"] else token for token in text] for text in tokens)
-    return words[:1].isalpha() and 0 < len(wanted) <= len(own) and own[-len(wanted) :] == wanted
+    name_tokens, ending = (["channel" if token in WORDS["input"] else token for token in text] for text in tokens)
+    return words[:1].isalpha() and 0 < len(ending) <= len(name_tokens) and name_tokens[-len(ending) :] == ending
 
 
 def is_recorded(label: Label) -> bool:
-    """Return whether a column is a measured pressure, position or speed, by its name or its unit."""
+    """Test whether a column is a measured pressure, position or speed, by its name or its unit."""
     if len(label.name) > _LONGEST_NAME:
         return False
     name, ending = split_unit(label.name)
@@ -145,7 +149,7 @@ def is_recorded(label: Label) -> bool:
         return False
     if unit is not None:
         recorded = ("Pa", "m", "rad/s", "m/s", "m^3/s")
-        return unit in WORDS["turns"] or any(same_dimension(unit, own) for own in recorded)
+        return unit in WORDS["turns"] or any(same_dimension(unit, recorded_unit) for recorded_unit in recorded)
     kinds = (*(_MEASURED[kind] for kind in ("pressure", "position", "speed")), _KIND["supply"], _KIND["velocity"])
     return len(name) > 1 and any(words & known for known in kinds)
 
@@ -167,7 +171,7 @@ def _words_of(name: str) -> set[str]:
 
 
 def _side_of_head(labels: Sequence[Label]) -> str:
-    """Return which chamber the columns called head are of: A beside a rod, B beside a cap; empty where unknown."""
+    """Return the chamber of the columns called head: A beside a rod, B beside a cap; empty where unknown."""
     words = {word for label in labels if len(label.name) <= _LONGEST_NAME for word in _words_of(label.name)}
     if not words & _SIDE["head"]:
         return ""
@@ -175,7 +179,7 @@ def _side_of_head(labels: Sequence[Label]) -> str:
 
 
 def _guess(label: Label, head: str = "") -> _Guess | None:
-    """Return what a column's name tells; `head`: the chamber that the word head stands for."""
+    """Guess the meaning of a column from its name; `head`: the chamber that the word head stands for."""
     if len(label.name) > _LONGEST_NAME:
         return None
     name, unit = split_unit(label.name)
@@ -209,17 +213,17 @@ def _guess(label: Label, head: str = "") -> _Guess | None:
 
 
 def _commands(unit: str) -> bool:
-    """Return whether a command may have a unit."""
+    """Test whether a command may have this unit."""
     return is_scaled(unit) or same_dimension(unit, "V")
 
 
 def is_scaled(unit: str) -> bool:
-    """Return whether a unit is a share of full scale, or the current of a valve or of a controller's output."""
+    """Test whether a unit is a share of full scale, or the current of a valve or of a controller's output."""
     return unit in _SHARES or same_dimension(unit, "A")
 
 
 def _guess_at_valve(label: Label, kind: str) -> _Guess | None:
-    """Return what a name tells of a pressure `before` or `behind` a valve; None for any other column."""
+    """Guess a pressure `before` or `behind` a valve from a column's name; None for any other column."""
     name, ending = split_unit(label.name)
     unit = ending if label.unit is None else label.unit
     words = _words_of(name if label.unit is None else label.name)

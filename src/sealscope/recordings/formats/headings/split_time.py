@@ -74,7 +74,7 @@ def joined_time(base: NDArray[Any], parts: Mapping[str, Array], unit: str | None
 
 
 def _falls_back(base: NDArray[Any], offset: Array) -> bool:
-    """Return whether what is below a second grows while the second stays, and begins again with the next."""
+    """Test whether the fraction of a second grows while the second stays, and begins again with the next."""
     steps = np.diff(base) / (np.timedelta64(1, "s") if base.dtype.kind == "M" else 1.0)
     same, next_one, change = steps == 0, steps == 1, np.diff(offset)
     if 2 * np.count_nonzero(same) < steps.size:

@@ -33,7 +33,7 @@ _decoder = json.JSONDecoder()
 
 
 def is_json(head: bytes) -> bool:
-    """Return whether a file that begins with `head` is JSON: an object, or an array, but no heading in brackets."""
+    """Test whether a file that begins with `head` is JSON: an object, or an array, but no heading in brackets."""
     encoding = encoding_of(head)
     text = "" if encoding is None else head.decode(encoding, errors="replace").lstrip("\ufeff \t\r\n\x1e")
     if not _BEGINS.match(text):
@@ -51,7 +51,7 @@ def is_json(head: bytes) -> bool:
     return True
 
 
-def read_json(path: Path, wanted: Wanted) -> RecordingFields:
+def read_json(path: Path, request: Wanted) -> RecordingFields:
     """Read the wanted columns of a JSON file."""
     place = str(path)
     with path.open("rb") as head:
@@ -72,29 +72,29 @@ def read_json(path: Path, wanted: Wanted) -> RecordingFields:
         raise InputError(f"JSON must be plain, got: {str(error)[:80]}") from None
     if not members:
         raise InputError("a recording must have samples, got empty JSON")
-    first, about = members[0], dict[str, str]()
+    first, remarks = members[0], dict[str, str]()
     if len(members) == 1 and isinstance(first, Mapping) and not all(map(_is_cell, first.values())):
-        about = entries((name, value) for name, value in first.items() if isinstance(value, str | int | float))
+        remarks = entries((name, value) for name, value in first.items() if isinstance(value, str | int | float))
         series = list(series_in(_arrays(first, place)))
     else:
         series = _records(members, place)
     if not series:
         raise InputError("JSON must hold records or columns of samples, got none")
-    table = table_of(series, wanted, "JSON", about, stated_rate(about))
+    table = table_of(series, request, "JSON", remarks, stated_rate(remarks))
     note = f"the last value is cut short and left out, after {len(members)} rows"
     return table.with_note(note) if cut else table
 
 
 def _members(text: str) -> Iterator[Any]:
     """Yield the values of a text, one after the other; an array of arrays or objects stands for its members."""
-    at, inside = 0, False
-    while (at := _BETWEEN.match(text, at).end()) < len(text):  # type: ignore[union-attr]
-        if inside and text[at] == "]":
-            inside, at = False, at + 1
-        elif not inside and (opened := _OPENS.match(text, at)):
-            inside, at = True, opened.end()
+    position, inside = 0, False
+    while (position := _BETWEEN.match(text, position).end()) < len(text):  # type: ignore[union-attr]
+        if inside and text[position] == "]":
+            inside, position = False, position + 1
+        elif not inside and (opened := _OPENS.match(text, position)):
+            inside, position = True, opened.end()
         else:
-            member, at = _decoder.raw_decode(text, at)
+            member, position = _decoder.raw_decode(text, position)
             yield member
 
 
@@ -163,7 +163,7 @@ def _records(members: Sequence[Any], place: str) -> list[Series]:
 
 
 def _block_length(member: Mapping[str, Any]) -> int | None:
-    """Return how many samples a block of columns holds: arrays of one length, one of which is the time."""
+    """Return the number of samples of a block of columns: arrays of one length, among them the time; else None."""
     if not all(isinstance(value, list) for value in member.values()):
         return None
     lengths = set(map(len, member.values()))
@@ -171,7 +171,7 @@ def _block_length(member: Mapping[str, Any]) -> int | None:
 
 
 def _array(cells: Sequence[Any], name: str) -> NDArray[Any]:
-    """Return cells as doubles (n,), missing ones as NaN; as texts where some are texts."""
+    """Convert cells to doubles (n,), with NaN for missing ones, or to texts if any is a text."""
     if any(isinstance(cell, str) for cell in cells):
         texts = ["" if cell is None or is_missing(str(cell)) else str(cell) for cell in cells]
         check_texts(len(texts), max(map(len, texts)), name)

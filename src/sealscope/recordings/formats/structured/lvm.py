@@ -34,8 +34,8 @@ class _Packet:
 
     def entry(self, name: str, index: int) -> str:
         """Return a channel's entry of the header; empty where there is none."""
-        own = self.head.get(name, [])
-        return own[index] if index < len(own) else ""
+        cells = self.head.get(name, [])
+        return cells[index] if index < len(cells) else ""
 
     def number(self, name: str, index: int) -> float:
         try:
@@ -57,11 +57,11 @@ class _Packet:
 
 
 def is_lvm(head: bytes) -> bool:
-    """Return whether a file that begins with `head` is a LabVIEW measurement file: the mark begins a line."""
+    """Test whether a file that begins with `head` is a LabVIEW measurement file: the mark begins a line."""
     return any(f"{end}{_END}".encode(encoding) in head for end in "\n\r" for encoding in ("ascii", "utf-16-le"))
 
 
-def read_lvm(path: Path, wanted: Wanted) -> RecordingFields:
+def read_lvm(path: Path, request: Wanted) -> RecordingFields:
     """Read the wanted channels of a LabVIEW measurement file; packets of the same channels follow each other."""
     with path.open("rb") as file:
         encoding = encoding_of(file.read(SNIFF)) or "cp1252"
@@ -79,8 +79,8 @@ def read_lvm(path: Path, wanted: Wanted) -> RecordingFields:
     if not packets:
         raise InputError("a LabVIEW measurement file must have samples, got a header and no rows")
     series = _series(packets, header.get("x_columns", "one").casefold())
-    about = entries((name, header[name]) for name in ("operator", "project", "description") if name in header)
-    return table_of(series, wanted, "LabVIEW measurement", about)
+    remarks = entries((name, header[name]) for name in ("operator", "project", "description") if name in header)
+    return table_of(series, request, "LabVIEW measurement", remarks)
 
 
 def _packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str, place: str) -> Iterator[_Packet]:
@@ -108,8 +108,8 @@ def _packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str, pla
             if len(packet.rows) % 2**16 == 0:
                 check_size(len(packet.rows), len(names))
         elif in_head:
-            own = cells[1:]  # every second cell is empty where each channel has a time
-            head[cells[0].casefold()] = own[::2] if len(own) > 2 and own[2] and not any(own[1::2]) else own
+            texts = cells[1:]  # every second cell is empty where each channel has a time
+            head[cells[0].casefold()] = texts[::2] if len(texts) > 2 and texts[2] and not any(texts[1::2]) else texts
         else:
             packet = _Packet(head, cells[:-1] if cells[-1].casefold() == "comment" else cells)
             yield packet
@@ -130,26 +130,26 @@ def _series(packets: Sequence[_Packet], x_columns: str) -> list[Series]:
         time = max((before for before in times if before < column), default=times[0]) if multiple else times[0]
         values, seconds = [], []
         for packet, begin in zip(same, begins, strict=True):
-            own = packet.column(column)
+            samples = packet.column(column)
             if multiple:  # it ends in blanks where others go on
-                own = own[: np.flatnonzero(np.isfinite(own)).max(initial=-1) + 1]
-            own_times = packet.column(time)[: own.size]
+                samples = samples[: np.flatnonzero(np.isfinite(samples)).max(initial=-1) + 1]
+            own_times = packet.column(time)[: samples.size]
             if x_columns == "no":
                 step = packet.number("delta_x", index)
                 if not step > 0:
                     raise InputError(f"Delta_X must be > 0 s, got {packet.head.get('delta_x')}")
-                own_times = np.nan_to_num(packet.number("x0", index)) + step * np.arange(own.size)
-            values.append(own)
+                own_times = np.nan_to_num(packet.number("x0", index)) + step * np.arange(samples.size)
+            values.append(samples)
             seconds.append(begin + own_times)
         joined, t = np.concatenate(values), np.concatenate(seconds)
         label = Label.parse(names[column], first.entry("y_unit_label", index) or None)
-        clock = Clock(time, partial(lambda *given: given, t, first.moment(index, day_first)))
+        clock = Clock(time, partial(lambda *reading: reading, t, first.moment(index, day_first)))
         series.append(Series("", label, t.size, partial(np.asarray, joined), clock))
     return series
 
 
 def _begins(packets: Sequence[_Packet], day_first: bool) -> list[float]:
-    """Return what is added to the times of each packet [s], where its own do not go on and the moments are known."""
+    """Compute the offset of each packet's times [s]: 0 if they go on from packet to packet or a moment is unknown."""
     moments = [packet.moment(0, day_first) for packet in packets]
     firsts = [packet.number("x0", 0) for packet in packets]
     known = [moment for moment in moments if moment is not None]

@@ -61,7 +61,7 @@ def _fields(value: Any) -> Mapping[str, Any] | None:
 def _group(group: str, name: str, fields: Mapping[str, Any], clock: Clock | None, depth: int) -> Iterator[Series]:
     by_name = {key.rstrip("_").casefold(): value for key, value in fields.items()}
     data, unit = by_name.get("data"), _first_text(by_name, _UNIT_FIELDS)
-    samples = next((own for key in _SAMPLE_FIELDS if _is_vector(own := by_name.get(key))), None)
+    samples = next((vector for key in _SAMPLE_FIELDS if _is_vector(vector := by_name.get(key))), None)
     if (time := _times(by_name)) is not None:
         clock = _clock((group, name, depth), time)
         if "signals" in by_name:  # a structure with time, as Simulink's scopes write
@@ -76,9 +76,9 @@ def _group(group: str, name: str, fields: Mapping[str, Any], clock: Clock | None
         yield from _walk(group, "data", data, clock, depth + 1)  # vectors that share the time beside them
         return
     if samples is not None and unit is not None:  # a signal with its name and unit beside its samples
-        own = by_name.get("time", by_name.get("t"))
-        if isinstance(own, np.ndarray) and own.dtype.kind in "fiu" and own.size == samples.size:
-            clock = _clock((group, name, depth), own.reshape(-1).astype(np.float64))
+        instants = by_name.get("time", by_name.get("t"))
+        if isinstance(instants, np.ndarray) and instants.dtype.kind in "fiu" and instants.size == samples.size:
+            clock = _clock((group, name, depth), instants.reshape(-1).astype(np.float64))
         yield from _columns(group, _first_text(by_name, _NAME_FIELDS) or name, samples, unit or None, clock)
         return
     if "values" in by_name and _text(by_name.get("name")):  # a signal of a Simulink log, named by the log
@@ -136,7 +136,7 @@ def _column_names(fields: Mapping[str, Any]) -> list[str]:
 
 
 def _times(by_name: Mapping[str, Any]) -> NDArray[np.float64] | None:
-    """Return the times (n,) [s] that fields hold, as numbers or as start, increment and length; None without."""
+    """Read the times (n,) [s] from fields: numbers, or a start, increment and length; None without."""
     if "signals" not in by_name and "data" not in by_name:
         return None
     time = by_name.get("time")
@@ -202,6 +202,6 @@ def number_of(value: Any) -> float | None:
 
 
 def entry_of(value: Any) -> str:
-    """Return the only text or number that a value holds as an entry about a recording; empty where it holds neither."""
+    """Format a value, a single text or number, for an entry about a recording; empty for any other value."""
     number = number_of(value)
     return _text(value) if number is None else f"{number:.12g}"
