@@ -167,7 +167,9 @@ def find_rests(increments: Array, rate: float, still: float) -> NDArray[np.bool_
     if still < 0.0 or len(increments) < size + least:
         return np.zeros(len(increments), dtype=bool)
     known = np.isfinite(increments)
-    volume, missing = (np.concatenate([[0], np.cumsum(of)]) for of in (np.where(known, increments, 0.0), ~known))
+    volume, missing = (
+        np.concatenate([[0], np.cumsum(values)]) for values in (np.where(known, increments, 0.0), ~known)
+    )
     below = np.abs(volume[size:] - volume[:-size]) <= still * size / rate
     below &= missing[size:] == missing[:-size]
     covered = _spread(below, size)  # every interval of a quiet stretch
@@ -339,9 +341,9 @@ def _released(rig: Rig, share: Callable[[Signals], Array | float]) -> Term:
     """Return free air in both chambers at once, each by its volume; `share`: how far side A's balance counts."""
     from sealscope.physics.cylinder import volumes_at_middle
 
-    own = rig.cylinder
-    middle = dict(zip("AB", volumes_at_middle(own), strict=True))
-    areas = {"A": own.A_A, "B": -own.A_B} if own.volumes == "position" else {"A": 0.0, "B": 0.0}
+    cylinder = rig.cylinder
+    middle = dict(zip("AB", volumes_at_middle(cylinder), strict=True))
+    areas = {"A": cylinder.A_A, "B": -cylinder.A_B} if cylinder.volumes == "position" else {"A": 0.0, "B": 0.0}
 
     def released(s: Signals) -> Array:
         by_A = share(s)
@@ -354,7 +356,7 @@ def _released(rig: Rig, share: Callable[[Signals], Array | float]) -> Term:
 
 
 def _lost_outside(side: str, share: float = 1.0) -> Term:
-    """Return what one side loses to the outside; `share`: how far it counts in the balance, and its sign there."""
+    """Return the external leak of one side; `share`: how far it counts in the balance, and its sign there."""
     name = f"p_{side}"
     return Term(
         f"external leak {side}",
@@ -369,7 +371,7 @@ def _lost_outside(side: str, share: float = 1.0) -> Term:
 
 
 def _made_up(side: str) -> Term:
-    """Return what is lost to the outside on one side and made up by a check valve on the side of lower pressure.
+    """Return the external leak of one side, made up by a check valve on the side of lower pressure.
 
     While that is the same side, the balance shows nothing. What B loses the pump need not take: it is negative.
     """
@@ -484,7 +486,7 @@ class _Way(NamedTuple):
 
 
 def _edges(side: str) -> tuple[Term, ...]:
-    """Return what a chamber's edges pass: over their gain; late, by the spool's lag; by overlap, underlap and wear."""
+    """Return the flow of a chamber's edges over their gain; late, by the spool's lag; by overlap, underlap and wear."""
     terms = []
     for way in (_Way.of(side, True), _Way.of(side, False)):
 
@@ -550,7 +552,7 @@ _STORED = tuple(
 
 
 def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
-    """Return the balance of what a pump delivers where the piston displaces nothing; None where no channel gives it.
+    """Return the balance of a pump's delivery while the piston displaces nothing; None if no channel gives it.
 
     Over whole cycles or at standstill: neither motion nor position is in it. A zero of the flow is not told from
     leakage under a steady load, and is taken for none.
@@ -578,7 +580,7 @@ def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
 
 
 def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array] | None:
-    """Return what gives the increments of the volume that the pump delivers [m^3]; None where nothing recorded does.
+    """Return the function for the increments of the pump's delivered volume [m^3]; None if no channel gives them.
 
     By its angle, its speed, a flow meter, or the speed that the drive makes of the command. A meter's scale for each
     direction is in the areas of that direction.
