@@ -121,23 +121,23 @@ class BlockStream:
         length = self._strides * self._stride
         tail = (SPAN - 1) * self._stride + 1 + (0 if last else self._margin)
         count = max(0, (self._have - tail) // length)
-        waits = 1 if last or self._weighting.begun else self._support or 1
+        waits = 1 if last or self._weighting.has_blocks else self._support or 1
         if count <= self._done or (self._done == 0 and count < waits):
             return None
-        joined = self._joined()
+        joined = self._join_pieces()
         ends = [count]
         if self._support is not None:  # those that support the stream together, then one by one, whatever the pieces
-            first = self._done + 1 if self._weighting.begun else min(self._support, count)
+            first = self._done + 1 if self._weighting.has_blocks else min(self._support, count)
             ends = list(range(first, count + 1))
         parts = [self._close(joined, *pair) for pair in zip([self._done, *ends[:-1]], ends, strict=True)]
-        blocks = parts[0] if len(parts) == 1 else Blocks.joined(parts)
+        blocks = parts[0] if len(parts) == 1 else Blocks.join(parts)
         self._done = count
         first_kept = max(0, count * length - self._margin)
         self._pieces = [{name: values[first_kept - self._first :].copy() for name, values in joined.items()}]
         self._first = first_kept
         return blocks
 
-    def _joined(self) -> dict[str, Array]:
+    def _join_pieces(self) -> dict[str, Array]:
         if len(self._pieces) == 1:
             return dict(self._pieces[0])
         names = self._pieces[0] if self._pieces else ()
@@ -146,7 +146,7 @@ class BlockStream:
     def state(self) -> dict[str, Any]:
         """Return the state of the stream in plain values for JSON."""
         return {
-            "samples": {name: plain_array(values) for name, values in self._joined().items()},
+            "samples": {name: plain_array(values) for name, values in self._join_pieces().items()},
             "begin": self._begin,
             "first": self._first,
             "done": self._done,
@@ -197,7 +197,7 @@ class BlockStream:
             left, moved = self._balances[0].left(signals), signals.step("x")
             self._still = _still_rate(left, self._rate), _still_rate(moved, self._rate)
         batch = max(1, AT_ONCE // length)
-        cuts = [self._cut(samples, k, min(k + batch, end)) for k in range(first, end, batch)]
+        cuts = [self._cut_rows(samples, k, min(k + batch, end)) for k in range(first, end, batch)]
         weights = np.concatenate([cut.weights for cut in cuts])
         counted, roots = weights > 0.0, np.sqrt(weights[weights > 0.0])[:, None]
         values = [np.concatenate(pieces)[counted] * roots for pieces in zip(*(cut.rows for cut in cuts), strict=True)]
@@ -212,7 +212,7 @@ class BlockStream:
         zeros = np.full(end - first, self._zero)
         return Blocks(start, last, gram, weights.reshape(-1, self._strides).sum(axis=1), flow, pressures, zeros)
 
-    def _cut(self, samples: Mapping[str, Array], first: int, end: int) -> _Cut:
+    def _cut_rows(self, samples: Mapping[str, Array], first: int, end: int) -> _Cut:
         """Return the rows of blocks `first` to `end`."""
         length = self._strides * self._stride
         start = first * length
@@ -327,16 +327,16 @@ def commanded(samples: Mapping[str, Array], rig: Rig, rate: float, *, loaded: bo
     drive = Drive.from_rig(rig)
     derived = {START: np.exp(-np.arange(len(samples["p_A"])) / (rate * drive.lag))}
     if flow_source(samples) == "u":
-        u, load = _held(samples["u"]), np.zeros(len(samples["u"]))
+        u, load = _hold_missing(samples["u"]), np.zeros(len(samples["u"]))
         if loaded:
-            dp = _held(samples["p_A"] - samples["p_B"])
+            dp = _hold_missing(samples["p_A"] - samples["p_B"])
             load = dp if float((u - u.mean()) @ (dp - dp.mean())) >= 0.0 else -dp
         speed = drive.flow(u, load, rate) / drive.displacement
         derived["omega"] = np.where(np.isnan(samples["u"]), np.nan, speed)
     return {**samples, **derived}
 
 
-def _held(values: Array) -> Array:
+def _hold_missing(values: Array) -> Array:
     """Fill each missing value of an array (n,) with the one before it; 0 at the beginning."""
     last = np.maximum.accumulate(np.where(np.isnan(values), -1, np.arange(len(values))))
     return np.where(last < 0, 0.0, values[last])

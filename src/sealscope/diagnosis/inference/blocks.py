@@ -109,7 +109,7 @@ class Blocks:
         return np.asarray(np.abs(np.sign(difference) * np.sqrt(np.abs(difference)) - (zero or 0.0)).mean(axis=1))
 
     @classmethod
-    def joined(cls, parts: Sequence[Blocks]) -> Blocks:
+    def join(cls, parts: Sequence[Blocks]) -> Blocks:
         """Return blocks one after the other."""
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
 
@@ -167,7 +167,7 @@ class Weighting:
         self._count = 0
 
     @property
-    def begun(self) -> bool:
+    def has_blocks(self) -> bool:
         """True once blocks were closed."""
         return self._count > 0
 
@@ -348,7 +348,7 @@ def _fit(gram: Array, blocks: Blocks, columns: Columns, test: int, nuisance: lis
     believed = _Prior(np.append(columns.levels[nuisance], np.inf), size, width)
     chosen, slope = [*nuisance, gram.shape[1]], np.zeros(len(blocks))
     for turn in range(_TURNS + 1):
-        normal = _normal(_about(gram, columns, test, slope, zero), powers, chosen, test, columns.left)
+        normal = _normal(_shift_zero(gram, columns, test, slope, zero), powers, chosen, test, columns.left)
         fitted = _fitted(normal, believed._replace(at=zero), degrees, rows)
         step = float(fitted.coefficients[-degrees])
         if turn == _TURNS or not width > 0.0 or (turn > 0 and abs(step) <= TOLERANCE * width):
@@ -358,7 +358,7 @@ def _fit(gram: Array, blocks: Blocks, columns: Columns, test: int, nuisance: lis
     return _Fit(normal, fitted, zero)
 
 
-def _about(gram: Array, columns: Columns, test: int, slope: Array, zero: float) -> Array:
+def _shift_zero(gram: Array, columns: Columns, test: int, slope: Array, zero: float) -> Array:
     """Return the sums with the tested column taken about a zero of the pressures.
 
     Last the column of the zero's error: -slope dt, of each block.
@@ -382,7 +382,7 @@ def _eliminated(gram: Array, blocks: Blocks, columns: Columns, test: int, nuisan
     return 0.5 * (precision + precision.T), vector
 
 
-def _beside(columns: Columns) -> list[int]:
+def _nuisance_columns(columns: Columns) -> list[int]:
     """Return the columns whose coefficients are unknown beside the leak's."""
     return [k for k in columns.nuisance if k != columns.leak]
 
@@ -399,7 +399,7 @@ def zero_of(blocks: Blocks, columns: Sequence[Columns], test: int | None = None)
     `test`: the column of the leak through an orifice, then the zero is that of its root [Pa^0.5], beside the sums'.
     """
     fits = [
-        _fit(blocks.gram[:, e], blocks, equation, equation.leak if test is None else test, _beside(equation))
+        _fit(blocks.gram[:, e], blocks, equation, equation.leak if test is None else test, _nuisance_columns(equation))
         for e, equation in enumerate(columns)
     ]
     zero = float(np.mean([fit.zero for fit in fits]))
@@ -415,11 +415,11 @@ def pair(blocks: Blocks, columns: Columns) -> tuple[Array, Array, Array]:
     assert bias is not None
     gram = blocks.gram[:, 0].copy()
     middle = gram[:, leak, bias] / np.maximum(gram[:, bias, bias], np.finfo(float).tiny)
-    fit = _fit(gram, blocks, columns, leak, _beside(columns))
+    fit = _fit(gram, blocks, columns, leak, _nuisance_columns(columns))
     gram[:, leak] -= middle[:, None] * gram[:, bias]
     gram[:, :, leak] -= middle[:, None] * gram[:, :, bias]
     nuisance = [k for k in columns.nuisance if k not in (leak, bias)]
-    position = _beside(columns).index(bias)
+    position = _nuisance_columns(columns).index(bias)
     powers, _ = _drifts(blocks)
     prior = np.delete(fit.fitted.precision.reshape(-1, powers.shape[1])[:-1], position, axis=0).ravel()
     of_leak, of_bias = (_normal(gram, powers, nuisance, k, columns.left) for k in (leak, bias))
@@ -432,7 +432,7 @@ def pair(blocks: Blocks, columns: Columns) -> tuple[Array, Array, Array]:
 
 def mean_of(blocks: Blocks, columns: Columns, shares: Mapping[int, float]) -> tuple[float, float]:
     """Return a mean of coefficients, by their columns' `shares`, and its deviation; the leak is free in each block."""
-    nuisance = _beside(columns)
+    nuisance = _nuisance_columns(columns)
     normal, fitted, _ = _fit(blocks.gram[:, 0], blocks, columns, columns.leak, nuisance)
     weights = np.zeros((len(nuisance) + 1, len(fitted.coefficients) // (len(nuisance) + 1)))
     for column, share in shares.items():
@@ -447,7 +447,7 @@ def total(blocks: Blocks, columns: Sequence[Columns]) -> Array:
     """Return a recording's sums (E, m, m), over the rows' variance."""
     sums = []
     for e, equation in enumerate(columns):
-        nuisance = _beside(equation)
+        nuisance = _nuisance_columns(equation)
         fit = _fit(blocks.gram[:, e], blocks, equation, equation.leak, nuisance)
         sums.append(blocks.gram[:, e].sum(axis=0) / fit.fitted.variance)
     return np.array(sums)

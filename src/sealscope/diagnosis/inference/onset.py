@@ -154,10 +154,10 @@ class StepTest:
         if not above > 0.0 or not high > 0.0:
             return max(high, 0.0)
 
-        def beyond(share: float) -> float:
+        def excess_chance(share: float) -> float:
             return float(self.weights @ ndtr((self.size - share * high) / deviation)) - (1.0 - probability) * above
 
-        return high * float(brentq(beyond, 0.0, 1.0)) if beyond(1.0) < 0.0 else high
+        return high * float(brentq(excess_chance, 0.0, 1.0)) if excess_chance(1.0) < 0.0 else high
 
     def findable(self, chance: float, power: float = 0.9) -> float:
         """Return the step that is found with probability `power` at a false-alarm probability, at the median onset."""
@@ -187,7 +187,7 @@ class Course(NamedTuple):
         half = WITHIN_95 * float(np.sqrt(np.maximum(weights @ self.covariance @ weights, 0.0)))
         return Interval(value, value - half, value + half)
 
-    def beyond(self, before: NDArray[np.bool_]) -> Course:
+    def relative_to(self, before: NDArray[np.bool_]) -> Course:
         """Return the coefficient beyond its mean over some blocks (K,)."""
         turn = np.eye(len(before)) - before / max(int(np.count_nonzero(before)), 1)
         return Course(turn @ self.mean, turn @ self.covariance @ turn.T)

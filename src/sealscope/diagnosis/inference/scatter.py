@@ -65,12 +65,12 @@ class Mixture(NamedTuple):
         unit = max(float(self.weights @ np.minimum(self.deviations, 1e3 * self.deviations.min())), TINY)
         centres, deviations = self.centres / unit, self.deviations / unit
 
-        def beyond(value: float) -> float:
+        def excess(value: float) -> float:
             return float(self.weights @ ndtr((value - centres) / deviations)) - probability
 
         ends = centres + ndtri(probability) * deviations
         low, high = float(ends.min()), float(ends.max())
-        return unit * (low if not beyond(low) < 0.0 < beyond(high) else float(brentq(beyond, low, high)))
+        return unit * (low if not excess(low) < 0.0 < excess(high) else float(brentq(excess, low, high)))
 
 
 class Rise(NamedTuple):
@@ -92,9 +92,9 @@ class Rise(NamedTuple):
     @property
     def chance(self) -> float:
         """Probability that a healthy recording scores as high."""
-        return self._beyond(self.score)
+        return self._exceedance(self.score)
 
-    def _beyond(self, score: float) -> float:
+    def _exceedance(self, score: float) -> float:
         from scipy.special import ndtr, stdtr
 
         if self.parts is None:
@@ -149,7 +149,7 @@ class RecordingSums(NamedTuple):
     oil_degC: float | None = None
 
     @classmethod
-    def of(
+    def from_blocks(
         cls,
         blocks: Blocks,
         columns: Sequence[Columns],
@@ -209,7 +209,7 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
         between[len(nodes) :, -1, -1] += 2.0 * (relative * oil) ** 2
     shifts = relative * slope * warmer
     most = np.maximum(min(steep * believed["largest"] * by_flow, believed["relative"]), 10.0 * steep * errors)
-    transformed, known = scale.of(values), scale.of(rises) - shifts[:-1]
+    transformed, known = scale.transform(values), scale.transform(rises) - shifts[:-1]
     predicted = Population(between, believed_of).predict(
         transformed - shifts[-1],
         known,
@@ -225,7 +225,7 @@ class _Levels(NamedTuple):
     level: float
     turn: float
 
-    def of(self, excess: Array) -> Array:
+    def transform(self, excess: Array) -> Array:
         """Return z of levels that are so far beyond that of all."""
         return np.asarray(np.arcsinh((self.level + excess) / (2.0 * self.turn)))
 

@@ -135,7 +135,7 @@ class Signals:
         """1 where p_A > p_B, else 0, at each sample."""
         return (self._channels["p_A"] > self._channels["p_B"] + self._zero).astype(float)
 
-    def moved(self, outward: bool, by_A: bool) -> Array:
+    def directed_step(self, outward: bool, by_A: bool) -> Array:
         """Return the increments of x of one direction while one side carries the pressure [m]."""
         out_A, out, by = self._ways
         share = (out_A if by_A else out - out_A) if outward else (by - out_A if by_A else 1.0 - out - by + out_A)
@@ -282,13 +282,13 @@ _LEAKS = (
 )
 
 
-def _moved(outward: bool, by_A: bool) -> Term:
+def _motion_by_side(outward: bool, by_A: bool) -> Term:
     way, side = ("out", "in")[not outward], "AB"[not by_A]
     return Term(
         f"motion {way}, {side} carries",
         f"dx, v {'>=' if outward else '<'} 0, p_{side} the larger",
         "m^2",
-        lambda s: s.moved(outward, by_A),
+        lambda s: s.directed_step(outward, by_A),
         "sensor fault",
         "motion",
         needs=("x",),
@@ -377,7 +377,7 @@ def _made_up(side: str) -> Term:
     """
     name = f"p_{side}"
 
-    def lost(s: Signals) -> Array:
+    def made_up_volume(s: Signals) -> Array:
         carries = _middle(s.carried_by_A)
         return np.asarray((carries if side == "A" else carries - 1.0) * np.maximum(s.mean(name), 0.0) * s.dt)
 
@@ -385,7 +385,7 @@ def _made_up(side: str) -> Term:
         f"external leak {side}{MADE_UP}",
         f"{'-' if side == 'B' else ''}[{name} the larger] max({name}, 0) dt",
         "m^3/(s Pa)",
-        lost,
+        made_up_volume,
         "external leak",
         nuisance=False,
         needs=("p_A", "p_B"),
@@ -443,7 +443,7 @@ _START = Term(
 )
 
 _CYLINDER = (
-    *(_moved(outward, by_A) for outward in (True, False) for by_A in (True, False)),
+    *(_motion_by_side(outward, by_A) for outward in (True, False) for by_A in (True, False)),
     *_of_side("A"),
     *_of_side("B"),
     _LAG,
@@ -467,7 +467,7 @@ class _Way(NamedTuple):
     opens: float
 
     @classmethod
-    def of(cls, side: str, rising: bool) -> _Way:
+    def at_chamber(cls, side: str, rising: bool) -> _Way:
         """Return the edge from the supply into a chamber (`rising`), or from the chamber to the return."""
         opens = 1.0 if (side == "A") == rising else -1.0
         return cls(
@@ -488,7 +488,7 @@ class _Way(NamedTuple):
 def _edges(side: str) -> tuple[Term, ...]:
     """Return the flow of a chamber's edges over their gain; late, by the spool's lag; by overlap, underlap and wear."""
     terms = []
-    for way in (_Way.of(side, True), _Way.of(side, False)):
+    for way in (_Way.at_chamber(side, True), _Way.at_chamber(side, False)):
 
         def gain(s: Signals, way: _Way = way) -> Array:
             return np.asarray(np.maximum(way.opens * s.mean("u"), 0.0) * way.root(s) * s.dt)

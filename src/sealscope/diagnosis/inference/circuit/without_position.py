@@ -90,7 +90,7 @@ def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
         return []
     area = max(rig.cylinder.A_A, rig.cylinder.A_B)
     counts = known & (signals.step("u") == 0.0) if shut else known
-    still = _held(np.where(counts, speed, np.inf), recording.rate, area if shut else 0.0)
+    still = _find_holds(np.where(counts, speed, np.inf), recording.rate, area if shut else 0.0)
     begin, balances = float(recording.t[0]), list[CycleBalance]()
     carries = rig.cylinder.single_rod
     if shut:
@@ -105,7 +105,7 @@ def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
     return balances
 
 
-def _held(speed: Array, rate: float, area: float = 0.0) -> NDArray[np.bool_]:
+def _find_holds(speed: Array, rate: float, area: float = 0.0) -> NDArray[np.bool_]:
     """Find the samples in which the piston is held, after it has settled; with an `area`, creep is a standstill."""
     size, settles = max(1, round(_PRIORS["averaged"] * rate)), max(1, round(_PRIORS["settles"] * rate))
     slow = np.abs(np.convolve(speed, np.full(size, 1.0 / size), "same"))

@@ -50,7 +50,7 @@ class PressureEvidence:
     others: Mapping[str, Information] = field(default_factory=dict)
 
     @staticmethod
-    def of(recording: Recording, rig: Rig, information: Mapping[str, Information]) -> PressureEvidence:
+    def from_blocks(recording: Recording, rig: Rig, information: Mapping[str, Information]) -> PressureEvidence:
         """Build the evidence from the likelihood of each parameter in a recording, `information["G"]` of g."""
         edges, dp = block_edges(recording), np.abs(recording["p_A"] - recording["p_B"])
         pressure = np.add.reduceat(dp, edges[:-1]) / np.diff(edges)

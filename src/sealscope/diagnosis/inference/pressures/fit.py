@@ -149,7 +149,7 @@ class Joint:
     variance: float
 
     @staticmethod
-    def of(blocks: Sequence[Block], priors: Priors, seconds: float, parameter: int) -> Joint:
+    def fit(blocks: Sequence[Block], priors: Priors, seconds: float, parameter: int) -> Joint:
         """Fit blocks of so many seconds jointly; the noise has its long-run variance in the score of `parameter`."""
         theta = np.array([block.theta for block in blocks])
         strain = _strain(len(blocks), priors, seconds)

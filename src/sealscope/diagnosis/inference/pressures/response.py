@@ -122,7 +122,7 @@ def _rates(y: State, friction: float, spin: float, now: Parameters, m: Reduced) 
 
 
 @contracted
-def _moved(y: State, h: float, k: State) -> State:
+def _advance(y: State, h: float, k: State) -> State:
     return y[0] + h * k[0], y[1] + h * k[1], y[2] + h * k[2], y[3] + h * k[3], y[4] + h * k[4], y[5] + h * k[5]
 
 
@@ -153,13 +153,13 @@ def simulate_response(
             w_1 = now[GAIN] * (command[sample] + rise * ((step + 0.5) / every)) + ahead
             w_2 = now[GAIN] * (command[sample] + rise * ((step + 1.0) / every)) + ahead
             k_1 = _rates(y, friction, w_0, now, m)
-            y_1 = _moved(y, 0.5 * h, k_1)
+            y_1 = _advance(y, 0.5 * h, k_1)
             k_2 = _rates(y_1, _held_by(friction, before, y_1[1], 0.5 * h, now, m)[0], w_1, now, m)
-            y_2 = _moved(y, 0.5 * h, k_2)
+            y_2 = _advance(y, 0.5 * h, k_2)
             k_3 = _rates(y_2, _held_by(friction, before, y_2[1], 0.5 * h, now, m)[0], w_1, now, m)
-            y_3 = _moved(y, h, k_3)
+            y_3 = _advance(y, h, k_3)
             k_4 = _rates(y_3, _held_by(friction, before, y_3[1], h, now, m)[0], w_2, now, m)
-            y = _moved(y, h / 6.0, _moved(_moved(_moved(k_1, 2.0, k_2), 2.0, k_3), 1.0, k_4))
+            y = _advance(y, h / 6.0, _advance(_advance(_advance(k_1, 2.0, k_2), 2.0, k_3), 1.0, k_4))
             friction, before = _held_by(friction, before, y[1], h, now, m)
             read = read + (y[0] - read) * (h / (h + now[LAG]))
         store(out, sample, read)
@@ -195,7 +195,7 @@ class Machine(NamedTuple):
     law: str
 
     @staticmethod
-    def of(rig: Rig, rate: float, law: str = STRIBECK) -> Machine:
+    def from_rig(rig: Rig, rate: float, law: str = STRIBECK) -> Machine:
         """Build the machine of a rig's kind."""
         whole = rig_numbers(rig)
         numbers = whole._replace(A_A=0.5 * (whole.A_A + whole.A_B), v_th=PRIORS[law].get("creep", whole.v_th))
@@ -396,19 +396,19 @@ class Follower:
         self.states, self.excess = np.zeros((8, SPRING + 2)), 0.0
 
     @staticmethod
-    def begun(recording: Recording, rig: Rig) -> Follower:
+    def fit_start(recording: Recording, rig: Rig) -> Follower:
         """Fit a follower to the first seconds of a recording; these are the next that it takes."""
         u, dp = recording["u"], recording["p_A"] - recording["p_B"]
         sense = float(np.sign(np.mean(u * (dp - dp.mean())))) or 1.0
         beginning = recording.samples(slice(0, math.ceil(_FOLLOW["window"] * recording.rate)))
         total = beginning["p_A"] + beginning["p_B"]
         noise = max(float(np.var(np.diff(total, 3))) / 20.0, 1.0)
-        follower = Follower(Machine.of(rig, recording.rate), priors_of(rig), sense)
+        follower = Follower(Machine.from_rig(rig, recording.rate), priors_of(rig), sense)
         window = follower.stretch(beginning)
         look = first_fit(window, total, noise)
         cost = look.cost(noise, follower.priors.normal, window.unit)
         if not window.explained(cost):
-            other = Follower(Machine.of(rig, recording.rate, BRISTLES), priors_of(rig, BRISTLES), sense)
+            other = Follower(Machine.from_rig(rig, recording.rate, BRISTLES), priors_of(rig, BRISTLES), sense)
             starts = np.array([look.theta, other.priors.centre])
             starts[:, GIVE] = other.priors.centre[GIVE]
             giving = fitted(other.stretch(beginning), starts, noise, 1)
@@ -423,9 +423,9 @@ class Follower:
         follower.covariance, follower.states, follower.last = covariance, states, math.nan
         return follower
 
-    def at(self, rig: Rig, rate: float) -> Follower:
+    def at_rate(self, rig: Rig, rate: float) -> Follower:
         """Return a follower for samples at another rate [Hz], with the same knowledge of the machine."""
-        machine = Machine.of(rig, rate, self.machine.law)
+        machine = Machine.from_rig(rig, rate, self.machine.law)
         follower = Follower(machine, self.priors, self.sense)
         follower.theta, follower.covariance = self.theta, self.covariance
         follower.variance, follower.states = self.variance, self.states
@@ -498,9 +498,9 @@ def response(recording: Recording, rig: Rig) -> Joint | None:
         edges = block_edges(recording)
         with np.errstate(over="ignore", invalid="ignore"):
             try:
-                follower = Follower.begun(recording, rig)
+                follower = Follower.fit_start(recording, rig)
                 parts = [follower.take(recording.samples(slice(*map(int, pair)))) for pair in pairwise(edges)]
-                joint = Joint.of(parts, follower.priors, recording.duration / len(parts), G)
+                joint = Joint.fit(parts, follower.priors, recording.duration / len(parts), G)
             except np.linalg.LinAlgError:
                 return None
         whole = np.all(np.isfinite(joint.mean)) and np.all(np.isfinite(joint.covariance))
@@ -519,4 +519,4 @@ def evidence(recording: Recording, rig: Rig) -> PressureEvidence | None:
     reach = np.sqrt(recording.duration / PRIORS["blocks"]["wander"]) * joint.priors.wander
     reach[G] = wander_of_conductance(recording.duration)
     information = {name: joint.information(k, time, float(reach[k])) for k, name in enumerate(PARAMETERS)}
-    return PressureEvidence.of(recording, rig, information)
+    return PressureEvidence.from_blocks(recording, rig, information)

@@ -177,7 +177,7 @@ class BalanceLeak:
         if not balance.size.stated:
             return None
         time = balance.blocks.time
-        course = balance.whole if onset_s is None else balance.course(step=True).beyond(time < onset_s)
+        course = balance.total_course if onset_s is None else balance.course(step=True).relative_to(time < onset_s)
         value, deviation = course.mean, np.sqrt(np.maximum(np.diag(course.covariance), 0.0))
         unit = balance.blocks.driving(balance.zero) * balance.size.scale / LITRE_PER_MINUTE
         half = WITHIN_95 * np.hypot(deviation, value * balance.size.deviation)

@@ -91,7 +91,7 @@ class RecordedBalance:
     def recording_sums(self) -> RecordingSums:
         """Sums of the recording, for comparison with other recordings."""
         dated, oil = start_seconds(self.recording), oil_temperature(self.recording)
-        return RecordingSums.of(self.blocks, self.columns, dated, oil)
+        return RecordingSums.from_blocks(self.blocks, self.columns, dated, oil)
 
     @cached_property
     def zero(self) -> float:
@@ -143,10 +143,10 @@ class RecordedBalance:
         The pressures at the pump's ports hardly differ from those of the chambers: the sum is known, its parts are not.
         """
         weights = np.maximum(self.blocks.rows, 0.0)
-        return self.whole.over(weights / weights.sum())
+        return self.total_course.over(weights / weights.sum())
 
     @cached_property
-    def whole(self) -> Course:
+    def total_course(self) -> Course:
         """Total leakage of pump and piston over the blocks, as a conductance."""
         column = self.columns[0]
         pump = column.names.index(PUMP) if PUMP in column.names else None
