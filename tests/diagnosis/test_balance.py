@@ -69,7 +69,7 @@ def test_pieces_of_any_size_make_the_same_blocks(sizes: list[int], support: int)
             stream.push({name: values[start:end] for name, values in samples.items()}, last=end == ends[-1])
             for start, end in zip(starts, ends, strict=True)
         ]
-        return Blocks.joined([part for part in parts if part is not None])
+        return Blocks.join([part for part in parts if part is not None])
 
     cuts = np.cumsum(sizes)
     whole, pieces = made(np.array([], dtype=int)), made(cuts[cuts < recording.t.size])

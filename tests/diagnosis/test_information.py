@@ -128,7 +128,7 @@ def test_joined_blocks_are_those_of_the_whole() -> None:
     whole = blocks(recorded(12))
     parts = [Blocks(*(getattr(whole, name)[cut] for name in FIELDS))
              for cut in (slice(0, 5), slice(5, 6), slice(6, 12))]  # fmt: skip
-    joined = Blocks.joined(parts)
+    joined = Blocks.join(parts)
     for name in FIELDS:
         np.testing.assert_array_equal(getattr(joined, name), getattr(whole, name))
 

@@ -102,14 +102,14 @@ def test_a_baseline_is_followed_once_for_many_files(monkeypatch: pytest.MonkeyPa
     baseline = [simulate(command="7 sin(4t)", duration=20.0, seed=seed) for seed in (1, 2)]
     files = [simulate(command="7 sin(4t)", duration=20.0, seed=seed) for seed in (3, 4)]
     followed: list[Recording] = []
-    plain = Follower.begun
+    plain = Follower.fit_start
 
-    def begun(recording: Recording, rig: Rig) -> Follower:
+    def fit_start(recording: Recording, rig: Rig) -> Follower:
         followed.append(recording)
         return plain(recording, rig)
 
     fresh = judge(PressureResponse(rig), files[0], [replace_of(b) for b in baseline])
-    monkeypatch.setattr(Follower, "begun", begun)
+    monkeypatch.setattr(Follower, "fit_start", fit_start)
     again = [judge(PressureResponse(rig), own, baseline) for own in files]
     assert fresh.score is not None, fresh.reason
     assert again[0].score == fresh.score

@@ -48,7 +48,7 @@ def test_steady_sliding_balances_friction_pressure_and_flow(
 ) -> None:
     theta, sense = BELIEFS.centre.copy(), -1.0 if backward else 1.0
     theta[[G, SIDE, F_V]] = conductance, side, 2e3  # so much that nothing rings by itself
-    machine = Machine.of(THESIS, RATE)  # the speed loop settles within 100 s
+    machine = Machine.from_rig(THESIS, RATE)  # the speed loop settles within 100 s
     dp = float(np.mean(machine.run(np.full(60_001, sense * volts), theta[None], np.zeros((8, 1)))[0][0, -200:]))
     m = machine.numbers
     v = (m.q_b / (2.0 * math.pi) * sense * theta[GAIN] * volts - conductance * dp) / m.A_A
@@ -60,7 +60,7 @@ def test_a_path_that_made_the_record_is_followed() -> None:
     """The blocks' parameters are those that the record was made with, within what the noise allows."""
     blocks, length, step = 12, 1000, 2e-12
     t = np.arange(blocks * length) / RATE
-    u, machine = 3.0 * np.sin(4.0 * t), Machine.of(THESIS, RATE)
+    u, machine = 3.0 * np.sin(4.0 * t), Machine.from_rig(THESIS, RATE)
     states, parts = np.zeros((8, 1)), []
     for k in range(blocks):
         theta = BELIEFS.centre.copy()

@@ -64,7 +64,9 @@ def risen(random: np.random.Generator, count: int, scatter: float, leak: float =
 def beyond(judged: Blocks, healthy: Sequence[Blocks]) -> Rise:
     """The rise of a recording beyond healthy ones."""
     return rise(
-        RecordingSums.of(judged, (COLUMNS,)), [RecordingSums.of(own, (COLUMNS,)) for own in healthy], (COLUMNS,)
+        RecordingSums.from_blocks(judged, (COLUMNS,)),
+        [RecordingSums.from_blocks(own, (COLUMNS,)) for own in healthy],
+        (COLUMNS,),
     )
 
 
@@ -76,7 +78,9 @@ def fleet(random: np.random.Generator, days: Sequence[int], viscosity: float, wi
     thin = dict(zip(dict.fromkeys(days), np.exp(viscosity * random.standard_normal(len(days))), strict=False))
     level = 20.0 * PRIORS
     return [
-        RecordingSums.of(recording(random, level * thin[day] + within * random.normal()), (COLUMNS,), DAY * day)
+        RecordingSums.from_blocks(
+            recording(random, level * thin[day] + within * random.normal()), (COLUMNS,), DAY * day
+        )
         for day in days
     ]
 
@@ -107,11 +111,13 @@ def test_a_known_temperature_of_the_oil_takes_off_what_it_makes_of_the_level() -
     """Twice the leakage in oil that is 17 K warmer is no leak, and as much at the same temperature is."""
     random, level = np.random.default_rng(5), 20.0 * PRIORS
     twice = np.exp(priors("inference")["oil"]["per_kelvin"] * 17.3)
-    healthy = [RecordingSums.of(recording(random, level), (COLUMNS,), DAY * 1, 40.0) for _ in range(4)]
+    healthy = [RecordingSums.from_blocks(recording(random, level), (COLUMNS,), DAY * 1, 40.0) for _ in range(4)]
 
     def risen(day: int, warm: float) -> Rise:
         return rise(
-            RecordingSums.of(recording(random, twice * level), (COLUMNS,), DAY * day, warm), healthy, (COLUMNS,)
+            RecordingSums.from_blocks(recording(random, twice * level), (COLUMNS,), DAY * day, warm),
+            healthy,
+            (COLUMNS,),
         )
 
     assert abs(risen(1, 57.3).value) < 0.1 * level < risen(1, 40.0).value
@@ -299,7 +305,7 @@ def warm_days(random: np.random.Generator, slope: float, judged: float, logged: 
 
     def day(number: int, oil: float) -> RecordingSums:
         level = 20.0 * PRIORS * np.exp(slope * (oil - 45.0) + 0.03 * random.standard_normal())
-        return RecordingSums.of(recording(random, level), (COLUMNS,), DAY * number, oil if logged else None)
+        return RecordingSums.from_blocks(recording(random, level), (COLUMNS,), DAY * number, oil if logged else None)
 
     return rise(day(9, judged), [day(k, oil) for k, oil in enumerate(random.uniform(33.0, 52.0, 7))], (COLUMNS,))
 
@@ -319,7 +325,7 @@ def test_warm_oil_is_no_leak_and_its_interval_holds(logged: bool) -> None:
 
 def test_conditions_that_no_healthy_recording_had_are_named() -> None:
     random = np.random.default_rng(10)
-    own = RecordingSums.of(recording(random, 20.0 * PRIORS), (COLUMNS,), DAY, 40.0)
+    own = RecordingSums.from_blocks(recording(random, 20.0 * PRIORS), (COLUMNS,), DAY, 40.0)
     healthy = [own, own._replace(oil_degC=46.0, pressure=1.1 * PRESSURE)]
     assert not conditions_beyond(own, healthy)
     warmer = conditions_beyond(own._replace(oil_degC=60.0, pressure=1.87 * PRESSURE), healthy)

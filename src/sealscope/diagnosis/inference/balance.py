@@ -119,34 +119,34 @@ class BlockStream:
             self._pieces.append(samples)
             self._have += len(next(iter(samples.values())))
         length = self._strides * self._stride
-        beyond = (SPAN - 1) * self._stride + 1 + (0 if last else self._margin)
-        count = max(0, (self._have - beyond) // length)
-        waits = 1 if last or self._weighting.begun else self._support or 1
+        tail = (SPAN - 1) * self._stride + 1 + (0 if last else self._margin)
+        count = max(0, (self._have - tail) // length)
+        waits = 1 if last or self._weighting.has_blocks else self._support or 1
         if count <= self._done or (self._done == 0 and count < waits):
             return None
-        joined = self._joined()
+        joined = self._join_pieces()
         ends = [count]
         if self._support is not None:  # those that support the stream together, then one by one, whatever the pieces
-            first = self._done + 1 if self._weighting.begun else min(self._support, count)
+            first = self._done + 1 if self._weighting.has_blocks else min(self._support, count)
             ends = list(range(first, count + 1))
         parts = [self._close(joined, *pair) for pair in zip([self._done, *ends[:-1]], ends, strict=True)]
-        blocks = parts[0] if len(parts) == 1 else Blocks.joined(parts)
+        blocks = parts[0] if len(parts) == 1 else Blocks.join(parts)
         self._done = count
         first_kept = max(0, count * length - self._margin)
         self._pieces = [{name: values[first_kept - self._first :].copy() for name, values in joined.items()}]
         self._first = first_kept
         return blocks
 
-    def _joined(self) -> dict[str, Array]:
+    def _join_pieces(self) -> dict[str, Array]:
         if len(self._pieces) == 1:
             return dict(self._pieces[0])
         names = self._pieces[0] if self._pieces else ()
         return {name: np.concatenate([piece[name] for piece in self._pieces]) for name in names}
 
     def state(self) -> dict[str, Any]:
-        """Return all that the stream knows as plain values that JSON holds."""
+        """Return the state of the stream in plain values for JSON."""
         return {
-            "samples": {name: plain_array(values) for name, values in self._joined().items()},
+            "samples": {name: plain_array(values) for name, values in self._join_pieces().items()},
             "begin": self._begin,
             "first": self._first,
             "done": self._done,
@@ -176,13 +176,13 @@ class BlockStream:
         else makes it.
         """
         signs = []
-        for balance, columns, own in zip(self._balances, self.columns, rows, strict=True):
-            pressure, left = own[:, columns.leak], balance.takes * own[:, columns.left]
-            moved = own[:, [k for k in columns.motion if columns.names[k].startswith("motion")]].sum(axis=1)
-            odds = _odds(_leaks(own.T @ own, columns, len(own)), "leak")
-            odds += _odds(_in_deviations((pressure - pressure.mean()) * left), "work") if len(own) else 0.0
-            if (along := _in_deviations(moved * left)) > 0.0:  # else either may be the other way round
-                odds += _odds(along, "sides")
+        for balance, columns, values in zip(self._balances, self.columns, rows, strict=True):
+            pressure, left = values[:, columns.leak], balance.takes * values[:, columns.left]
+            moved = values[:, [k for k in columns.motion if columns.names[k].startswith("motion")]].sum(axis=1)
+            odds = _odds(_leaks(values.T @ values, columns, len(values)), "leak")
+            odds += _odds(_in_deviations((pressure - pressure.mean()) * left), "work") if len(values) else 0.0
+            if (agreement := _in_deviations(moved * left)) > 0.0:  # else either may be the other way round
+                odds += _odds(agreement, "sides")
             signs.append(-1.0 if odds < 0.0 else 1.0)
         return tuple(signs)
 
@@ -196,14 +196,14 @@ class BlockStream:
             signals = Signals(samples, self._rate, self._zeros)
             left, moved = self._balances[0].left(signals), signals.step("x")
             self._still = _still_rate(left, self._rate), _still_rate(moved, self._rate)
-        each = max(1, AT_ONCE // length)
-        cuts = [self._cut(samples, k, min(k + each, end)) for k in range(first, end, each)]
+        batch = max(1, AT_ONCE // length)
+        cuts = [self._cut_rows(samples, k, min(k + batch, end)) for k in range(first, end, batch)]
         weights = np.concatenate([cut.weights for cut in cuts])
         counted, roots = weights > 0.0, np.sqrt(weights[weights > 0.0])[:, None]
-        values = [np.concatenate(of)[counted] * roots for of in zip(*(cut.rows for cut in cuts), strict=True)]
+        values = [np.concatenate(pieces)[counted] * roots for pieces in zip(*(cut.rows for cut in cuts), strict=True)]
         self._signs = self._signs or self._oriented(values)
-        for own, columns, sign in zip(values, self.columns, self._signs, strict=True):
-            own[:, columns.left] *= sign
+        for equation_rows, columns, sign in zip(values, self.columns, self._signs, strict=True):
+            equation_rows[:, columns.left] *= sign
         gram = self._weighting.close(values, np.cumsum(counted.reshape(-1, self._strides).sum(axis=1)))
         index = np.arange(first, end, dtype=float)
         start = self._begin + (index * self._strides + 0.5 * SPAN) * (self._stride / self._rate)
@@ -212,7 +212,7 @@ class BlockStream:
         zeros = np.full(end - first, self._zero)
         return Blocks(start, last, gram, weights.reshape(-1, self._strides).sum(axis=1), flow, pressures, zeros)
 
-    def _cut(self, samples: Mapping[str, Array], first: int, end: int) -> _Cut:
+    def _cut_rows(self, samples: Mapping[str, Array], first: int, end: int) -> _Cut:
         """Return the rows of blocks `first` to `end`."""
         length = self._strides * self._stride
         start = first * length
@@ -226,17 +226,17 @@ class BlockStream:
         cut_rows, lefts = [], [balance.left(signals) for balance in self._balances]
         for balance, left in zip(self._balances, lefts, strict=True):
             columns = [*(term.increments(signals) for term in balance.terms), left]
-            made = rows([column[inner] for column in columns], self._rate)
-            whole &= made.whole
-            cut_rows.append(made.values)
+            weak_rows = rows([column[inner] for column in columns], self._rate)
+            whole &= weak_rows.whole
+            cut_rows.append(weak_rows.values)
         within = slice(start - begin, start - begin + (end - first) * length)
         pressure = (cut["p_A"] - cut["p_B"])[within].reshape(-1, length)
         rate = np.abs(lefts[0][within].reshape(-1, length)) * self._rate
         known = np.isfinite(rate)
         flow = np.where(known, rate, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
-        parts = np.array([distribution(own, self._rate) for own in pressure])
-        beside = weights_beside_holes(cut[HOLE][inner.start : inner.stop + 1], self._rate) if HOLE in cut else 1.0
-        return _Cut(tuple(cut_rows), np.where(whole, beside, 0.0), flow, parts)
+        parts = np.array([distribution(block, self._rate) for block in pressure])
+        hole_weights = weights_beside_holes(cut[HOLE][inner.start : inner.stop + 1], self._rate) if HOLE in cut else 1.0
+        return _Cut(tuple(cut_rows), np.where(whole, hole_weights, 0.0), flow, parts)
 
 
 class _Cut(NamedTuple):
@@ -267,15 +267,15 @@ def _odds(z: float, what: str) -> float:
 
 def _leaks(gram: Array, columns: Columns, count: int) -> float:
     """Return the leak's coefficient over its deviation, by least squares over all rows; 0 where nothing tells it."""
-    others = [k for k in columns.nuisance if k != columns.leak]
-    right = gram[np.ix_(others, [columns.leak, columns.left])]
-    solved = solve(gram[np.ix_(others, others)], right)
+    nuisance = [k for k in columns.nuisance if k != columns.leak]
+    right = gram[np.ix_(nuisance, [columns.leak, columns.left])]
+    solved = solve(gram[np.ix_(nuisance, nuisance)], right)
     rest = gram[np.ix_([columns.leak, columns.left], [columns.leak, columns.left])] - right.T @ solved
-    along, lead, square = float(rest[0, 0]), float(rest[0, 1]), float(rest[1, 1])
-    if not along > RIDGE * float(gram[columns.leak, columns.leak]) or count <= len(others) + 1:
+    energy, lead, square = float(rest[0, 0]), float(rest[0, 1]), float(rest[1, 1])
+    if not energy > RIDGE * float(gram[columns.leak, columns.leak]) or count <= len(nuisance) + 1:
         return 0.0
-    variance = OVERLAP * max(square - lead * lead / along, 0.0) / (count - len(others) - 1)
-    return lead / max(float(np.sqrt(variance * along)), np.finfo(float).tiny)
+    variance = OVERLAP * max(square - lead * lead / energy, 0.0) / (count - len(nuisance) - 1)
+    return lead / max(float(np.sqrt(variance * energy)), np.finfo(float).tiny)
 
 
 def _still_rate(increments: Array, rate: float) -> float:
@@ -290,7 +290,7 @@ def _still_rate(increments: Array, rate: float) -> float:
 
 
 def _gauge_to_absolute(pressure: Array) -> float:
-    """Return what makes a gauge pressure absolute: the atmosphere, or more where its zero is surely too low."""
+    """Compute the offset from gauge to absolute pressure: the atmosphere, or more where the zero is surely too low."""
     finite = pressure[np.isfinite(pressure)]
     lowest = float(np.min(finite)) if finite.size else 0.0
     return max(P_ATM, LEAST_ABSOLUTE - lowest)
@@ -325,19 +325,19 @@ def commanded(samples: Mapping[str, Array], rig: Rig, rate: float, *, loaded: bo
     level.
     """
     drive = Drive.from_rig(rig)
-    made = {START: np.exp(-np.arange(len(samples["p_A"])) / (rate * drive.lag))}
+    derived = {START: np.exp(-np.arange(len(samples["p_A"])) / (rate * drive.lag))}
     if flow_source(samples) == "u":
-        u, load = _held(samples["u"]), np.zeros(len(samples["u"]))
+        u, load = _hold_missing(samples["u"]), np.zeros(len(samples["u"]))
         if loaded:
-            dp = _held(samples["p_A"] - samples["p_B"])
+            dp = _hold_missing(samples["p_A"] - samples["p_B"])
             load = dp if float((u - u.mean()) @ (dp - dp.mean())) >= 0.0 else -dp
         speed = drive.flow(u, load, rate) / drive.displacement
-        made["omega"] = np.where(np.isnan(samples["u"]), np.nan, speed)
-    return {**samples, **made}
+        derived["omega"] = np.where(np.isnan(samples["u"]), np.nan, speed)
+    return {**samples, **derived}
 
 
-def _held(values: Array) -> Array:
-    """Return values (n,) of which each that is missing is that before it, 0 at the beginning."""
+def _hold_missing(values: Array) -> Array:
+    """Fill each missing value of an array (n,) with the one before it; 0 at the beginning."""
     last = np.maximum.accumulate(np.where(np.isnan(values), -1, np.arange(len(values))))
     return np.where(last < 0, 0.0, values[last])
 
@@ -444,8 +444,8 @@ def blocks_of(recording: Recording, rig: Rig) -> tuple[Blocks, Blocks, tuple[Col
     recorded = recorded_blocks(recording, rig)
     if recorded is None:
         return None
-    own = recorded.regime(recorded.odds)
-    return own.blocks, own.plain, own.columns
+    regime = recorded.regime(recorded.odds)
+    return regime.blocks, regime.plain, regime.columns
 
 
 _READ = ("u", "omega", "theta", "q_pump", "x", "p_1", "p_2", "p_A", "p_B")

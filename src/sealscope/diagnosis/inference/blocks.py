@@ -80,10 +80,10 @@ class Blocks:
 
     def merged(self, most: int = MOST_BLOCKS) -> Blocks:
         """Return at most so many blocks, neighbours added up."""
-        each = -(-len(self) // most)
-        if each <= 1:
+        group = -(-len(self) // most)
+        if group <= 1:
             return self
-        first = np.arange(0, len(self), each)
+        first = np.arange(0, len(self), group)
         last = np.append(first[1:], len(self)) - 1
         rows = np.add.reduceat(self.rows, first)
         shares = self.rows[:, None] / np.maximum(np.repeat(rows, np.diff(np.append(first, len(self)))), 1.0)[:, None]
@@ -105,11 +105,11 @@ class Blocks:
         """
         if not root:
             return np.asarray(np.abs(self.pressures - (self.zero[:, None] if zero is None else zero)).mean(axis=1))
-        about = self.pressures - self.zero[:, None]
-        return np.asarray(np.abs(np.sign(about) * np.sqrt(np.abs(about)) - (zero or 0.0)).mean(axis=1))
+        difference = self.pressures - self.zero[:, None]
+        return np.asarray(np.abs(np.sign(difference) * np.sqrt(np.abs(difference)) - (zero or 0.0)).mean(axis=1))
 
     @classmethod
-    def joined(cls, parts: Sequence[Blocks]) -> Blocks:
+    def join(cls, parts: Sequence[Blocks]) -> Blocks:
         """Return blocks one after the other."""
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
 
@@ -167,21 +167,23 @@ class Weighting:
         self._count = 0
 
     @property
-    def begun(self) -> bool:
-        """Whether blocks were closed."""
+    def has_blocks(self) -> bool:
+        """True once blocks were closed."""
         return self._count > 0
 
     def state(self) -> dict[str, Any]:
-        """Return what is known as plain values that JSON holds."""
-        return {"count": self._count, "known": [plain_array(of) for of in self._known]}
+        """Return the learnt sums in plain values for JSON."""
+        return {"count": self._count, "known": [plain_array(sums) for sums in self._known]}
 
     def recall(self, state: Mapping[str, Any]) -> None:
         """Continue from a `state`; raises InputError where it does not fit."""
         self._count = int(part_of(state, "count", int))
-        known = [array_of(of, "known") for of in part_of(state, "known", list)]
-        shapes = [of.shape for of in self._known]
-        if [of.shape for of in known] != shapes:
-            raise InputError(f"saved state's known must be of the shapes {shapes}, got {[of.shape for of in known]}")
+        known = [array_of(sums, "known") for sums in part_of(state, "known", list)]
+        shapes = [sums.shape for sums in self._known]
+        if [sums.shape for sums in known] != shapes:
+            raise InputError(
+                f"saved state's known must be of the shapes {shapes}, got {[sums.shape for sums in known]}"
+            )
         self._known = known
 
     def close(self, values: Sequence[Array], ends: NDArray[np.intp]) -> Array:
@@ -192,9 +194,9 @@ class Weighting:
         self._count += len(ends)
         share = min(1.0, SUPPORT / self._count)
         grams = []
-        for own, columns, known in zip(values, self._columns, self._known, strict=True):
+        for equation_rows, columns, known in zip(values, self._columns, self._known, strict=True):
             fast, slow = columns.fast, (*columns.support, columns.left)
-            grams.append(weighted(own, ends, np.array(fast), np.array(slow), known, share))
+            grams.append(weighted(equation_rows, ends, np.array(fast), np.array(slow), known, share))
         return np.stack(grams, axis=1)
 
 
@@ -221,15 +223,15 @@ def _cholesky() -> Callable[[Array, Array], tuple[Array, Array, int]]:
 
 
 def information(blocks: Blocks, columns: Sequence[Columns], test: int, replaces: int | None = None) -> Information:
-    """Return what the blocks say of the coefficient of one column, all other coefficients eliminated.
+    """Estimate the coefficient of one column in each block, all other coefficients eliminated.
 
     `test`: index of the column, the left side's for a change of scale; `replaces`: a column that is left out for it.
     """
     count = len(blocks)
     precision, vector = np.zeros((count, count)), np.zeros(count)
-    for e, own in enumerate(columns):
-        others = [k for k in own.nuisance if k not in (test, replaces)]
-        part, lead = _eliminated(blocks.gram[:, e], blocks, own, test, others)
+    for e, equation in enumerate(columns):
+        nuisance = [k for k in equation.nuisance if k not in (test, replaces)]
+        part, lead = _eliminated(blocks.gram[:, e], blocks, equation, test, nuisance)
         precision += part
         vector += lead
     return Information(blocks.time, precision, vector, columns[0].level_deviation(test, blocks))
@@ -257,15 +259,15 @@ class _Normal(NamedTuple):
     square: float
 
 
-def _normal(gram: Array, powers: Array, others: list[int], test: int, left: int) -> _Normal:
-    n, degrees = len(others), powers.shape[1]
+def _normal(gram: Array, powers: Array, nuisance: list[int], test: int, left: int) -> _Normal:
+    n, degrees = len(nuisance), powers.shape[1]
     size = n * degrees
     squares = (powers[:, :, None] * powers[:, None, :]).reshape(len(gram), degrees**2)
-    cross = gram[:, others][:, :, others].reshape(len(gram), n * n).T @ squares
+    cross = gram[:, nuisance][:, :, nuisance].reshape(len(gram), n * n).T @ squares
     return _Normal(
         cross.reshape(n, n, degrees, degrees).transpose(0, 2, 1, 3).reshape(size, size),
-        np.einsum("ki,kp->ip", gram[:, others, left], powers).ravel(),
-        np.einsum("ki,kp->kip", gram[:, others, test], powers).reshape(len(gram), size),
+        np.einsum("ki,kp->ip", gram[:, nuisance, left], powers).ravel(),
+        np.einsum("ki,kp->kip", gram[:, nuisance, test], powers).reshape(len(gram), size),
         gram[:, test, test],
         gram[:, test, left],
         float(gram[:, left, left].sum()),
@@ -273,7 +275,7 @@ def _normal(gram: Array, powers: Array, others: list[int], test: int, left: int)
 
 
 class _Prior(NamedTuple):
-    """What is believed of the other coefficients.
+    """Prior on the other coefficients.
 
     Standard deviations of each one's `level` and of its `drift`, (c,); `zero`, that of the last one; `at`: what it is
     counted from.
@@ -330,7 +332,7 @@ class _Fit(NamedTuple):
     zero: float
 
 
-def _fit(gram: Array, blocks: Blocks, columns: Columns, test: int, others: list[int]) -> _Fit:
+def _fit(gram: Array, blocks: Blocks, columns: Columns, test: int, nuisance: list[int]) -> _Fit:
     """Return the fit of one equation, the tested column's coefficient free in each block.
 
     A leak g (p_A - p_B - z) has a zero z of the pressures' difference, one number: beside a change of g there is one of
@@ -341,12 +343,12 @@ def _fit(gram: Array, blocks: Blocks, columns: Columns, test: int, others: list[
     powers, minutes = _drifts(blocks)
     rows, degrees = max(float(blocks.rows.sum()), 1.0), powers.shape[1]
     total = gram.sum(axis=0)
-    level = solve(total[np.ix_(others, others)], total[others, columns.left])
-    size = np.append(np.minimum(np.abs(level), columns.levels[others]) * columns.drift[others] * minutes, 0.0)
-    believed = _Prior(np.append(columns.levels[others], np.inf), size, width)
-    chosen, slope = [*others, gram.shape[1]], np.zeros(len(blocks))
+    level = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, columns.left])
+    size = np.append(np.minimum(np.abs(level), columns.levels[nuisance]) * columns.drift[nuisance] * minutes, 0.0)
+    believed = _Prior(np.append(columns.levels[nuisance], np.inf), size, width)
+    chosen, slope = [*nuisance, gram.shape[1]], np.zeros(len(blocks))
     for turn in range(_TURNS + 1):
-        normal = _normal(_about(gram, columns, test, slope, zero), powers, chosen, test, columns.left)
+        normal = _normal(_shift_zero(gram, columns, test, slope, zero), powers, chosen, test, columns.left)
         fitted = _fitted(normal, believed._replace(at=zero), degrees, rows)
         step = float(fitted.coefficients[-degrees])
         if turn == _TURNS or not width > 0.0 or (turn > 0 and abs(step) <= TOLERANCE * width):
@@ -356,7 +358,7 @@ def _fit(gram: Array, blocks: Blocks, columns: Columns, test: int, others: list[
     return _Fit(normal, fitted, zero)
 
 
-def _about(gram: Array, columns: Columns, test: int, slope: Array, zero: float) -> Array:
+def _shift_zero(gram: Array, columns: Columns, test: int, slope: Array, zero: float) -> Array:
     """Return the sums with the tested column taken about a zero of the pressures.
 
     Last the column of the zero's error: -slope dt, of each block.
@@ -370,9 +372,9 @@ def _about(gram: Array, columns: Columns, test: int, slope: Array, zero: float) 
     return np.asarray(turned.transpose(0, 2, 1) @ gram @ turned)
 
 
-def _eliminated(gram: Array, blocks: Blocks, columns: Columns, test: int, others: list[int]) -> tuple[Array, Array]:
+def _eliminated(gram: Array, blocks: Blocks, columns: Columns, test: int, nuisance: list[int]) -> tuple[Array, Array]:
     """Return precision (K, K) and vector (K,) of one equation."""
-    normal, fitted, _ = _fit(gram, blocks, columns, test, others)
+    normal, fitted, _ = _fit(gram, blocks, columns, test, nuisance)
     right = np.column_stack([normal.along.T, normal.left + fitted.lead])
     solved = solve(normal.cross + np.diag(fitted.precision), right)
     precision = (np.diag(normal.energy) - normal.along @ solved[:, :-1]) / fitted.variance
@@ -380,7 +382,7 @@ def _eliminated(gram: Array, blocks: Blocks, columns: Columns, test: int, others
     return 0.5 * (precision + precision.T), vector
 
 
-def _beside(columns: Columns) -> list[int]:
+def _nuisance_columns(columns: Columns) -> list[int]:
     """Return the columns whose coefficients are unknown beside the leak's."""
     return [k for k in columns.nuisance if k != columns.leak]
 
@@ -397,11 +399,11 @@ def zero_of(blocks: Blocks, columns: Sequence[Columns], test: int | None = None)
     `test`: the column of the leak through an orifice, then the zero is that of its root [Pa^0.5], beside the sums'.
     """
     fits = [
-        _fit(blocks.gram[:, e], blocks, own, own.leak if test is None else test, _beside(own))
-        for e, own in enumerate(columns)
+        _fit(blocks.gram[:, e], blocks, equation, equation.leak if test is None else test, _nuisance_columns(equation))
+        for e, equation in enumerate(columns)
     ]
-    own = float(np.mean([fit.zero for fit in fits]))
-    return own if test is not None else float(np.mean(blocks.zero)) + own
+    zero = float(np.mean([fit.zero for fit in fits]))
+    return zero if test is not None else float(np.mean(blocks.zero)) + zero
 
 
 def pair(blocks: Blocks, columns: Columns) -> tuple[Array, Array, Array]:
@@ -413,28 +415,28 @@ def pair(blocks: Blocks, columns: Columns) -> tuple[Array, Array, Array]:
     assert bias is not None
     gram = blocks.gram[:, 0].copy()
     middle = gram[:, leak, bias] / np.maximum(gram[:, bias, bias], np.finfo(float).tiny)
-    fit = _fit(gram, blocks, columns, leak, _beside(columns))
+    fit = _fit(gram, blocks, columns, leak, _nuisance_columns(columns))
     gram[:, leak] -= middle[:, None] * gram[:, bias]
     gram[:, :, leak] -= middle[:, None] * gram[:, :, bias]
-    others = [k for k in columns.nuisance if k not in (leak, bias)]
-    at = _beside(columns).index(bias)
+    nuisance = [k for k in columns.nuisance if k not in (leak, bias)]
+    position = _nuisance_columns(columns).index(bias)
     powers, _ = _drifts(blocks)
-    prior = np.delete(fit.fitted.precision.reshape(-1, powers.shape[1])[:-1], at, axis=0).ravel()
-    of_leak, of_bias = (_normal(gram, powers, others, k, columns.left) for k in (leak, bias))
-    along = np.vstack([of_leak.along, of_bias.along])
-    solved = solve(of_leak.cross + np.diag(prior), np.column_stack([along.T, of_leak.left]))
-    precision = np.diag(np.concatenate([of_leak.energy, of_bias.energy])) - along @ solved[:, :-1]
-    vector = np.concatenate([of_leak.lead, of_bias.lead]) - along @ solved[:, -1]
+    prior = np.delete(fit.fitted.precision.reshape(-1, powers.shape[1])[:-1], position, axis=0).ravel()
+    of_leak, of_bias = (_normal(gram, powers, nuisance, k, columns.left) for k in (leak, bias))
+    coupling = np.vstack([of_leak.along, of_bias.along])
+    solved = solve(of_leak.cross + np.diag(prior), np.column_stack([coupling.T, of_leak.left]))
+    precision = np.diag(np.concatenate([of_leak.energy, of_bias.energy])) - coupling @ solved[:, :-1]
+    vector = np.concatenate([of_leak.lead, of_bias.lead]) - coupling @ solved[:, -1]
     return 0.5 * (precision + precision.T) / fit.fitted.variance, vector / fit.fitted.variance, middle
 
 
 def mean_of(blocks: Blocks, columns: Columns, shares: Mapping[int, float]) -> tuple[float, float]:
     """Return a mean of coefficients, by their columns' `shares`, and its deviation; the leak is free in each block."""
-    others = _beside(columns)
-    normal, fitted, _ = _fit(blocks.gram[:, 0], blocks, columns, columns.leak, others)
-    weights = np.zeros((len(others) + 1, len(fitted.coefficients) // (len(others) + 1)))
+    nuisance = _nuisance_columns(columns)
+    normal, fitted, _ = _fit(blocks.gram[:, 0], blocks, columns, columns.leak, nuisance)
+    weights = np.zeros((len(nuisance) + 1, len(fitted.coefficients) // (len(nuisance) + 1)))
     for column, share in shares.items():
-        weights[others.index(column), 0] = share
+        weights[nuisance.index(column), 0] = share
     energy = np.maximum(normal.energy, np.finfo(float).tiny)
     matrix = normal.cross - (normal.along / energy[:, None]).T @ normal.along + np.diag(fitted.precision)
     variance = float(weights.ravel() @ solve(matrix, weights.ravel())) * fitted.variance
@@ -444,8 +446,8 @@ def mean_of(blocks: Blocks, columns: Columns, shares: Mapping[int, float]) -> tu
 def total(blocks: Blocks, columns: Sequence[Columns]) -> Array:
     """Return a recording's sums (E, m, m), over the rows' variance."""
     sums = []
-    for e, own in enumerate(columns):
-        others = _beside(own)
-        fit = _fit(blocks.gram[:, e], blocks, own, own.leak, others)
+    for e, equation in enumerate(columns):
+        nuisance = _nuisance_columns(equation)
+        fit = _fit(blocks.gram[:, e], blocks, equation, equation.leak, nuisance)
         sums.append(blocks.gram[:, e].sum(axis=0) / fit.fitted.variance)
     return np.array(sums)

@@ -93,7 +93,7 @@ class LeakMeasure(Protocol):
 
     @property
     def cause(self) -> Cause:
-        """What a leak is as far as the channels tell."""
+        """Cause of a leak, as far as the channels tell."""
 
     @property
     def step(self) -> StepTest | None:
@@ -145,20 +145,20 @@ class LeakMeasure(Protocol):
 
     @property
     def remarks(self) -> Sequence[Remark]:
-        """What the provider says of sizes, zeros and delays."""
+        """Remarks of the provider on sizes, zeros and delays."""
 
     def relative(self, flow: Flow) -> RelativeLeak | None:
         """Return a flow beside the pump's flow and the piston's area."""
 
     def total(self, findable: float | None) -> TotalLeakage | None:
-        """Return what leaks in all; `findable`: the smallest step that would have been found [m^3/s]."""
+        """Return the total leakage; `findable`: the smallest step that would have been found [m^3/s]."""
 
     def course(self, onset_s: float | None) -> LeakCourse | None:
         """Return the leakage over the recording; since an onset what came with it."""
 
 
 class Ringing(NamedTuple):
-    """How far the ringing of the pressures is known, where nothing measures the leak itself.
+    """Precision of the measured ringing of the pressures, where nothing measures the leak itself.
 
     `bound`: 95 % bound of the size of a change of its log RMS; `rate` [Hz]; `healthy`: recordings it was compared with,
     0 for none; `is_dated`: whether their dates are known; `unused`: recorded columns that no channel is made of.
@@ -173,7 +173,7 @@ class Ringing(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """What a provider reports of a recording.
+    """Report of a provider on a recording.
 
     Parameters
     ----------

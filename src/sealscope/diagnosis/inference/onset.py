@@ -64,7 +64,7 @@ RANK = 1e-9
 
 
 class Information(NamedTuple):
-    """What K blocks say of one coefficient, one number g_k a block: likelihood exp(vector g - g precision g / 2).
+    """Likelihood of one coefficient in K blocks, one number g_k a block: exp(vector g - g precision g / 2).
 
     `time` (K,) [s], `precision` (K, K), `vector` (K,). What is believed of the coefficient, infinite where nothing is:
     `level`, its standard deviation before the first block; `slope`, that of an even change over all blocks; `walk`,
@@ -154,10 +154,10 @@ class StepTest:
         if not above > 0.0 or not high > 0.0:
             return max(high, 0.0)
 
-        def beyond(share: float) -> float:
+        def excess_chance(share: float) -> float:
             return float(self.weights @ ndtr((self.size - share * high) / deviation)) - (1.0 - probability) * above
 
-        return high * float(brentq(beyond, 0.0, 1.0)) if beyond(1.0) < 0.0 else high
+        return high * float(brentq(excess_chance, 0.0, 1.0)) if excess_chance(1.0) < 0.0 else high
 
     def findable(self, chance: float, power: float = 0.9) -> float:
         """Return the step that is found with probability `power` at a false-alarm probability, at the median onset."""
@@ -187,7 +187,7 @@ class Course(NamedTuple):
         half = WITHIN_95 * float(np.sqrt(np.maximum(weights @ self.covariance @ weights, 0.0)))
         return Interval(value, value - half, value + half)
 
-    def beyond(self, before: NDArray[np.bool_]) -> Course:
+    def relative_to(self, before: NDArray[np.bool_]) -> Course:
         """Return the coefficient beyond its mean over some blocks (K,)."""
         turn = np.eye(len(before)) - before / max(int(np.count_nonzero(before)), 1)
         return Course(turn @ self.mean, turn @ self.covariance @ turn.T)
@@ -280,12 +280,12 @@ def step_tests(information: Information, signs: Sequence[float], shape: Array | 
     covariance = inner @ outer @ inner.T
     unit = len(free) / max(float(np.trace(covariance)), np.finfo(float).tiny)
     eigen, basis = np.linalg.eigh(unit * covariance)
-    at = np.arange(EDGE, count - EDGE + 1e-9, 1.0 / PARTS)
-    steps = np.clip(index[:, None] + 1.0 - at, 0.0, 1.0)
+    positions = np.arange(EDGE, count - EDGE + 1e-9, 1.0 / PARTS)
+    steps = np.clip(index[:, None] + 1.0 - positions, 0.0, 1.0)
     if shape is not None:
         steps[count - len(shape) :] *= shape[:, None]
     z, steps, eigen = basis.T @ (free @ z), basis.T @ (inner @ steps), np.maximum(eigen, 0.0)
-    onsets, believed = _onset_times(time, at), -np.log1p(WALKS * unit * count / information.walk**2)
+    onsets, believed = _onset_times(time, positions), -np.log1p(WALKS * unit * count / information.walk**2)
     return [_scan(sign * z, steps, eigen, onsets, unit, believed) for sign in signs]
 
 
@@ -304,12 +304,12 @@ def _with_level(information: Information) -> tuple[Array, Array, Array]:
     return np.concatenate([[2.0 * time[0] - time[1]], time]), before, np.concatenate([[0.0], vector])
 
 
-def _onset_times(time: Array, at: Array) -> Array:
+def _onset_times(time: Array, positions: Array) -> Array:
     """Return the times of onsets given in blocks from the beginning of the first."""
     edges = np.concatenate(
         [[1.5 * time[0] - 0.5 * time[1]], 0.5 * (time[1:] + time[:-1]), [1.5 * time[-1] - 0.5 * time[-2]]]
     )
-    return np.asarray(np.interp(at, np.arange(len(edges)), edges))
+    return np.asarray(np.interp(positions, np.arange(len(edges)), edges))
 
 
 def _scan(z: Array, steps: Array, eigen: Array, onsets: Array, unit: float, believed: Array) -> StepTest:
@@ -320,33 +320,33 @@ def _scan(z: Array, steps: Array, eigen: Array, onsets: Array, unit: float, beli
     n = len(z)
     weight = 1.0 / (1.0 + WALKS[:, None] * eigen)
     total = np.maximum((weight * z**2).sum(axis=1), np.finfo(float).tiny)
-    along, square = (weight * z) @ steps, np.maximum(weight @ steps**2, np.finfo(float).tiny)
+    lead, square = (weight * z) @ steps, np.maximum(weight @ steps**2, np.finfo(float).tiny)
     determinant = np.log(weight).sum(axis=1) + 2.0 * believed
     without = 0.5 * determinant - 0.5 * n * np.log(total / n)
-    rest = np.maximum(total[:, None] - np.maximum(along, 0.0) ** 2 / square, 1e-12 * total[:, None])
-    beside = 0.5 * determinant[:, None] - 0.5 * n * np.log(rest / n)
+    rest = np.maximum(total[:, None] - np.maximum(lead, 0.0) ** 2 / square, 1e-12 * total[:, None])
+    with_step = 0.5 * determinant[:, None] - 0.5 * n * np.log(rest / n)
     plain = int(without.argmax())
-    walk, best = np.unravel_index(int(beside.argmax()), beside.shape)
-    score = 2.0 * float(beside[walk, best] - without[plain])
-    likeliest = beside.max(axis=1)
-    plainly, beside_it = without - believed, likeliest - believed  # the recording alone says how large a walk may be
-    allowed = (plainly > plainly.max() - ALLOWED) | (beside_it > beside_it.max() - ALLOWED)
+    walk, best = np.unravel_index(int(with_step.argmax()), with_step.shape)
+    score = 2.0 * float(with_step[walk, best] - without[plain])
+    likeliest = with_step.max(axis=1)
+    plainly, stepped = without - believed, likeliest - believed  # the recording alone says how large a walk may be
+    allowed = (plainly > plainly.max() - ALLOWED) | (stepped > stepped.max() - ALLOWED)
     norm = np.sqrt(square[allowed])
     cosines = (weight[allowed] @ (steps[:, 1:] * steps[:, :-1])) / (norm[:, 1:] * norm[:, :-1])
     # of the curve of whitened steps on the unit sphere
     length = np.arccos(np.clip(cosines, -1.0, 1.0)).sum(axis=1).max()
     law = NullLaw(min(n, 0.5 * n + 2.0), float(length))
     noise = float(rest[walk, best]) / n
-    fitted = float(along[walk, best] / square[walk, best]), float(np.sqrt(noise / square[walk, best]))
-    size = along[plain] / square[plain]
+    fitted = float(lead[walk, best] / square[walk, best]), float(np.sqrt(noise / square[walk, best]))
+    size = lead[plain] / square[plain]
     return StepTest(
         score=score,
         chance=law.chance(score),
         best=int(best),
         onsets=onsets,
-        likelihood=beside.max(axis=0),
+        likelihood=with_step.max(axis=0),
         size=size,
-        deviation=np.sqrt(np.maximum(total[plain] - along[plain] ** 2 / square[plain], 0.0) / n / square[plain]),
+        deviation=np.sqrt(np.maximum(total[plain] - lead[plain] ** 2 / square[plain], 0.0) / n / square[plain]),
         fitted=fitted,
         walk=(unit * float(WALKS[plain]), unit * float(WALKS[walk])),
         noise=(float(total[plain]) / n, noise),

@@ -65,14 +65,14 @@ def has_rests(blocks: Blocks, columns: Columns) -> bool:
 
 
 def shut_odds(blocks: Blocks, columns: Columns) -> float:
-    """Compute the log odds that the pump is cut off at rest, over that it is not; 0 where nothing tells."""
+    """Compute the log odds that the pump is cut off at rest; 0 where nothing tells."""
     gram, believed = blocks.gram[:, 0], priors("inference")["rest"]
     at_rest, bias = (columns.names.index(name) for name in RESTS)
     if not has_rests(blocks, columns) or len(blocks) < 2:
         return 0.0
     chosen = [*columns.nuisance, at_rest, bias]
-    each, left = gram[:, chosen][:, :, chosen], gram[:, chosen, columns.left]
-    coefficients, covariance = _sandwich(each, left)
+    grams, left = gram[:, chosen][:, :, chosen], gram[:, chosen, columns.left]
+    coefficients, covariance = _sandwich(grams, left)
     both = [chosen.index(columns.leak), chosen.index(at_rest)]
     motion, more = coefficients[both]
     resting, differing = float(covariance[np.ix_(both, both)].sum()), float(covariance[both[1], both[1]])
@@ -85,7 +85,7 @@ def shut_odds(blocks: Blocks, columns: Columns) -> float:
 
 
 class HoldLeaks(NamedTuple):
-    """What the rests of a machine whose valves shut say: conductances with standard deviations [m^3/(s Pa)].
+    """Leakage in the rests of a machine whose valves shut: conductances with standard deviations [m^3/(s Pa)].
 
     `loaded`: what the side that carries loses, past the piston or to the outside; `pump`: what only motion tells.
     """
@@ -106,19 +106,19 @@ def hold_leaks(blocks: Blocks, columns: Columns) -> HoldLeaks | None:
     coefficients, covariance = _sandwich(gram[:, chosen][:, :, chosen], gram[:, chosen, columns.left])
     deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     loaded, pump = (
-        (float(coefficients[at]), float(deviations[at]))
-        for at in map(chosen.index, (columns.leak, columns.names.index(TURNING)))
+        (float(coefficients[place]), float(deviations[place]))
+        for place in map(chosen.index, (columns.leak, columns.names.index(TURNING)))
     )
     return HoldLeaks(loaded, pump)
 
 
-def _sandwich(each: Array, left: Array) -> tuple[Array, Array]:
+def _sandwich(grams: Array, left: Array) -> tuple[Array, Array]:
     """Return coefficients (c,) of sums (K, c, c) and (K, c), and their covariance where the blocks' errors differ."""
-    total = each.sum(axis=0)
+    total = grams.sum(axis=0)
     coefficients = solve(total, left.sum(axis=0))
-    scores = left - each @ coefficients
+    scores = left - grams @ coefficients
     inverse = solve(total, np.eye(len(total)))
-    return coefficients, inverse @ (scores.T @ scores) @ inverse * (len(each) / (len(each) - 1.0))
+    return coefficients, inverse @ (scores.T @ scores) @ inverse * (len(grams) / (len(grams) - 1.0))
 
 
 def _log_normal(value: float, variance: float) -> float:

@@ -65,12 +65,12 @@ class Mixture(NamedTuple):
         unit = max(float(self.weights @ np.minimum(self.deviations, 1e3 * self.deviations.min())), TINY)
         centres, deviations = self.centres / unit, self.deviations / unit
 
-        def beyond(value: float) -> float:
+        def excess(value: float) -> float:
             return float(self.weights @ ndtr((value - centres) / deviations)) - probability
 
         ends = centres + ndtri(probability) * deviations
         low, high = float(ends.min()), float(ends.max())
-        return unit * (low if not beyond(low) < 0.0 < beyond(high) else float(brentq(beyond, low, high)))
+        return unit * (low if not excess(low) < 0.0 < excess(high) else float(brentq(excess, low, high)))
 
 
 class Rise(NamedTuple):
@@ -92,9 +92,9 @@ class Rise(NamedTuple):
     @property
     def chance(self) -> float:
         """Probability that a healthy recording scores as high."""
-        return self._beyond(self.score)
+        return self._exceedance(self.score)
 
-    def _beyond(self, score: float) -> float:
+    def _exceedance(self, score: float) -> float:
         from scipy.special import ndtr, stdtr
 
         if self.parts is None:
@@ -135,7 +135,7 @@ class Rise(NamedTuple):
 
 
 class RecordingSums(NamedTuple):
-    """What a recording says of its machine, to be added to what others say.
+    """Sums over a recording of one machine, to be added to those of other recordings.
 
     `sums` (E, m, m) of its rows, the zero of its flow set aside; `flow` of the pump and `pressure`, mean sizes
     [m^3/s], [Pa]; `start_s`: its date [s since 1970], and `oil_degC`, its oil's temperature, None where
@@ -149,47 +149,53 @@ class RecordingSums(NamedTuple):
     oil_degC: float | None = None
 
     @classmethod
-    def of(
+    def from_blocks(
         cls,
         blocks: Blocks,
         columns: Sequence[Columns],
         start_s: float | None = None,
         oil_degC: float | None = None,
     ) -> RecordingSums:
-        """Return that of a recording's blocks."""
+        """Compute the sums of a recording's blocks."""
         weights = np.maximum(blocks.rows, 1e-9)
-        flow, pressure = (float(np.average(of, weights=weights)) for of in (blocks.flow, blocks.driving()))
+        flow, pressure = (float(np.average(values, weights=weights)) for values in (blocks.flow, blocks.driving()))
         return cls(_about_own(total(blocks, columns), columns), flow, pressure, start_s, oil_degC)
 
 
 def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[Columns]) -> Rise:
-    """Return how far the leak's coefficient of a recording is beyond that of healthy recordings of the same machine.
+    """Estimate the rise of a recording's leak coefficient beyond healthy recordings of the same machine.
 
     All are of `columns`, one of each equation.
     """
-    everything, count = np.sum([own.sums for own in baseline], axis=0), len(baseline)
+    everything, count = np.sum([recording.sums for recording in baseline], axis=0), len(baseline)
     believed, by_flow = priors("inference")["scatter"], judged.flow / judged.pressure if judged.pressure > 0.0 else 0.0
     decades = np.linspace(-FARTHEST, FARTHEST, SCALES)
     widths = believed["between"] ** decades
-    beyond, own_errors = np.zeros((SCALES, count)), np.zeros((SCALES, count))
+    rises, own_errors = np.zeros((SCALES, count)), np.zeros((SCALES, count))
     if count > 1:
-        pairs = [_rises(own.sums, everything - own.sums, columns, widths) for own in baseline]
-        beyond, own_errors = (np.array(of).T * ((count - 1) / count) for of in zip(*pairs, strict=True))
+        pairs = [_rises(recording.sums, everything - recording.sums, columns, widths) for recording in baseline]
+        rises, own_errors = (np.array(numbers).T * ((count - 1) / count) for numbers in zip(*pairs, strict=True))
     values, error = _rises(judged.sums, everything, columns, widths)
     level, level_error = _level(everything, columns)
     errors = believed["own"] * np.median(np.column_stack([error, own_errors]), axis=1)
     errors = np.maximum(errors, max(believed["finest"] * by_flow, 1.0 / LARGEST))
-    starts, pause = [own.start_s for own in (*baseline, judged)], 3600.0 * priors("inference")["oil"]["shift"]
+    starts, pause = (
+        [recording.start_s for recording in (*baseline, judged)],
+        3600.0 * priors("inference")["oil"]["shift"],
+    )
     sessions = np.array(sessions_of(starts, pause))
     warmer, oil = _oil_shifts([*baseline, judged])
-    unseen = sum(own.excess for own in conditions_beyond(judged, baseline)) * priors("inference")["conditions"]["leak"]
+    unseen = (
+        sum(condition.excess for condition in conditions_beyond(judged, baseline))
+        * priors("inference")["conditions"]["leak"]
+    )
     nodes = WIDEST * ((np.arange(NODES) + 0.5) / NODES) ** 2  # closer near zero
     believed_of = 0.5 * np.log(nodes) - 0.5 * nodes**2
     if len(set(sessions)) == 1:
         nodes, believed_of = np.zeros(1), np.zeros(1)
     slope, doubt = (priors("inference")["oil"][name] for name in ("per_kelvin", "per_kelvin_deviation"))
     thin = np.exp(slope * warmer[:-1])
-    left = beyond - level * (thin - thin.mean())
+    left = rises - level * (thin - thin.mean())
     turn = max(level_error, float(np.median(errors)), float(np.median(left.std(axis=1))), 0.1 * level)
     scale = _Levels(level, turn)
     steep = scale.slope(level)
@@ -203,14 +209,14 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
         between[len(nodes) :, -1, -1] += 2.0 * (relative * oil) ** 2
     shifts = relative * slope * warmer
     most = np.maximum(min(steep * believed["largest"] * by_flow, believed["relative"]), 10.0 * steep * errors)
-    own, known = scale.of(values), scale.of(beyond) - shifts[:-1]
+    transformed, known = scale.transform(values), scale.transform(rises) - shifts[:-1]
     predicted = Population(between, believed_of).predict(
-        own - shifts[-1],
+        transformed - shifts[-1],
         known,
         np.geomspace(steep * errors, most, NODES, axis=1),
-        np.log(scale.slope(level + beyond)).sum(axis=1) - 0.5 * decades**2,
+        np.log(scale.slope(level + rises)).sum(axis=1) - 0.5 * decades**2,
     )
-    return _combined(scale.levels(predicted, own), values)
+    return _combined(scale.levels(predicted, transformed), values)
 
 
 class _Levels(NamedTuple):
@@ -219,18 +225,21 @@ class _Levels(NamedTuple):
     level: float
     turn: float
 
-    def of(self, beyond: Array) -> Array:
+    def transform(self, excess: Array) -> Array:
         """Return z of levels that are so far beyond that of all."""
-        return np.asarray(np.arcsinh((self.level + beyond) / (2.0 * self.turn)))
+        return np.asarray(np.arcsinh((self.level + excess) / (2.0 * self.turn)))
 
     def slope(self, level: Any) -> Any:
         """Return dz/da at levels."""
         return 1.0 / np.hypot(level, 2.0 * self.turn)
 
-    def levels(self, predicted: Mixture, own: Array) -> Mixture:
-        """Return a law of z beside `own` (s,) as one of levels beyond that of all, by narrower laws that are linear."""
+    def levels(self, predicted: Mixture, transformed: Array) -> Mixture:
+        """Convert a law of z, relative to `transformed` (s,), to one of levels relative to the level of all.
+
+        Each part is split into narrower ones, in which the levels are linear in z.
+        """
         x, shares = np.polynomial.hermite_e.hermegauss(PARTS)
-        centres, deviations = predicted.centres + own[:, None, None], predicted.deviations[..., None]
+        centres, deviations = predicted.centres + transformed[:, None, None], predicted.deviations[..., None]
         z = np.clip(centres[..., None] + np.sqrt(1.0 - NARROWER**2) * deviations * x, -FARTHEST_Z, FARTHEST_Z)
         return Mixture(
             predicted.weights[..., None] + np.log(shares / shares.sum()),
@@ -241,9 +250,9 @@ class _Levels(NamedTuple):
 
 def _combined(predicted: Mixture, values: Array) -> Rise:
     """Return the rise of `values` (s,) over laws (s, ...) of what healthy recordings show, by their log weights."""
-    own = np.reshape(values, (-1, *[1] * (predicted.centres.ndim - 1)))
+    offset = np.reshape(values, (-1, *[1] * (predicted.centres.ndim - 1)))
     logs, deviations, centres = (
-        of.ravel() for of in (predicted.weights, predicted.deviations, predicted.centres - own)
+        part.ravel() for part in (predicted.weights, predicted.deviations, predicted.centres - offset)
     )
     kept = logs > logs.max() - FAINTEST
     weights = np.exp(logs[kept] - logs.max())
@@ -268,26 +277,26 @@ class Beyond(NamedTuple):
 
 def conditions_beyond(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> list[Beyond]:
     """Find the conditions of a recording that are beyond those of the healthy ones: oil, load, speed."""
-    allowed, beyond = priors("inference")["conditions"], list[Beyond]()
-    for name, unit, of in (("load", "Pa", "pressure"), ("speed", "m^3/s", "flow")):
-        value, known = getattr(judged, of), [getattr(own, of) for own in baseline]
+    allowed, extremes = priors("inference")["conditions"], list[Beyond]()
+    for name, unit, field in (("load", "Pa", "pressure"), ("speed", "m^3/s", "flow")):
+        value, known = getattr(judged, field), [getattr(healthy, field) for healthy in baseline]
         if not known or not min(value, *known) > 0.0:
             continue
         excess = float(max(np.log(value / max(known)), np.log(min(known) / value)))
         if excess > allowed["ratio"]:
-            beyond.append(Beyond(name, value, min(known), max(known), unit, excess))
-    warm = [own.oil_degC for own in baseline if own.oil_degC is not None]
+            extremes.append(Beyond(name, value, min(known), max(known), unit, excess))
+    warm = [healthy.oil_degC for healthy in baseline if healthy.oil_degC is not None]
     if judged.oil_degC is not None and warm:
         excess = max(judged.oil_degC - max(warm), min(warm) - judged.oil_degC)
         if excess > allowed["oil"]:  # what it does is in the slope's doubt
-            beyond.append(Beyond("oil", judged.oil_degC, min(warm), max(warm), "degC", 0.0))
-    return beyond
+            extremes.append(Beyond("oil", judged.oil_degC, min(warm), max(warm), "degC", 0.0))
+    return extremes
 
 
 def leave_one_out(recordings: Sequence[RecordingSums], columns: Sequence[Columns]) -> Array:
     """Compute the rise (n,) of each recording beyond the n - 1 others, by what is believed of their differences."""
     everything = np.sum([recording.sums for recording in recordings], axis=0)
-    rises = [_rises(own.sums, everything - own.sums, columns, np.ones(1))[0] for own in recordings]
+    rises = [_rises(recording.sums, everything - recording.sums, columns, np.ones(1))[0] for recording in recordings]
     return np.array(rises) * ((len(recordings) - 1) / len(recordings))
 
 
@@ -313,14 +322,14 @@ class Population:
         self._own, self._logarithms = candidates[:, n, n, None], logarithms[:, None]
 
     def rise(self, values: Array, known: Array, usual: float, freedom: float) -> Rise:
-        """Return by how much a value is beyond what those known let expect.
+        """Estimate the rise of a value beyond its prediction from the known ones.
 
         `values` (s,) and `known` (s, n): the same quantity, estimated in s ways; the evidence of those known weighs the
         ways. `usual`, `freedom`: what is believed of sigma, whose square has a scaled inverse chi square law.
         """
         count = len(self._chosen)
-        others = known[:, self._chosen]
-        squares = freedom * usual**2 + np.sum((others - others.mean(axis=1, keepdims=True)) ** 2, axis=1)
+        healthy = known[:, self._chosen]
+        squares = freedom * usual**2 + np.sum((healthy - healthy.mean(axis=1, keepdims=True)) ** 2, axis=1)
         if not 1e4 * squares.max() < LARGEST:  # numbers that cannot be computed with bound nothing
             return Rise(float(values.mean()), np.inf, freedom)
         least = np.sqrt(np.maximum(0.1 * freedom * usual**2, 1e-9 * squares) / (freedom + count))
@@ -338,12 +347,12 @@ class Population:
         `known` (s, n): the others, in s ways of which `logarithms` (s,) are believed; `sigma` (s, nodes): evenly spaced
         in their logarithms, of whose densities `believed` (s, nodes) are the logarithms.
         """
-        others = known[:, self._chosen]
+        healthy = known[:, self._chosen]
         variance = sigma[:, None] ** 2  # (s, 1, nodes)
         weight = 1.0 / (variance[..., None] + self._eigen)  # (s, g, nodes, n)
         of_ones, cross = weight * self._ones, self._cross
         precision = (of_ones * self._ones).sum(axis=-1)
-        rotated = np.einsum("gij,si->sgj", self._basis, others)[:, :, None]
+        rotated = np.einsum("gij,si->sgj", self._basis, healthy)[:, :, None]
         mean = (of_ones * rotated).sum(axis=-1) / precision
         left = weight * (rotated - mean[..., None] * self._ones)
         logarithm = 0.5 * (np.log(weight).sum(axis=-1) - np.log(precision) - (left * rotated).sum(axis=-1))
@@ -365,9 +374,9 @@ def sessions_of(starts: Sequence[float | None], pause: float) -> list[int]:
 
 
 def _oil_shifts(recordings: Sequence[RecordingSums]) -> tuple[Array, float]:
-    """Return how much warmer the oil of each was than on the mean of all but the last [K], and what else it may do.
+    """Compute the oil temperature of each recording over the mean of all but the last [K], and a doubt.
 
-    Where a temperature is missing none counts, and levels of sessions deviate in their logarithms by the latter.
+    Where a temperature is missing none counts: the levels of sessions deviate in their logarithms by the doubt, else 0.
     """
     known = [recording.oil_degC for recording in recordings if recording.oil_degC is not None]
     if len(known) < len(recordings):  # the difference of two sessions has twice the variance of each
@@ -379,11 +388,11 @@ def _level(sums: Array, columns: Sequence[Columns]) -> tuple[float, float]:
     """Return the leak's coefficient in healthy recordings by their sums (E, m, m), at least zero, and its error."""
     precision, vector = 0.0, 0.0
     for e, column in enumerate(columns):
-        others = [k for k in column.compared if k != column.leak and np.isfinite(column.between[k])]
-        along = sums[e][others, column.leak]
-        solved = solve(sums[e][np.ix_(others, others)], np.column_stack([along, sums[e][others, column.left]]))
-        precision += float(sums[e][column.leak, column.leak] - along @ solved[:, 0])
-        vector += float(sums[e][column.leak, column.left] - along @ solved[:, 1])
+        nuisance = [k for k in column.compared if k != column.leak and np.isfinite(column.between[k])]
+        cross = sums[e][nuisance, column.leak]
+        solved = solve(sums[e][np.ix_(nuisance, nuisance)], np.column_stack([cross, sums[e][nuisance, column.left]]))
+        precision += float(sums[e][column.leak, column.leak] - cross @ solved[:, 0])
+        vector += float(sums[e][column.leak, column.left] - cross @ solved[:, 1])
     return (max(vector, 0.0) / precision, precision**-0.5) if precision > 0.0 else (0.0, 0.0)
 
 
@@ -427,7 +436,7 @@ def _about_own(sums: Array, columns: Sequence[Columns]) -> Array:
     return reduced
 
 
-def _rises(own: Array, reference: Array, columns: Sequence[Columns], widths: Array) -> tuple[Array, Array]:
+def _rises(sums: Array, reference: Array, columns: Sequence[Columns], widths: Array) -> tuple[Array, Array]:
     """Return the rise (s,) of the leak's coefficient in one recording's sums (E, m, m) beyond others', and its error.
 
     The recording's other coefficients differ from theirs by what is believed of recordings of one machine, over all
@@ -437,18 +446,18 @@ def _rises(own: Array, reference: Array, columns: Sequence[Columns], widths: Arr
     for e, column in enumerate(columns):
         chosen = [k for k in column.compared if k == column.leak or np.isfinite(column.between[k])]
         coefficients = solve(reference[e][np.ix_(chosen, chosen)], reference[e][chosen, column.left])
-        residual = own[e][:, column.left] - own[e][:, chosen] @ coefficients
-        others = [k for k in chosen if k != column.leak]
-        size = np.abs(coefficients[[chosen.index(k) for k in others]])
+        residual = sums[e][:, column.left] - sums[e][:, chosen] @ coefficients
+        nuisance = [k for k in chosen if k != column.leak]
+        size = np.abs(coefficients[[chosen.index(k) for k in nuisance]])
         with np.errstate(divide="ignore", over="ignore"):
-            prior = 1.0 / (size * column.between[others]) ** 2
-        matrix, along = own[e][np.ix_(others, others)], own[e][others, column.leak]
-        right = np.column_stack([along, residual[others]])
+            prior = 1.0 / (size * column.between[nuisance]) ** 2
+        matrix, cross = sums[e][np.ix_(nuisance, nuisance)], sums[e][nuisance, column.leak]
+        right = np.column_stack([cross, residual[nuisance]])
         for s, width in enumerate(widths):
             tied = matrix + np.diag(np.minimum(prior / width**2, 1e9 * np.diag(matrix)))
             solved = solve(tied, right)
-            precision[s] += float(own[e][column.leak, column.leak] - along @ solved[:, 0])
-            vector[s] += float(residual[column.leak] - along @ solved[:, 1])
+            precision[s] += float(sums[e][column.leak, column.leak] - cross @ solved[:, 0])
+            vector[s] += float(residual[column.leak] - cross @ solved[:, 1])
     known = precision > 0.0
     divisor = np.where(known, precision, 1.0)
     return np.where(known, vector / divisor, 0.0), np.where(known, divisor**-0.5, 0.0)

@@ -135,7 +135,7 @@ class Signals:
         """1 where p_A > p_B, else 0, at each sample."""
         return (self._channels["p_A"] > self._channels["p_B"] + self._zero).astype(float)
 
-    def moved(self, outward: bool, by_A: bool) -> Array:
+    def directed_step(self, outward: bool, by_A: bool) -> Array:
         """Return the increments of x of one direction while one side carries the pressure [m]."""
         out_A, out, by = self._ways
         share = (out_A if by_A else out - out_A) if outward else (by - out_A if by_A else 1.0 - out - by + out_A)
@@ -167,7 +167,9 @@ def find_rests(increments: Array, rate: float, still: float) -> NDArray[np.bool_
     if still < 0.0 or len(increments) < size + least:
         return np.zeros(len(increments), dtype=bool)
     known = np.isfinite(increments)
-    volume, missing = (np.concatenate([[0], np.cumsum(of)]) for of in (np.where(known, increments, 0.0), ~known))
+    volume, missing = (
+        np.concatenate([[0], np.cumsum(values)]) for values in (np.where(known, increments, 0.0), ~known)
+    )
     below = np.abs(volume[size:] - volume[:-size]) <= still * size / rate
     below &= missing[size:] == missing[:-size]
     covered = _spread(below, size)  # every interval of a quiet stretch
@@ -280,13 +282,13 @@ _LEAKS = (
 )
 
 
-def _moved(outward: bool, by_A: bool) -> Term:
+def _motion_by_side(outward: bool, by_A: bool) -> Term:
     way, side = ("out", "in")[not outward], "AB"[not by_A]
     return Term(
         f"motion {way}, {side} carries",
         f"dx, v {'>=' if outward else '<'} 0, p_{side} the larger",
         "m^2",
-        lambda s: s.moved(outward, by_A),
+        lambda s: s.directed_step(outward, by_A),
         "sensor fault",
         "motion",
         needs=("x",),
@@ -339,9 +341,9 @@ def _released(rig: Rig, share: Callable[[Signals], Array | float]) -> Term:
     """Return free air in both chambers at once, each by its volume; `share`: how far side A's balance counts."""
     from sealscope.physics.cylinder import volumes_at_middle
 
-    own = rig.cylinder
-    middle = dict(zip("AB", volumes_at_middle(own), strict=True))
-    areas = {"A": own.A_A, "B": -own.A_B} if own.volumes == "position" else {"A": 0.0, "B": 0.0}
+    cylinder = rig.cylinder
+    middle = dict(zip("AB", volumes_at_middle(cylinder), strict=True))
+    areas = {"A": cylinder.A_A, "B": -cylinder.A_B} if cylinder.volumes == "position" else {"A": 0.0, "B": 0.0}
 
     def released(s: Signals) -> Array:
         by_A = share(s)
@@ -354,7 +356,7 @@ def _released(rig: Rig, share: Callable[[Signals], Array | float]) -> Term:
 
 
 def _lost_outside(side: str, share: float = 1.0) -> Term:
-    """Return what one side loses to the outside; `share`: how far it counts in the balance, and its sign there."""
+    """Return the external leak of one side; `share`: how far it counts in the balance, and its sign there."""
     name = f"p_{side}"
     return Term(
         f"external leak {side}",
@@ -369,13 +371,13 @@ def _lost_outside(side: str, share: float = 1.0) -> Term:
 
 
 def _made_up(side: str) -> Term:
-    """Return what is lost to the outside on one side and made up by a check valve on the side of lower pressure.
+    """Return the external leak of one side, made up by a check valve on the side of lower pressure.
 
     While that is the same side, the balance shows nothing. What B loses the pump need not take: it is negative.
     """
     name = f"p_{side}"
 
-    def lost(s: Signals) -> Array:
+    def made_up_volume(s: Signals) -> Array:
         carries = _middle(s.carried_by_A)
         return np.asarray((carries if side == "A" else carries - 1.0) * np.maximum(s.mean(name), 0.0) * s.dt)
 
@@ -383,7 +385,7 @@ def _made_up(side: str) -> Term:
         f"external leak {side}{MADE_UP}",
         f"{'-' if side == 'B' else ''}[{name} the larger] max({name}, 0) dt",
         "m^3/(s Pa)",
-        lost,
+        made_up_volume,
         "external leak",
         nuisance=False,
         needs=("p_A", "p_B"),
@@ -441,7 +443,7 @@ _START = Term(
 )
 
 _CYLINDER = (
-    *(_moved(outward, by_A) for outward in (True, False) for by_A in (True, False)),
+    *(_motion_by_side(outward, by_A) for outward in (True, False) for by_A in (True, False)),
     *_of_side("A"),
     *_of_side("B"),
     _LAG,
@@ -465,7 +467,7 @@ class _Way(NamedTuple):
     opens: float
 
     @classmethod
-    def of(cls, side: str, rising: bool) -> _Way:
+    def at_chamber(cls, side: str, rising: bool) -> _Way:
         """Return the edge from the supply into a chamber (`rising`), or from the chamber to the return."""
         opens = 1.0 if (side == "A") == rising else -1.0
         return cls(
@@ -484,9 +486,9 @@ class _Way(NamedTuple):
 
 
 def _edges(side: str) -> tuple[Term, ...]:
-    """Return what a chamber's edges pass: over their gain; late, by the spool's lag; by overlap, underlap and wear."""
+    """Return the flow of a chamber's edges over their gain; late, by the spool's lag; by overlap, underlap and wear."""
     terms = []
-    for way in (_Way.of(side, True), _Way.of(side, False)):
+    for way in (_Way.at_chamber(side, True), _Way.at_chamber(side, False)):
 
         def gain(s: Signals, way: _Way = way) -> Array:
             return np.asarray(np.maximum(way.opens * s.mean("u"), 0.0) * way.root(s) * s.dt)
@@ -550,7 +552,7 @@ _STORED = tuple(
 
 
 def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
-    """Return the balance of what a pump delivers where the piston displaces nothing; None where no channel gives it.
+    """Return the balance of a pump's delivery while the piston displaces nothing; None if no channel gives it.
 
     Over whole cycles or at standstill: neither motion nor position is in it. A zero of the flow is not told from
     leakage under a steady load, and is taken for none.
@@ -578,7 +580,7 @@ def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
 
 
 def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array] | None:
-    """Return what gives the increments of the volume that the pump delivers [m^3]; None where nothing recorded does.
+    """Return the function for the increments of the pump's delivered volume [m^3]; None if no channel gives them.
 
     By its angle, its speed, a flow meter, or the speed that the drive makes of the command. A meter's scale for each
     direction is in the areas of that direction.

@@ -61,10 +61,10 @@ def about_zero(blocks: Blocks, columns: Sequence[Columns]) -> Blocks:
     ends = [(positions[max(start - 1, 0)], positions[min(start + 1, TRIED - 1)]) for start in starts]
     fits = [minimize_scalar(cost, bounds=end, method="bounded", options={"xatol": 1e-3}) for end in ends]
     position = min(fits, key=lambda fit: fit.fun).x
-    zero, own = width * float(np.sinh(position)), columns[0]
+    zero, equation = width * float(np.sinh(position)), columns[0]
     gram = blocks.gram.copy()
-    gram[:, 0, own.leak] -= zero * gram[:, 0, own.bias]
-    gram[:, 0, :, own.leak] -= zero * gram[:, 0, :, own.bias]
+    gram[:, 0, equation.leak] -= zero * gram[:, 0, equation.bias]
+    gram[:, 0, :, equation.leak] -= zero * gram[:, 0, :, equation.bias]
     return replace(blocks, gram=gram, zero=blocks.zero + zero)
 
 
@@ -105,7 +105,7 @@ def _likelihoods(steps: Array, z: Array, walks: Array) -> Array:
     inside = directions.T @ z
     outside = z - directions @ inside
     total = float(outside @ outside) + (inside**2 / spread).sum(axis=1)
-    along = (np.sqrt(eigen) * inside / spread) @ basis.T
+    lead = (np.sqrt(eigen) * inside / spread) @ basis.T
     size = np.maximum((eigen / spread) @ (basis**2).T, np.finfo(float).tiny)
-    rest = np.maximum(total - (np.maximum(along, 0.0) ** 2 / size).max(axis=1), 1e-9 * total)
+    rest = np.maximum(total - (np.maximum(lead, 0.0) ** 2 / size).max(axis=1), 1e-9 * total)
     return np.asarray(-0.5 * np.log(spread).sum(axis=1) - 0.5 * n * np.log(rest))

@@ -164,7 +164,7 @@ class LiveBalance:
             return shown if isinstance(shown, NotJudged) else [shown]
         if not block.gram[0, 0, -1, -1] > 0.0 and self._waiting is None:
             return NotJudged(end, "at standstill", "blocks: at standstill")
-        self._waiting = block if self._waiting is None else Blocks.joined([self._waiting, block])
+        self._waiting = block if self._waiting is None else Blocks.join([self._waiting, block])
         if len(self._waiting) < LEARNED:
             return NotJudged(end, "learning")
         waiting, self._waiting = self._waiting, None

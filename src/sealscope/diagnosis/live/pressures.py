@@ -78,7 +78,7 @@ class PressureEstimator:
                 kept = kept[:, first // 2 :]
                 shown.append(NotJudged(float(run.t[-1]), "", f"half minutes before the first block: {reason}"))
             else:
-                self._follower = Follower.begun(beginning, self._rig)
+                self._follower = Follower.fit_start(beginning, self._rig)
         while (self._follower is not None or run.rate < _SLOWEST) and kept.shape[1] >= length:
             holds = [find_holds(kept[k], run.rate, self._held[k - 1]) for k in _PRESSURES]
             if min(hold.open for hold in holds) < length:  # a hold may go on
@@ -135,7 +135,7 @@ class PressureEstimator:
         assert self._follower is not None
         anew = self._follower.machine.rate != rate
         if anew:
-            self._follower = self._follower.at(self._rig, rate)
+            self._follower = self._follower.at_rate(self._rig, rate)
         elif abs(gap) < 0.5 / rate:
             return False
         short = -1.0 / rate <= gap <= _PAUSE  # nan before the first block
@@ -166,7 +166,7 @@ class PressureEstimator:
             raise InputError(f"saved state's rate must be > 0 Hz, got {rate}")
         if (law := part_of(known, "law", str)) not in LAWS:
             raise InputError(f"saved state's law must be {' or '.join(LAWS)}, got {law!r}")
-        self._follower = Follower(Machine.of(self._rig, rate, law), priors_of(self._rig, law), sense)
+        self._follower = Follower(Machine.from_rig(self._rig, rate, law), priors_of(self._rig, law), sense)
         recall(self._follower, _FOLLOWED, known)
 
 

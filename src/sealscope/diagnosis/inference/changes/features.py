@@ -36,7 +36,7 @@ def duty_tests(recording: Recording) -> list[StepTest]:
         length = round(max(1, math.ceil(length / samples)) * samples)
     sizes = []
     for names in (COMMANDS, MOTIONS):
-        if name := next((own for own in names if own in recording), None):
+        if name := next((channel for channel in names if channel in recording), None):
             values = _blocks(recording, length)[name]
             if not np.isfinite(values).any(axis=1).all():
                 return []
@@ -55,7 +55,7 @@ def sensor_tests(recording: Recording) -> list[tuple[str, StepTest]]:
     if np.isnan(blocks["p_A"]).all(axis=1).any():  # not known in all blocks
         return []
     features = _features(blocks, recording.rate)
-    return [(name, test) for name, own in features if (test := _test(recording, own, length)) is not None]
+    return [(name, test) for name, sizes in features if (test := _test(recording, sizes, length)) is not None]
 
 
 def _blocks(recording: Recording, length: int) -> dict[str, Array]:
@@ -71,15 +71,15 @@ def _blocks(recording: Recording, length: int) -> dict[str, Array]:
 def _features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[str, Array]]:
     """Yield a number a block of each feature, by its name."""
     p_A, p_B = blocks["p_A"], blocks["p_B"]
-    if name := next((own for own in ("omega", "u", "theta", "x") if own in blocks), None):
+    if name := next((channel for channel in ("omega", "u", "theta", "x") if channel in blocks), None):
         # whether p_A - p_B goes with the flow into A (1) or against it (-1): friction takes work
         flow = blocks[name] if name in ("omega", "u") else np.gradient(blocks[name], axis=1)
         difference = p_A - p_B - np.nanmean(p_A - p_B)
         yield "sense of p_A - p_B", np.sign(_of_rows(np.nanmean, difference * flow))
     # the median square, for a jump at a reversal is no noise
-    own, other = (np.log(_of_rows(np.nanmedian, np.diff(p, ORDER, axis=1) ** 2)) for p in (p_A, p_B))
-    yield "noise of the pressures", own + other
-    yield "noise of p_A beside that of p_B", own - other
+    noise_A, noise_B = (np.log(_of_rows(np.nanmedian, np.diff(p, ORDER, axis=1) ** 2)) for p in (p_A, p_B))
+    yield "noise of the pressures", noise_A + noise_B
+    yield "noise of p_A beside that of p_B", noise_A - noise_B
     length = p_A.shape[1] // 2
     values = (p_A + p_B)[:, : 2 * length].reshape(-1, 2, length)
     bins = np.array([0.0, *_BESIDE, *np.negative(_BESIDE)])

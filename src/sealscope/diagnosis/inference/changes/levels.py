@@ -75,7 +75,7 @@ def _motion(recording: Recording) -> Array | None:
     motion = [speed, _slope(speed, half)]
     if name == "x":
         motion.append(recording[name] - np.nanmean(recording[name]))
-    return np.column_stack([own / max(float(np.nanpercentile(np.abs(own), 99.0)), _TINY) for own in motion])
+    return np.column_stack([column / max(float(np.nanpercentile(np.abs(column), 99.0)), _TINY) for column in motion])
 
 
 def _slope(values: Array, half: int) -> Array:
@@ -102,7 +102,7 @@ def levels(recording: Recording) -> tuple[Array, Array] | None:
         motion = np.where(whole[:, None], motion, 0.0)
         moving = (whole & (np.abs(motion[:, 0]) > believed["slowest"])).astype(float)
         columns = np.column_stack([np.ones(len(recording)), np.sign(motion[:, 0]), motion, pressures - means])
-    own, size = min(2, columns.shape[1] - 2), columns.shape[1]
+    free, size = min(2, columns.shape[1] - 2), columns.shape[1]
     lengths, cycle = [len(recording) // count for count in believed["blocks"]], find_cycle(recording)
     if cycle is not None:
         samples = cycle * recording.rate
@@ -113,16 +113,16 @@ def levels(recording: Recording) -> tuple[Array, Array] | None:
             continue
         rows = (columns * moving[:, None])[: count * length].reshape(count, length, size)
         gram = rows.transpose(0, 2, 1) @ rows
-        if own == 2:
+        if free == 2:
             ways = 0.5 * (gram[:, 0, :1] + np.multiply.outer(gram[:, 0, 1], [1.0, -1.0]))
             if ways.min() < believed["least"] * length:
                 continue
-        solved = np.linalg.solve(gram[:, :own, :own], gram[:, :own, own:])
-        rest = (gram[:, own:, own:] - gram[:, own:, :own] @ solved).sum(axis=0)
+        solved = np.linalg.solve(gram[:, :free, :free], gram[:, :free, free:])
+        rest = (gram[:, free:, free:] - gram[:, free:, :free] @ solved).sum(axis=0)
         shared = np.linalg.lstsq(rest[:-2, :-2], rest[:-2, -2:], rcond=None)[0]
         fitted = solved[:, :, -2:] - solved[:, :, :-2] @ shared
         values = np.zeros((count, 4))
-        values[:, : 2 * own] = fitted.reshape(count, 2 * own)
+        values[:, : 2 * free] = fitted.reshape(count, 2 * free)
         values[:, :2] += means
         return recording.t[0] + (np.arange(count) + 0.5) * length / recording.rate, values
     return None
@@ -130,10 +130,10 @@ def levels(recording: Recording) -> tuple[Array, Array] | None:
 
 def level_tests(recording: Recording) -> tuple[Level, ...]:
     """Return the tests of all patterns, the most likely first."""
-    made = levels(recording)
-    if made is None:
+    estimated = levels(recording)
+    if estimated is None:
         return ()
-    time, values = made
+    time, values = estimated
     kept = np.flatnonzero(np.ptp(values, axis=0) > 0.0)
     change = np.diff(values[:, kept], axis=0)
     covariance = change.T @ change / len(change)
@@ -158,8 +158,8 @@ def _test(name: str, rows: Array, whitened: Array, time: Array) -> Level | None:
     """Return the test of whitened blocks (K, c) by the steps of `rows` (m, c), the first of them as it is."""
     basis, size = np.linalg.qr(rows.T)
     basis = basis[:, np.abs(np.diag(size)) > RANK * np.abs(size).max()]
-    blocks = [Information(time, np.eye(len(time)), whitened @ own) for own in basis.T]
-    tests = [test for own in blocks if (test := two_sided(own)) is not None]
+    blocks = [Information(time, np.eye(len(time)), whitened @ direction) for direction in basis.T]
+    tests = [test for component in blocks if (test := two_sided(component)) is not None]
     if not tests:
         return None
     half, count = 0.5 * len(time), len(tests)

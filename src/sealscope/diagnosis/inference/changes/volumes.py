@@ -61,18 +61,18 @@ def volume_observables(
     tuple of Observable
         The largest score first.
     """
-    about, recorded = (own.merged(priors("inference")["blocks"]["coarse"]) for own in (blocks, plain))
+    centred, recorded = (series.merged(priors("inference")["blocks"]["coarse"]) for series in (blocks, plain))
     first = columns[0]
     orifice = first.names.index(ORIFICE)
     tests: list[tuple[str, Sequence[float], Information, Array | None]] = []
     for index, term in enumerate(balances[0].terms):
         if not _is_tested(term, index, first, bool(lost)):
             continue
-        coarse = about if term.name in (LEAK, PUMP) else recorded
+        coarse = centred if term.name in (LEAK, PUMP) else recorded
         both: Sequence[float] = (1.0,) if term.cause in _ONE_WAY and term.name != BIAS else (1.0, -1.0)
         tests.append((_name_of(term), both, information(coarse, columns, index), None))
-    leak = information(about, columns, first.leak)
-    shapes = law_shapes(about, columns).items()
+    leak = information(centred, columns, first.leak)
+    shapes = law_shapes(centred, columns).items()
     tests += [(f"{LEAK} of exponent {exponent:g}", (1.0,), leak, shape) for exponent, shape in shapes if exponent < 1.0]
     scaled = information(_with_scale(recorded, columns, orifice), columns, orifice)
     tests.append((SCALE, (1.0, -1.0), scaled, None))
@@ -99,11 +99,11 @@ def volume_observables(
         observables.append(
             Observable.of_test(name, VOLUMES, step, looks=len(steps), sign=signs[best], advantage=advantage)
         )
-    return tuple(sorted(observables, key=lambda own: -own.score))
+    return tuple(sorted(observables, key=lambda observable: -observable.score))
 
 
 def _is_tested(term: Term, index: int, columns: Columns, has_lost: bool) -> bool:
-    """Return whether a term's coefficient is tested by itself."""
+    """Test whether a term's coefficient is to be tested by itself."""
     if term.drift == "motion" and index in columns.motion and term.name.startswith("motion"):
         return False  # area and displacement change together, as a scale
     if term.compared or term.name == ORIFICE:

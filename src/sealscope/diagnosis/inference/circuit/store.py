@@ -77,10 +77,10 @@ def lost_oil(signals: Signals, rig: Rig, cycle: float | None, begin: float) -> d
         return {}
     idle = np.where(signals.carried_by_A > 0.0, signals["p_B"], signals["p_A"])
     compliance = rig.makeup.V_gas / (rig.makeup.n_gas * (rig.fluid.p_charge + P_ATM))
-    given = -compliance * idle
+    volume = -compliance * idle
     if "x" in signals:
-        given = given - (rig.cylinder.A_A - rig.cylinder.A_B) * signals["x"]
-    level = _means(given, ends)
+        volume = volume - (rig.cylinder.A_A - rig.cylinder.A_B) * signals["x"]
+    level = _means(volume, ends)
     tests = {}
     for side in "AB":
         pressure = _means(signals[f"p_{side}"], ends)
@@ -91,13 +91,15 @@ def lost_oil(signals: Signals, rig: Rig, cycle: float | None, begin: float) -> d
 
 def _means(values: Array, ends: Array) -> Array:
     known = np.isfinite(values)
-    sums, counts = (np.concatenate([[0.0], np.cumsum(of)])[ends] for of in (np.where(known, values, 0.0), known))
+    sums, counts = (
+        np.concatenate([[0.0], np.cumsum(series)])[ends] for series in (np.where(known, values, 0.0), known)
+    )
     with np.errstate(invalid="ignore"):
         return np.asarray(np.diff(sums) / np.diff(counts))
 
 
 def _information(level: Array, pressure: Array, length: float, begin: float) -> Information:
-    """Return what the levels (K,) [m^3] say of the conductance to the outside, driven by `pressure` (K,) [Pa]."""
+    """Estimate the conductance to the outside from the levels (K,) [m^3], driven by `pressure` (K,) [Pa]."""
     count = len(level)
     time = (np.arange(count) + 0.5) * length
     flows = (np.tril(np.ones((count, count)), -1) + 0.5 * np.eye(count)) * pressure * length

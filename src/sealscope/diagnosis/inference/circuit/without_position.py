@@ -90,8 +90,8 @@ def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
         return []
     area = max(rig.cylinder.A_A, rig.cylinder.A_B)
     counts = known & (signals.step("u") == 0.0) if shut else known
-    still = _held(np.where(counts, speed, np.inf), recording.rate, area if shut else 0.0)
-    begin, made = float(recording.t[0]), list[CycleBalance]()
+    still = _find_holds(np.where(counts, speed, np.inf), recording.rate, area if shut else 0.0)
+    begin, balances = float(recording.t[0]), list[CycleBalance]()
     carries = rig.cylinder.single_rod
     if shut:
         blocks = _blocks(signals, equation, HELD, known & still, begin, carries)
@@ -101,12 +101,12 @@ def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
         blocks = None if half is None else _blocks(signals, equation, half, counts, begin, carries)
         if blocks is not None:
             lost = lost_oil(signals, rig, cycle, begin)
-            made.append(CycleBalance(blocks, equation, Columns(equation), lost))
-    return made
+            balances.append(CycleBalance(blocks, equation, Columns(equation), lost))
+    return balances
 
 
-def _held(speed: Array, rate: float, area: float = 0.0) -> NDArray[np.bool_]:
-    """Return in which samples the piston is held, after it has settled; with an `area`, creep is a standstill."""
+def _find_holds(speed: Array, rate: float, area: float = 0.0) -> NDArray[np.bool_]:
+    """Find the samples in which the piston is held, after it has settled; with an `area`, creep is a standstill."""
     size, settles = max(1, round(_PRIORS["averaged"] * rate)), max(1, round(_PRIORS["settles"] * rate))
     slow = np.abs(np.convolve(speed, np.full(size, 1.0 / size), "same"))
     finite = np.isfinite(slow)
@@ -135,16 +135,16 @@ def _blocks(
         side = _rows([signals.carried_by_A[1:] / rate], counts, half, rate).values[:, 0]
         one_side = np.minimum(side, 1.0 - side) < _PRIORS["elsewhere"]
         rows = rows._replace(whole=rows.whole & one_side)
-    each = 2 if half > HELD else round(2.0 * LONGEST / half)
-    parts = [slice(k * each, (k + 1) * each) for k in range(len(rows.time) // each)]
+    group = 2 if half > HELD else round(2.0 * LONGEST / half)
+    parts = [slice(k * group, (k + 1) * group) for k in range(len(rows.time) // group)]
     if sum(bool(rows.whole[part].any()) for part in parts) < FEWEST:
         return None
     kept = np.array([np.count_nonzero(rows.whole[part]) for part in parts])
-    whole = rows.values[: len(parts) * each][rows.whole[: len(parts) * each]]
+    whole = rows.values[: len(parts) * group][rows.whole[: len(parts) * group]]
     gram = Weighting((Columns(equation),)).close([whole], np.cumsum(kept))
     ends = np.array([[rows.time[part][0], rows.time[part][-1]] for part in parts]) + np.array([-0.25, 0.25]) * half
     measured = [_measured(dp[a:b], left[a:b], rate) for a, b in np.round(ends * rate).astype(int)]
-    flow, pressures = (np.array(of) for of in zip(*measured, strict=True))
+    flow, pressures = (np.array(values) for values in zip(*measured, strict=True))
     start, end = begin + ends.T
     return Blocks(start, end, gram, kept.astype(float), flow, pressures, np.zeros(len(parts))).merged()
 

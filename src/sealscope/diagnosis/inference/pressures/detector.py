@@ -35,13 +35,13 @@ class PressureResponse:
         return unusable(recording, self.rig)
 
     def reading(self, recording: Recording) -> PressureEvidence | None:
-        """Return what a recording says of the conductance; None where it says nothing."""
+        """Estimate the conductance in a recording; None where the recording says nothing of it."""
         return response.evidence(recording, self.rig)
 
     def learn(self, recording: Recording) -> Lesson | None:
-        """Return what a healthy recording teaches: the level of the conductance."""
-        own = self.reading(recording)
-        return None if own is None else {"level": own.level[0]}
+        """Return the lesson of a healthy recording: the level of the conductance."""
+        reading = self.reading(recording)
+        return None if reading is None else {"level": reading.level[0]}
 
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
         """Return the steps of the response's parameters, and the leak against healthy recordings."""
@@ -67,4 +67,4 @@ def response_observables(reading: PressureEvidence) -> tuple[Observable, ...]:
             best = max(range(len(steps)), key=lambda k: steps[k].score)
             sign = (1.0, -1.0)[best]
             observables.append(Observable.of_test(name, RESPONSE, steps[best], looks=2.0, sign=sign))
-    return tuple(sorted(observables, key=lambda own: -own.score))
+    return tuple(sorted(observables, key=lambda observable: -observable.score))

@@ -50,14 +50,14 @@ class PressureEvidence:
     others: Mapping[str, Information] = field(default_factory=dict)
 
     @staticmethod
-    def of(recording: Recording, rig: Rig, said: Mapping[str, Information]) -> PressureEvidence:
-        """Return it from what the blocks of a recording say of parameters, `said["G"]` of g."""
+    def from_blocks(recording: Recording, rig: Rig, information: Mapping[str, Information]) -> PressureEvidence:
+        """Build the evidence from the likelihood of each parameter in a recording, `information["G"]` of g."""
         edges, dp = block_edges(recording), np.abs(recording["p_A"] - recording["p_B"])
         pressure = np.add.reduceat(dp, edges[:-1]) / np.diff(edges)
         speed = rig.motor.omega_per_volt * float(np.mean(np.abs(recording["u"])))
-        others = {name: own for name, own in said.items() if name != "G"}
+        nuisance = {name: value for name, value in information.items() if name != "G"}
         pump = speed * rig.pump.q_b / (2.0 * np.pi)
-        return PressureEvidence(said["G"], pressure, pump, states_flow(rig), others)
+        return PressureEvidence(information["G"], pressure, pump, states_flow(rig), nuisance)
 
     @cached_property
     def test(self) -> StepTest | None:
@@ -94,12 +94,12 @@ def flow_scale() -> float:
 
 
 def states_flow(rig: Rig) -> bool:
-    """Return whether a rig states what turns a conductance into L/min."""
+    """Test whether a rig states the sizes to convert a conductance into L/min."""
     return rig.states("cylinder.A_A", "cylinder.A_B", "cylinder.M_eq")
 
 
 def wander_of_conductance(seconds: float) -> float:
-    """Return how far a healthy machine's conductance wanders in so many seconds [m^3/(s Pa)]."""
+    """Compute the drift of a healthy machine's conductance in so many seconds [m^3/(s Pa)]."""
     return float(PRIORS["conductance"]["wander"]) * math.sqrt(seconds / PRIORS["blocks"]["wander"])
 
 

@@ -34,7 +34,7 @@ class Normal(NamedTuple):
 
 
 class Priors(NamedTuple):
-    """What is believed of the parameters (p,): centre and `width` of their mean, and how far they `wander` in 90 s."""
+    """Prior on the parameters (p,): centre and `width` of their mean, and how far they `wander` in 90 s."""
 
     centre: Array
     width: Array
@@ -47,7 +47,7 @@ class Priors(NamedTuple):
 
     @property
     def normal(self) -> Normal:
-        """What is believed of a machine at first."""
+        """Prior on a machine before its first block."""
         return Normal(self.centre, np.diag((self.unit / self.width) ** 2))
 
     def spread(self, seconds: float) -> Array:
@@ -74,7 +74,7 @@ class Look(NamedTuple):
 
 
 class Model(Protocol):
-    """What can be fitted; `unit` (p,) of its parameters."""
+    """Model to be fitted; `unit` (p,) of its parameters."""
 
     @property
     def unit(self) -> Array: ...  # noqa: D102
@@ -149,33 +149,33 @@ class Joint:
     variance: float
 
     @staticmethod
-    def of(blocks: Sequence[Block], priors: Priors, seconds: float, asked: int) -> Joint:
-        """Return it for blocks of so many seconds; the noise has its long-run variance in the score of `asked`."""
+    def fit(blocks: Sequence[Block], priors: Priors, seconds: float, parameter: int) -> Joint:
+        """Fit blocks of so many seconds jointly; the noise has its long-run variance in the score of `parameter`."""
         theta = np.array([block.theta for block in blocks])
         strain = _strain(len(blocks), priors, seconds)
         pull = strain @ ((theta - priors.centre) / priors.unit).ravel()
         normal = block_diag(*(block.gram[1:, 1:] for block in blocks))
         vector = np.concatenate([block.gram[0, 1:] for block in blocks])
-        white, inflation = _noise(blocks, np.zeros(theta.size), asked)[0], 1.0
+        white, inflation = _noise(blocks, np.zeros(theta.size), parameter)[0], 1.0
         for _ in range(2):  # the noise's variance is one of the unknowns
             factor = cho_factor(normal / (white * inflation) + strain, check_finite=False)
             mean = cho_solve(factor, vector / (white * inflation) - pull, check_finite=False)
-            white, inflation = _noise(blocks, mean, asked)
+            white, inflation = _noise(blocks, mean, parameter)
         covariance = cho_solve(factor, np.eye(theta.size), check_finite=False)
         return Joint(priors, theta, mean, covariance, strain, white)
 
     def information(self, parameter: int, time: Array, reach: float) -> Information:
-        """Return what the blocks at `time` (K,) [s] say of a parameter, all others eliminated.
+        """Compute the likelihood of a parameter in the blocks at `time` (K,) [s], all others eliminated.
 
         What is believed of the parameter itself, which guided the fit, is taken out; that it wanders evenly or as a
         random walk, by `reach` over all blocks, is stated beside.
         """
-        own = slice(parameter, None, self.theta.shape[1])
-        inverse = np.linalg.inv(self.covariance[own, own])
-        believed, unit = self.strain[own, own], self.priors.unit[parameter]
-        at, precision = self.theta[:, parameter] / unit, inverse - believed
-        off = at - self.priors.centre[parameter] / unit
-        vector = inverse @ self.mean[own] + believed @ off + precision @ at
+        places = slice(parameter, None, self.theta.shape[1])
+        inverse = np.linalg.inv(self.covariance[places, places])
+        believed, unit = self.strain[places, places], self.priors.unit[parameter]
+        value, precision = self.theta[:, parameter] / unit, inverse - believed
+        off = value - self.priors.centre[parameter] / unit
+        vector = inverse @ self.mean[places] + believed @ off + precision @ value
         precision = 0.5 * (precision + precision.T) / unit**2
         return Information(time, precision, vector / unit, slope=reach, walk=reach)
 
@@ -187,12 +187,12 @@ def _strain(count: int, priors: Priors, seconds: float) -> Array:
     return np.asarray(walk + np.kron(np.full((count, count), 1.0 / count**2), priors.normal.precision))
 
 
-def _noise(blocks: Sequence[Block], off: Array, asked: int) -> tuple[float, float]:
+def _noise(blocks: Sequence[Block], off: Array, parameter: int) -> tuple[float, float]:
     """Return the variance [Pa^2] left at deviations (P,), and the long-run variance of the scores over it."""
-    moved = [np.append(1.0, -own) for own in off.reshape(len(blocks), -1)]
+    moved = [np.append(1.0, -deviation) for deviation in off.reshape(len(blocks), -1)]
     pairs = list(zip(blocks, moved, strict=True))
-    squares = sum(float(own @ block.gram @ own) for block, own in pairs)
+    squares = sum(float(direction @ block.gram @ direction) for block, direction in pairs)
     variance = max(squares, 1.0) / sum(block.samples for block in blocks)
-    scores = np.concatenate([block.scores @ own for block, own in pairs])
-    expected = variance * sum(float(block.gram[1 + asked, 1 + asked]) for block in blocks)
+    scores = np.concatenate([block.scores @ direction for block, direction in pairs])
+    expected = variance * sum(float(block.gram[1 + parameter, 1 + parameter]) for block in blocks)
     return variance, max(1.0, float(scores @ scores) / max(expected, np.finfo(float).tiny))

@@ -127,7 +127,7 @@ class ResponseLeak:
         if onset_s is None or test is None or not reading.stated:
             return None
         time = reading.information.time
-        beyond = course(reading.information, test, step=True).beyond(time < onset_s)
+        growth = course(reading.information, test, step=True).relative_to(time < onset_s)
         unit = reading.pressure * 0.5 * (1.0 + reading.orifice) / LITRE_PER_MINUTE
-        value, half = beyond.mean * unit, WITHIN_95 * np.sqrt(np.maximum(np.diag(beyond.covariance), 0.0)) * unit
+        value, half = growth.mean * unit, WITHIN_95 * np.sqrt(np.maximum(np.diag(growth.covariance), 0.0)) * unit
         return LeakCourse(time, value, value - half, value + half)

@@ -91,11 +91,12 @@ def _steady(v: float, now: Parameters, m: Reduced) -> tuple[float, float, float]
 
 @contracted
 def _held_by(friction: float, before: float, v: float, h: float, now: Parameters, m: Reduced) -> tuple[float, float]:
-    """Return the friction F [N] after h seconds in which that of steady sliding went from `before` to that at v.
+    """Compute the friction F [N] after h seconds, from F_0 `friction`.
 
-    give dF/dt = v - speed F/level: LuGre's law without its damping, which dies out as the contact slides. With a = h
-    speed/(give level), F = (F_0 + (a/2) (before + (1 + a) steady)) / (1 + a + a^2/2), times (give level)^2 above and
-    below; and `steady`, that at v.
+    In them the friction of steady sliding went from `before` to `steady`, the one at v, which is returned as well. The
+    law is give dF/dt = v - speed F/level: LuGre's law without its damping, which dies out as the contact slides. With
+    a = h speed/(give level), F = (F_0 + (a/2) (before + (1 + a) steady)) / (1 + a + a^2/2), times (give level)^2 above
+    and below.
     """
     steady, level, speed = _steady(v, now, m)
     w, g = h * speed, now[GIVE] * level
@@ -121,7 +122,7 @@ def _rates(y: State, friction: float, spin: float, now: Parameters, m: Reduced) 
 
 
 @contracted
-def _moved(y: State, h: float, k: State) -> State:
+def _advance(y: State, h: float, k: State) -> State:
     return y[0] + h * k[0], y[1] + h * k[1], y[2] + h * k[2], y[3] + h * k[3], y[4] + h * k[4], y[5] + h * k[5]
 
 
@@ -152,13 +153,13 @@ def simulate_response(
             w_1 = now[GAIN] * (command[sample] + rise * ((step + 0.5) / every)) + ahead
             w_2 = now[GAIN] * (command[sample] + rise * ((step + 1.0) / every)) + ahead
             k_1 = _rates(y, friction, w_0, now, m)
-            y_1 = _moved(y, 0.5 * h, k_1)
+            y_1 = _advance(y, 0.5 * h, k_1)
             k_2 = _rates(y_1, _held_by(friction, before, y_1[1], 0.5 * h, now, m)[0], w_1, now, m)
-            y_2 = _moved(y, 0.5 * h, k_2)
+            y_2 = _advance(y, 0.5 * h, k_2)
             k_3 = _rates(y_2, _held_by(friction, before, y_2[1], 0.5 * h, now, m)[0], w_1, now, m)
-            y_3 = _moved(y, h, k_3)
+            y_3 = _advance(y, h, k_3)
             k_4 = _rates(y_3, _held_by(friction, before, y_3[1], h, now, m)[0], w_2, now, m)
-            y = _moved(y, h / 6.0, _moved(_moved(_moved(k_1, 2.0, k_2), 2.0, k_3), 1.0, k_4))
+            y = _advance(y, h / 6.0, _advance(_advance(_advance(k_1, 2.0, k_2), 2.0, k_3), 1.0, k_4))
             friction, before = _held_by(friction, before, y[1], h, now, m)
             read = read + (y[0] - read) * (h / (h + now[LAG]))
         store(out, sample, read)
@@ -173,10 +174,10 @@ def priors_of(rig: Rig, law: str = STRIBECK) -> Priors:
     friction, gain = rig.friction, rig.motor.omega_per_volt
     of_difference = friction.coulomb_pressure == "difference"
     coulomb = coulomb_friction(rig.fluid.p_charge, rig.fluid.p_charge, friction.F_pr, friction.F_cfr, of_difference)
-    own = {"gain": gain, "bias": gain, "K": rig.fluid.K_oil, "F_C": coulomb}
-    own |= {name: getattr(friction, name) for name in ("F_v", "K_brk", "C_c")}
+    rig_values = {"gain": gain, "bias": gain, "K": rig.fluid.K_oil, "F_C": coulomb}
+    rig_values |= {name: getattr(friction, name) for name in ("F_v", "K_brk", "C_c")}
     known = {**PRIORS["response"], "give": PRIORS[law]["give"]}
-    return Priors(*np.array([own.get(name, 1.0) * np.array(known[name]) for name in PARAMETERS]).T)
+    return Priors(*np.array([rig_values.get(name, 1.0) * np.array(known[name]) for name in PARAMETERS]).T)
 
 
 def _tried(table: str, parameter: int, count: int) -> Array:
@@ -194,11 +195,11 @@ class Machine(NamedTuple):
     law: str
 
     @staticmethod
-    def of(rig: Rig, rate: float, law: str = STRIBECK) -> Machine:
-        """Return that of a rig's kind."""
+    def from_rig(rig: Rig, rate: float, law: str = STRIBECK) -> Machine:
+        """Build the machine of a rig's kind."""
         whole = rig_numbers(rig)
-        own = whole._replace(A_A=0.5 * (whole.A_A + whole.A_B), v_th=PRIORS[law].get("creep", whole.v_th))
-        reduced = Reduced(*(getattr(own, name) for name in Reduced._fields))
+        numbers = whole._replace(A_A=0.5 * (whole.A_A + whole.A_B), v_th=PRIORS[law].get("creep", whole.v_th))
+        reduced = Reduced(*(getattr(numbers, name) for name in Reduced._fields))
         return Machine(reduced, rate, math.ceil(1.0 / rate / _STEP), law)
 
     def run(self, command: Array, paths: Array, states: Array) -> tuple[Array, Array]:
@@ -233,9 +234,9 @@ class Machine(NamedTuple):
         segments = sliding_window_view([dp, total], min(_SEGMENT, dp.size), axis=1)[:, :: _SEGMENT // 2]
         spectra = np.fft.rfft(segments * np.hanning(segments.shape[2] + 1)[:-1], 4 * _SEGMENT)
         powers = np.mean(np.abs(spectra) ** 2, axis=1)  # Welch's
-        beyond = np.pad((powers[0] - powers[1])[k], 1, constant_values=-np.inf)
-        peaks = np.flatnonzero((beyond[1:-1] > beyond[:-2]) & (beyond[1:-1] >= beyond[2:]))
-        chosen = np.resize(peaks[np.argsort(-beyond[1 + peaks])], 2)
+        excess = np.pad((powers[0] - powers[1])[k], 1, constant_values=-np.inf)
+        peaks = np.flatnonzero((excess[1:-1] > excess[:-2]) & (excess[1:-1] >= excess[2:]))
+        chosen = np.resize(peaks[np.argsort(-excess[1 + peaks])], 2)
         return np.asarray(priors.centre[K_OIL] * (k[chosen] / middle) ** 2)
 
 
@@ -264,7 +265,7 @@ class Stretch:
 
     @cached_property
     def samples(self) -> float:
-        """How many samples are known."""
+        """Number of known samples."""
         return float(np.count_nonzero(self.known))
 
     @cached_property
@@ -300,9 +301,9 @@ class Stretch:
         rows[1 + OFFSET] = self.unit[OFFSET]
         rows[2 + OFFSET :] = self.dp - paths[1:, SCALE, None] * shown[simulated + 1 :] - paths[1:, OFFSET, None]
         rows, products, waves = self._fitted_part(rows)
-        gram, own = rows @ rows.T - waves @ products.T, slice(2 + OFFSET)
+        gram, free = rows @ rows.T - waves @ products.T, slice(2 + OFFSET)
         squares = np.diag(gram)[[0, *range(2 + OFFSET, len(rows))]]
-        return Look(theta, gram[own, own], rows[own], ends[:, : simulated + 1]), squares
+        return Look(theta, gram[free, free], rows[free], ends[:, : simulated + 1]), squares
 
     def _rest(self, theta: Array, shown: Array) -> Array:
         """Return the slopes of lead, lag and scale (3, n) from the simulated p_A - p_B (n,)."""
@@ -327,7 +328,7 @@ class Stretch:
         return max(squares, 1.0) / count * max(1.0, 2.0 * math.sqrt(math.pi) * self.smooth)
 
     def explained(self, cost: float) -> bool:
-        """Whether a chi square is not far above the number of samples."""
+        """Test whether a chi square is not far above the number of samples."""
         return bool(cost <= self.samples + _FOLLOW["unexplained"] * math.sqrt(2.0 * self.samples))
 
     def block(self, look: Look) -> Block:
@@ -347,12 +348,12 @@ def first_fit(stretch: Stretch, total: Array, noise: float) -> Look:
     """
     priors = stretch.priors
 
-    def ranked(of: Stretch, theta: Array, groups: int, changes: dict[int, Array]) -> Array:
+    def ranked(section: Stretch, theta: Array, groups: int, changes: dict[int, Array]) -> Array:
         """Return the groups that 16 sets with `changes` make, the best of each first: (16/groups, groups, p)."""
         sets = np.tile(theta, (SINGLE_WIDTH, 1))
         for parameter, values in changes.items():
             sets[:, parameter] = values
-        order = of.squares(sets).reshape(groups, -1).argsort(axis=1).T
+        order = section.squares(sets).reshape(groups, -1).argsort(axis=1).T
         return sets.reshape(groups, -1, len(PARAMETERS))[range(groups), order]
 
     slow = replace(stretch, smooth=_FOLLOW["slow"] * stretch.machine.period(priors.centre[K_OIL]))
@@ -395,19 +396,19 @@ class Follower:
         self.states, self.excess = np.zeros((8, SPRING + 2)), 0.0
 
     @staticmethod
-    def begun(recording: Recording, rig: Rig) -> Follower:
-        """Return it fitted to the first seconds of a recording, about to take these."""
+    def fit_start(recording: Recording, rig: Rig) -> Follower:
+        """Fit a follower to the first seconds of a recording; these are the next that it takes."""
         u, dp = recording["u"], recording["p_A"] - recording["p_B"]
         sense = float(np.sign(np.mean(u * (dp - dp.mean())))) or 1.0
         beginning = recording.samples(slice(0, math.ceil(_FOLLOW["window"] * recording.rate)))
         total = beginning["p_A"] + beginning["p_B"]
         noise = max(float(np.var(np.diff(total, 3))) / 20.0, 1.0)
-        follower = Follower(Machine.of(rig, recording.rate), priors_of(rig), sense)
+        follower = Follower(Machine.from_rig(rig, recording.rate), priors_of(rig), sense)
         window = follower.stretch(beginning)
         look = first_fit(window, total, noise)
         cost = look.cost(noise, follower.priors.normal, window.unit)
         if not window.explained(cost):
-            other = Follower(Machine.of(rig, recording.rate, BRISTLES), priors_of(rig, BRISTLES), sense)
+            other = Follower(Machine.from_rig(rig, recording.rate, BRISTLES), priors_of(rig, BRISTLES), sense)
             starts = np.array([look.theta, other.priors.centre])
             starts[:, GIVE] = other.priors.centre[GIVE]
             giving = fitted(other.stretch(beginning), starts, noise, 1)
@@ -416,15 +417,15 @@ class Follower:
         follower.theta, follower.variance = look.theta, window.spread(float(look.gram[0, 0]))
         covariance, states = follower.covariance, follower.states
         length = round(_FOLLOW["block"] * recording.rate)
-        taken = min(round(_FOLLOW["beginning"] * recording.rate), len(recording) - length + 1)
-        for first in range(0, taken, length):  # run once before, to begin where that ends
+        stop = min(round(_FOLLOW["beginning"] * recording.rate), len(recording) - length + 1)
+        for first in range(0, stop, length):  # run once before, to begin where that ends
             follower.take(recording.samples(slice(first, first + length)))
         follower.covariance, follower.states, follower.last = covariance, states, math.nan
         return follower
 
-    def at(self, rig: Rig, rate: float) -> Follower:
-        """Return it about to take samples at another rate [Hz]: what is known of the machine stays."""
-        machine = Machine.of(rig, rate, self.machine.law)
+    def at_rate(self, rig: Rig, rate: float) -> Follower:
+        """Return a follower for samples at another rate [Hz], with the same knowledge of the machine."""
+        machine = Machine.from_rig(rig, rate, self.machine.law)
         follower = Follower(machine, self.priors, self.sense)
         follower.theta, follower.covariance = self.theta, self.covariance
         follower.variance, follower.states = self.variance, self.states
@@ -445,12 +446,12 @@ class Follower:
             self.last, self.states = float(u[0]), self.states.copy()
             self.states[_POSITION] = self.machine.from_mid_stroke(u * self.theta[GAIN])
             known[: round(_FOLLOW["settling"] * block.rate)] = 0.0
-        apart = mains_waves(block["p_A"] + block["p_B"], block.rate) * known
+        waves = mains_waves(block["p_A"] + block["p_B"], block.rate) * known
         dp = self.sense * (block["p_A"] - block["p_B"])
-        return Stretch(self.machine, self.priors, np.append(self.last, u), dp, self.states, apart, known)
+        return Stretch(self.machine, self.priors, np.append(self.last, u), dp, self.states, waves, known)
 
     def _prior(self, seconds: float, jumped: int | None = None) -> Normal:
-        """Return what is believed of a block so long beforehand; a parameter that `jumped` as widely as at first."""
+        """Compute the prior on a block of so many seconds; a `jumped` parameter is as uncertain as at first."""
         priors = self.priors
         wander = priors.spread(seconds)
         if jumped is not None:
@@ -474,7 +475,7 @@ class Follower:
                 sets[:, parameter] = unit * _tried("jump", parameter, SINGLE_WIDTH)
                 best = int(stretch.squares(sets).argmin())
                 candidates.append(candidate(sets[best], self._prior(seconds, parameter)))
-        return min(candidates, key=lambda own: own[0])[1:]
+        return min(candidates, key=lambda entry: entry[0])[1:]
 
     def take(self, block: Recording) -> Block:
         """Return the sums of the next block."""
@@ -497,25 +498,25 @@ def response(recording: Recording, rig: Rig) -> Joint | None:
         edges = block_edges(recording)
         with np.errstate(over="ignore", invalid="ignore"):
             try:
-                follower = Follower.begun(recording, rig)
+                follower = Follower.fit_start(recording, rig)
                 parts = [follower.take(recording.samples(slice(*map(int, pair)))) for pair in pairwise(edges)]
-                own = Joint.of(parts, follower.priors, recording.duration / len(parts), G)
+                joint = Joint.fit(parts, follower.priors, recording.duration / len(parts), G)
             except np.linalg.LinAlgError:
                 return None
-        whole = np.all(np.isfinite(own.mean)) and np.all(np.isfinite(own.covariance))
+        whole = np.all(np.isfinite(joint.mean)) and np.all(np.isfinite(joint.covariance))
         share = _FOLLOW["explained"] * np.var(recording["p_A"] - recording["p_B"])
-        return own if whole and own.variance < share else None
+        return joint if whole and joint.variance < share else None
 
     return remembered(recording, ("response", rig), compute, ("u", "p_A", "p_B"))
 
 
 def evidence(recording: Recording, rig: Rig) -> PressureEvidence | None:
-    """Return what the response says of the parameters; None where nothing simulates it, or the circuit is another."""
-    own = response(recording, rig) if unusable(recording, rig) is None else None
-    if own is None:
+    """Estimate the parameters from the response; None where nothing simulates it, or the circuit is another."""
+    joint = response(recording, rig) if unusable(recording, rig) is None else None
+    if joint is None:
         return None
     time = middles(recording, block_edges(recording))
-    reach = np.sqrt(recording.duration / PRIORS["blocks"]["wander"]) * own.priors.wander
+    reach = np.sqrt(recording.duration / PRIORS["blocks"]["wander"]) * joint.priors.wander
     reach[G] = wander_of_conductance(recording.duration)
-    said = {name: own.information(k, time, float(reach[k])) for k, name in enumerate(PARAMETERS)}
-    return PressureEvidence.of(recording, rig, said)
+    information = {name: joint.information(k, time, float(reach[k])) for k, name in enumerate(PARAMETERS)}
+    return PressureEvidence.from_blocks(recording, rig, information)

@@ -151,18 +151,18 @@ def weigh(values: Any, ends: Any, place: Any, fast: int, known: Any, share: floa
     slow, normal, reduced = last - fast, workspace.normal, workspace.reduced
     for r in range(count):
         workspace.weights[r] = 1.0
-    settled = count == 0
+    converged = count == 0
     for turn in range(MOST_TURNS + 1):
         for b in range(blocks):
             _sum_products(values, int(ends[b - 1]) if b else 0, int(ends[b]), workspace.weights, gram[b])
             _reduce(gram[b], place, fast, reduced[b])
-        settled = settled or turn == MOST_TURNS
+        converged = converged or turn == MOST_TURNS
         for i in range(slow + 1):
             for j in range(slow + 1):
-                normal[i, j] = 0.0 if settled else known[i, j]
+                normal[i, j] = 0.0 if converged else known[i, j]
                 for b in range(blocks):
                     normal[i, j] += reduced[b, fast + i, fast + j]
-        if settled:
+        if converged:
             break
         eliminate(normal, slow)
         for b in range(blocks):
@@ -171,16 +171,16 @@ def weigh(values: Any, ends: Any, place: Any, fast: int, known: Any, share: floa
             for i in range(fast):
                 for j in range(fast, last):
                     workspace.fit[b, i] -= reduced[b, i, j] * workspace.fit[b, j]
-        settled = _reweigh(values, ends, place, workspace)
+        converged = _reweigh(values, ends, place, workspace)
     for i in range(slow + 1):
         for j in range(slow + 1):
             known[i, j] += share * (SUPPORT / blocks * normal[i, j] - known[i, j])
 
 
-def weighted(values: Array, ends: _Places, fast: _Places, own: _Places, known: Array, share: float) -> Array:
+def weighted(values: Array, ends: _Places, fast: _Places, slow: _Places, known: Array, share: float) -> Array:
     """Return the Gram matrices (K, m, m) of blocks, and learn from them (`weigh`)."""
-    place = np.concatenate([fast, own])
-    workspace = Workspace(*map(np.empty, workspace_shapes(len(values), len(ends), len(place), len(own) - 1)))
+    place = np.concatenate([fast, slow])
+    workspace = Workspace(*map(np.empty, workspace_shapes(len(values), len(ends), len(place), len(slow) - 1)))
     gram = np.empty((len(ends), values.shape[1], values.shape[1]))
     weigh(values, ends, place, len(fast), known, share, workspace, gram)
     return gram

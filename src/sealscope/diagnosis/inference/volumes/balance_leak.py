@@ -37,7 +37,7 @@ class BalanceLeak:
 
     @property
     def cause(self) -> Cause:
-        """What a leak is as far as the channels tell: the pressures at the pump separate its leak from the piston's."""
+        """Cause of a leak: the pressures at the pump separate its leak from the piston's."""
         return "piston leak" if len(self.balance.columns) > 1 else "piston or pump leak"
 
     @property
@@ -151,7 +151,7 @@ class BalanceLeak:
         )
 
     def total(self, findable: float | None) -> TotalLeakage:
-        """Return what pump and piston pass in all; `findable`: the smallest step that would have been found [m^3/s]."""
+        """Return the total leakage of pump and piston; `findable`: the smallest step that would be found [m^3/s]."""
         balance = self.balance
         size, pressure, pump, level = balance.size, balance.mean_pressure(), balance.mean_flow, balance.level
         limit, litres = healthy_leakage(balance.rig), size.scale / LITRE_PER_MINUTE
@@ -177,7 +177,7 @@ class BalanceLeak:
         if not balance.size.stated:
             return None
         time = balance.blocks.time
-        course = balance.whole if onset_s is None else balance.course(step=True).beyond(time < onset_s)
+        course = balance.total_course if onset_s is None else balance.course(step=True).relative_to(time < onset_s)
         value, deviation = course.mean, np.sqrt(np.maximum(np.diag(course.covariance), 0.0))
         unit = balance.blocks.driving(balance.zero) * balance.size.scale / LITRE_PER_MINUTE
         half = WITHIN_95 * np.hypot(deviation, value * balance.size.deviation)
@@ -186,7 +186,7 @@ class BalanceLeak:
 
     @property
     def remarks(self) -> Sequence[Remark]:
-        """What the balance says of sizes, zeros, delays and conditions."""
+        """Remarks of the balance on sizes, zeros, delays and conditions."""
         balance = self.balance
         size, zero, remarks = balance.size, balance.zero, list[Remark]()
         if size.ratio is not None and size.disagrees:

@@ -50,7 +50,7 @@ RESOLVED = 2
 
 
 def made_good(balance: RecordedBalance) -> bool:
-    """Whether the pump surely delivers what any pump loses: a loop brings the piston back, or holds it."""
+    """Test whether the pump surely delivers the loss of any pump: a loop brings the piston back, or holds it."""
     least: float = priors("inference")["held"]["share"]
     return balance.level.low * balance.mean_pressure() > least * balance.mean_flow
 
@@ -93,59 +93,70 @@ class VolumeBalance:
         return None
 
     def balance(self, recording: Recording, odds: float = 0.0) -> RecordedBalance | None:
-        """Return the recording's balance, that of the smallest bound where it has several; None where it has none.
+        """Return the recording's balance; None if it has none.
 
-        Where the position is not recorded a balance says nothing unless the pump makes good what a pump loses.
-        `odds`: logarithm of those by other recordings that the pump is cut off at rest.
+        Of several it is the one with the smallest bound. Without a recorded position a balance says nothing, unless
+        the pump surely makes good its loss. `odds`: log odds by other recordings that the pump is cut off at rest.
         """
         balances = equations(self.rig, frozenset(recording.channels))
         if not balances:
-            made = remembered(recording, (self.name, self.rig), lambda own: circulations(own, self.rig), _READ)
+            cycle_balances = remembered(
+                recording, (self.name, self.rig), lambda samples: circulations(samples, self.rig), _READ
+            )
             candidates = [
-                RecordedBalance(own.blocks, (own.equation,), (own.columns,), self.rig, recording, own.lost)
-                for own in made
+                RecordedBalance(
+                    cycle_balance.blocks,
+                    (cycle_balance.equation,),
+                    (cycle_balance.columns,),
+                    self.rig,
+                    recording,
+                    cycle_balance.lost,
+                )
+                for cycle_balance in cycle_balances
             ]
             answering = [
                 candidate for candidate in candidates if candidate.equations[0].name == LOCKED or made_good(candidate)
             ]
-            return min(answering, key=lambda own: BalanceLeak(self.name, own).bound_flow, default=None)
+            return min(answering, key=lambda candidate: BalanceLeak(self.name, candidate).bound_flow, default=None)
         recorded = self._recorded(recording)
         return None if recorded is None else self._balance(recording, recorded.regime(recorded.odds + odds))
 
     def _recorded(self, recording: Recording) -> RecordedBlocks | None:
-        return remembered(recording, (self.name, self.rig), lambda own: recorded_blocks(own, self.rig), _READ)
+        return remembered(recording, (self.name, self.rig), lambda samples: recorded_blocks(samples, self.rig), _READ)
 
     def _balance(self, recording: Recording, regime: RegimeBlocks) -> RecordedBalance:
         zero = float(regime.blocks.zero[0])
-        lost = remembered(recording, ("lost oil", self.rig), lambda own: lost_beside(own, self.rig, zero), _READ)
+        lost = remembered(
+            recording, ("lost oil", self.rig), lambda samples: lost_beside(samples, self.rig, zero), _READ
+        )
         blocks, plain, balances, columns, shut = regime
         return RecordedBalance(blocks, balances, columns, self.rig, recording, lost, plain, shut)
 
     def learn(self, recording: Recording) -> Lesson | None:
-        """Return what a healthy recording teaches (`scatter.RecordingSums`), by the terms of its balance.
+        """Return the lesson of a healthy recording (`scatter.RecordingSums`), by the terms of its balance.
 
         `scale` makes flows by the rig's displacement the machine's, 0 where its size is not stated. Where the machine
         rests, `shut_sums` are those of a pump that is cut off then, `shut_odds` the log odds that it is.
         """
         recorded = self._recorded(recording) if equations(self.rig, frozenset(recording.channels)) else None
-        own = self.balance(recording) if recorded is None else self._balance(recording, recorded.open)
-        if own is None:
+        balance = self.balance(recording) if recorded is None else self._balance(recording, recorded.open)
+        if balance is None:
             return None
-        scale = own.size.scale if own.size.stated else 0.0
-        known = {name: value for name, value in own.recording_sums._asdict().items() if value is not None}
+        scale = balance.size.scale if balance.size.stated else 0.0
+        known = {name: value for name, value in balance.recording_sums._asdict().items() if value is not None}
         if recorded is not None and recorded.shut is not None:
             shut = self._balance(recording, recorded.shut)
             known |= {"shut_sums": shut.recording_sums.sums, "shut_odds": recorded.odds}
-        return {"terms": list(own.columns[0].names), "scale": scale, **known}
+        return {"terms": list(balance.columns[0].names), "scale": scale, **known}
 
     def next_rise(self, lessons: Sequence[Lesson], channels: frozenset[str], repeated: int = 1) -> Rise:
         """Return the rise of a healthy recording like these on a later day, as after `repeated` times as many days."""
         shut = self._odds_of(lessons, channels) > 0.0
         healthy = [_sums_of(lesson, shut) for lesson in lessons]
-        later = [own._replace(start_s=_later(own, k)) for k in range(repeated) for own in healthy]
-        flow, pressure = (float(np.median([lesson[of] for lesson in lessons])) for of in ("flow", "pressure"))
+        later = [sums._replace(start_s=_later(sums, k)) for k in range(repeated) for sums in healthy]
+        flow, pressure = (float(np.median([lesson[name] for lesson in lessons])) for name in ("flow", "pressure"))
         middle = RecordingSums(healthy[0].sums, flow, pressure, oil_degC=healthy[0].oil_degC)
-        dated = next((own for own in healthy if own.start_s is not None), middle)
+        dated = next((sums for sums in healthy if sums.start_s is not None), middle)
         return rise(middle._replace(start_s=_later(dated, repeated)), later, self._columns(channels, shut))
 
     def _odds_of(self, lessons: Sequence[Lesson], channels: frozenset[str]) -> float:
@@ -179,7 +190,7 @@ class VolumeBalance:
         return self._report(balance, [_sums_of(lesson, balance.shut) for lesson in lessons if lesson["terms"] == names])
 
     def observe_regimes(self, recording: Recording) -> Mapping[bool, Observed]:
-        """Return what a recording shows by itself, with the pump in the circuit at rest (False) or cut off (True)."""
+        """Observe a recording by itself, with the pump in the circuit at rest (False) or cut off (True)."""
         recorded = self._recorded(recording) if equations(self.rig, frozenset(recording.channels)) else None
         regimes = [] if recorded is None else [recorded.open, recorded.shut]
         balances = [self._balance(recording, regime) for regime in regimes if regime is not None]
@@ -206,8 +217,8 @@ def _motion_observable(balance: RecordedBalance, healthy: Sequence[RecordingSums
     columns, sums = balance.columns[0], [recording.sums[0] for recording in healthy]
     change = motion_change(balance.recording_sums.sums[0], sums, columns)
     known = [
-        motion_change(own, sums[:k] + sums[k + 1 :], columns) * (len(sums) - 1) / len(sums)
-        for k, own in enumerate(sums if len(sums) > 1 else ())
+        motion_change(recording_sums, sums[:k] + sums[k + 1 :], columns) * (len(sums) - 1) / len(sums)
+        for k, recording_sums in enumerate(sums if len(sums) > 1 else ())
     ]
     observable = difference("motion", "motion", change, known, priors("inference")["size"]["motion"])
     yield from () if observable is None else (observable,)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class Size(NamedTuple):
-    """What turns a flow by the assumed displacement into that of the machine.
+    """Scale from a flow by the assumed displacement to that of the machine.
 
     `scale`, its relative `deviation`; `stated`: whether L/min can be stated at all; `ratio`: displacement over area as
     measured, over the assumed one, with its interval, None where the position has no unit; `area` of the piston by the
@@ -69,7 +69,7 @@ class RecordedBalance:
 
     @cached_property
     def leak(self) -> Information:
-        """What the blocks say of the leak's coefficient."""
+        """Likelihood of the leak's coefficient in the blocks."""
         return information(self.blocks, self.columns, self.columns[0].leak)
 
     @cached_property
@@ -89,9 +89,9 @@ class RecordedBalance:
 
     @cached_property
     def recording_sums(self) -> RecordingSums:
-        """What the recording says of a healthy machine."""
+        """Sums of the recording, for comparison with other recordings."""
         dated, oil = start_seconds(self.recording), oil_temperature(self.recording)
-        return RecordingSums.of(self.blocks, self.columns, dated, oil)
+        return RecordingSums.from_blocks(self.blocks, self.columns, dated, oil)
 
     @cached_property
     def zero(self) -> float:
@@ -100,7 +100,7 @@ class RecordedBalance:
 
     @cached_property
     def delay(self) -> tuple[float, float] | None:
-        """How much later x is recorded than the flow [s], by the share of its lag in the motion, with its deviation."""
+        """Delay of x behind the flow [s], by the share of its lag in the motion, with its deviation."""
         column = self.columns[0]
         motion = [k for k in column.motion if column.names[k].startswith("motion")]
         if LAG not in column.names or not motion:
@@ -133,24 +133,24 @@ class RecordedBalance:
 
     @cached_property
     def size(self) -> Size:
-        """What turns a flow by the assumed displacement into that of the machine."""
+        """Scale from a flow by the assumed displacement to that of the machine."""
         return _size(self)
 
     @cached_property
     def level(self) -> Interval:
-        """What passes pump and piston in all over the recording, as a conductance with its interval.
+        """Total leakage of pump and piston over the recording, as a conductance with its interval.
 
         The pressures at the pump's ports hardly differ from those of the chambers: the sum is known, its parts are not.
         """
         weights = np.maximum(self.blocks.rows, 0.0)
-        return self.whole.over(weights / weights.sum())
+        return self.total_course.over(weights / weights.sum())
 
     @cached_property
-    def whole(self) -> Course:
-        """What passes pump and piston in all over the blocks, as a conductance."""
+    def total_course(self) -> Course:
+        """Total leakage of pump and piston over the blocks, as a conductance."""
         column = self.columns[0]
-        apart = column.names.index(PUMP) if PUMP in column.names else None
-        both = information(self.blocks, self.columns, column.leak, apart)
+        pump = column.names.index(PUMP) if PUMP in column.names else None
+        both = information(self.blocks, self.columns, column.leak, pump)
         test = step_test(both)
         return course(both, test, step=test is not None and test.chance < RAREST)
 
@@ -181,11 +181,11 @@ def _size(balance: RecordedBalance) -> Size:
     if meter:
         return Size(1.0, believed["meter"], pressures, None, area.measured)
     ratio = Interval(*(area.assumed / end for end in (area.measured, area.high, max(area.low, 1e-12))))
-    apart = abs(1.0 / ratio.value - 1.0)
+    disagreement = abs(1.0 / ratio.value - 1.0)
     known = float(np.hypot(believed["displacement"], believed["area"]))
     if states_displacement:
-        disagrees = rig.states("cylinder.A_A", "cylinder.A_B") and apart > WITHIN_95 * known
-        deviation = apart if disagrees else believed["displacement"]
+        disagrees = rig.states("cylinder.A_A", "cylinder.A_B") and disagreement > WITHIN_95 * known
+        deviation = disagreement if disagrees else believed["displacement"]
         return Size(1.0, deviation, pressures, ratio, area.measured, disagrees)
     if rig.states("cylinder.A_A", "cylinder.A_B"):
         return Size(ratio.value, believed["area"], pressures, ratio, area.measured)

@@ -30,8 +30,8 @@ def rival_rises(
     observables = []
     for k in tested:
         values = [
-            _shift(own.sums, everything - own.sums if own is not judged else everything, columns, k)
-            for own in (judged, *healthy)
+            _shift(subject.sums, everything - subject.sums if subject is not judged else everything, columns, k)
+            for subject in (judged, *healthy)
         ]
         observable = difference(names[k], RISE, values[0], values[1:], above=names[k] != AIR)
         observables += [] if observable is None else [observable]
@@ -50,9 +50,9 @@ def _shift(sums: Array, reference: Array, columns: Sequence[Columns], test: int)
         residual = sums[e][:, column.left] - sums[e][:, chosen] @ coefficients
         with np.errstate(divide="ignore", over="ignore"):
             prior = 1.0 / (np.abs(coefficients) * width[chosen]) ** 2
-        matrix, along = sums[e][np.ix_(chosen, chosen)], sums[e][chosen, test]
+        matrix, cross = sums[e][np.ix_(chosen, chosen)], sums[e][chosen, test]
         tied = matrix + np.diag(np.minimum(prior, 1e9 * np.diag(matrix)))
-        solved = solve(tied, np.column_stack([along, residual[chosen]]))
-        precision += float(sums[e][test, test] - along @ solved[:, 0])
-        vector += float(residual[test] - along @ solved[:, 1])
+        solved = solve(tied, np.column_stack([cross, residual[chosen]]))
+        precision += float(sums[e][test, test] - cross @ solved[:, 0])
+        vector += float(residual[test] - cross @ solved[:, 1])
     return vector / precision if precision > 0.0 else 0.0
