@@ -164,7 +164,7 @@ def main() -> None:
 
 @contextmanager
 def _no_interrupt_lost() -> Iterator[None]:
-    """Send an interrupt again that came where Python ignores exceptions, such as in a finalizer of the compiler."""
+    """Repeat an interrupt that Python ignored, for example in a finalizer of the compiler."""
     usual = sys.unraisablehook
 
     def again(unraisable: Any) -> None:

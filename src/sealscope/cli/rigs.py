@@ -70,7 +70,7 @@ def new(
         text = rig_text(name, *areas, length, _si(volume, "m^3/rev", _CM3, "--displacement"))
     else:
         flow = _si(valve or _asked("Rated flow of the valve", "L/min"), "m^3/s", "L/min", "--valve")
-        pressures = (None if own is None else _si(own, "Pa", "bar", option) for own, option in (
+        pressures = (None if pressure is None else _si(pressure, "Pa", "bar", option) for pressure, option in (
             (drop, "--drop"), (supply, "--supply")))  # fmt: skip
         text = valve_rig_text(name, *areas, length, flow, *pressures)
     path = output or Path(f"{name}.toml")
@@ -112,11 +112,11 @@ def print_margins(
     from sealscope.units import parse_quantity
 
     loaded, force = load_rig(rig), parse_quantity(load, "N", name="--load")
-    made = controller_named(controller, loaded)
-    echo(f"{loaded.name}, {controller}, {made.rate:g} Hz, late by {made.delay} samples, load {force:g} N")
+    control = controller_named(controller, loaded)
+    echo(f"{loaded.name}, {controller}, {control.rate:g} Hz, late by {control.delay} samples, load {force:g} N")
     echo("speed [m/s]  gain [dB]  phase [deg]  crossover [Hz]  delay [ms]  peak 1/|1+L|")
     for speed in (0.0, 0.01, 0.02, 0.05):
-        m = margins(loaded, made, speed, force)
+        m = margins(loaded, control, speed, force)
         gain = "inf" if math.isinf(m.gain) else f"{20 * math.log10(m.gain):.1f}"
         figures = f"{math.degrees(m.phase):11.0f}  {m.crossover:14.2f}  {1e3 * m.delay:10.1f}  {m.peak:12.2f}"
         echo(f"{speed:11g}  {gain:>9}  {figures}" + ("" if m.damped else "\n  the rig alone is not damped here"))

@@ -48,7 +48,7 @@ _KEPT_S = 120.0
 
 @dataclass
 class _Actuator:
-    """What is in memory of an actuator.
+    """The state of an actuator in memory.
 
     `pending`, `bytes`: blocks since the checkpoint; `taken`: blocks so far; `judged_s`: end of the last block that was
     judged [s]; `last`: the last estimate, of flows over the cycles seen; `kept`: the last samples while there is an
@@ -87,8 +87,8 @@ class _Actuator:
                 self.judged_s = estimate.t
             if change is not None:
                 happened.append((*change, estimate.t))
-        alike = self.kept and (self.kept[0].units, self.kept[0].rate) == (samples.units, samples.rate)
-        if self.judge.alarm is None or not (follows and alike):
+        same_format = self.kept and (self.kept[0].units, self.kept[0].rate) == (samples.units, samples.rate)
+        if self.judge.alarm is None or not (follows and same_format):
             self.kept = []
         if self.judge.alarm is not None and len(samples):
             most = round(_KEPT_S * samples.rate)
@@ -98,7 +98,7 @@ class _Actuator:
         return estimates, happened
 
     def state(self) -> dict[str, Any]:
-        """Return all that a checkpoint keeps, as plain values."""
+        """Return the state for a checkpoint as plain values."""
         return saved(self, ("watch", "judge", "last", "oil_celsius", "judged_s"))
 
     def _machine_state(self) -> MachineState:
@@ -115,7 +115,7 @@ class _Actuator:
         return state_of("watched", since_s=max(baseline.learned_s, over or -math.inf))
 
     def summary(self) -> dict[str, Any]:
-        """Return what it shows now, as plain values."""
+        """Return the present summary as plain values."""
         base, alarm = self.watch.baseline, self.judge.alarm
         last = self.last or BlockEstimate(0, math.nan, "waits for samples")
         return {
@@ -146,9 +146,9 @@ def _settings_of(stored: str) -> WatchSettings | None:
 
 
 def _learned_alike(stored: Watch, fresh: Watch) -> bool:
-    """Return whether a stored watch learned with what a fresh one would, or with a displacement measured since."""
-    (rig, *rest), (before, *others) = fresh.learned_with, stored.learned_with
-    return rest == others and (rig == before or is_remeasured(rig, before))
+    """Test whether a stored watch learned under the conditions of a fresh one, up to a remeasured displacement."""
+    (rig, *rest), (before, *other_conditions) = fresh.learned_with, stored.learned_with
+    return rest == other_conditions and (rig == before or is_remeasured(rig, before))
 
 
 class _Repeated(Exception):  # noqa: N818 (says what happened)
@@ -175,17 +175,19 @@ class WatchedActuators:
         fresh = watch(load_watched(settings.rig).rig, false_alarms_per_1000_h=rate, learn_hours=settings.learn_hours)
         actuator, anew = _Actuator(settings, fresh, AlarmJudge(name), taken=taken), True
         if state is not None:
-            stored, own, pending = state
+            stored, checkpoint, pending = state
             before = _settings_of(stored)
-            actuator.judge = restored(AlarmJudge, own["judge"], "alarm")
-            if (version := part_of(own["watch"], "version", int)) != STATE_VERSION:
+            actuator.judge = restored(AlarmJudge, checkpoint["judge"], "alarm")
+            if (version := part_of(checkpoint["watch"], "version", int)) != STATE_VERSION:
                 _log.warning("%s: its state has version %s, not %d, begins anew", name, version, STATE_VERSION)
-                learned = part_of(own["watch"], "baseline_version", int)
+                learned = part_of(checkpoint["watch"], "baseline_version", int)
                 fresh.continue_from(self.store.last_number(self.store.tables.estimates, name), learned)
             else:
-                actuator.watch = Watch.from_state(own["watch"])
-                actuator.last = None if own["last"] is None else restored(BlockEstimate, own["last"], "last")
-                actuator.oil_celsius, actuator.judged_s = own.get("oil_celsius"), own.get("judged_s")
+                actuator.watch = Watch.from_state(checkpoint["watch"])
+                actuator.last = (
+                    None if checkpoint["last"] is None else restored(BlockEstimate, checkpoint["last"], "last")
+                )
+                actuator.oil_celsius, actuator.judged_s = checkpoint.get("oil_celsius"), checkpoint.get("judged_s")
                 for samples, follows in pending:  # as they were judged before
                     actuator.judged(samples, follows, before or settings)
                 anew = before != settings.watched_with
@@ -322,15 +324,15 @@ class WatchedActuators:
             if name not in self.settings:
                 raise InputError(f"the settings must have the actuator {name[:60]!r}, got none")
             actuator, rows = self._actuator(name), StoredRows()
-            at = getattr(actuator.last, "t", getattr(actuator.judge.alarm, "updated_s", 0.0))
+            t = getattr(actuator.last, "t", getattr(actuator.judge.alarm, "updated_s", 0.0))
             kept = list(actuator.kept)
-            alarm = actuator.judge.marked(mark, at, until=at + hours * 3600.0, reason=text)
+            alarm = actuator.judge.marked(mark, t, until=t + hours * 3600.0, reason=text)
             try:
                 if mark == "invalid":
                     actuator.watch.dismiss()
                 elif mark == "repaired":
                     actuator.watch.relearn()
-                rows.add_alarm(alarm, mark, at, by_whom, text)
+                rows.add_alarm(alarm, mark, t, by_whom, text)
                 self._checkpoint(actuator, rows)
                 self.store.keep(rows)
             except BaseException:  # the next one begins at the last transaction
@@ -338,7 +340,7 @@ class WatchedActuators:
                 raise
         if done := pass_on(self.settings[name].rig, alarm, mark, kept):  # takes a second, and holds nothing up
             rows = StoredRows()
-            rows.add_alarm(alarm, "comment", at, "Sealscope", done)
+            rows.add_alarm(alarm, "comment", t, "Sealscope", done)
             rows.alarms.clear()  # it may have changed meanwhile
             self.store.keep(rows)
         self._tell()
@@ -350,7 +352,7 @@ class WatchedActuators:
         return sum(settings.false_alarms_per_1000_h for settings in self.settings.values())
 
     def plain(self) -> dict[str, dict[str, Any]]:
-        """Return what each actuator of the settings shows now, as its last transaction left it.
+        """Return the present summary of each actuator of the settings, as its last transaction left it.
 
         Where nothing has come for `no_data_s` and no alarm lasts, its state says so.
         """
@@ -358,11 +360,11 @@ class WatchedActuators:
         shown = {}
         for name, settings in self.settings.items():
             if name in known:
-                summary, own = known[name], known[name].get("state")
+                summary, state = known[name], known[name].get("state")
                 silent = now - self._heard[name] > settings.no_data_s
-                if own is None or (silent and own["condition"] not in LEAKING):
-                    own = state_of("no data", since_s=summary["t"]).as_dict()
-                shown[name] = {**summary, "state": own}
+                if state is None or (silent and state["condition"] not in LEAKING):
+                    state = state_of("no data", since_s=summary["t"]).as_dict()
+                shown[name] = {**summary, "state": state}
         return shown
 
     def _tell(self) -> None:

@@ -64,17 +64,17 @@ class Alarm:
 
     @property
     def over(self) -> bool:
-        """Whether nothing is left to do about it."""
+        """Test whether the alarm is closed or invalid, with nothing left to do."""
         return self.state in ("invalid", "closed")
 
     @property
     def active(self) -> bool:
-        """Whether its cause lasts."""
+        """Test whether the cause of the alarm lasts."""
         return self.returned_s is None and not self.over
 
     @property
     def shelved(self) -> bool:
-        """Whether it is not to be announced, as of its last change."""
+        """Test whether the alarm was shelved at its last change, and so not to be announced."""
         return self.shelved_until_s > self.updated_s
 
     @property
@@ -89,10 +89,15 @@ class Alarm:
         return level | (NEW_BIT if self.state == "new" and not self.shelved else 0)
 
     def plain(self) -> dict[str, Any]:
-        """Return it as plain values, with what follows from its fields."""
-        own = state_of(self.condition, self.cause if self.active else None, since_s=self.onset_s)
+        """Return the fields as plain values, with the machine state and diagnostic number derived from them."""
+        machine_state = state_of(self.condition, self.cause if self.active else None, since_s=self.onset_s)
         number = DIAGNOSTIC_NUMBERS[self.level]
-        return {**vars(self), "diagnostic_number": number, "shelved": self.shelved, "machine_state": own.as_dict()}
+        return {
+            **vars(self),
+            "diagnostic_number": number,
+            "shelved": self.shelved,
+            "machine_state": machine_state.as_dict(),
+        }
 
 
 @dataclass
@@ -180,7 +185,7 @@ class AlarmJudge:
         self.alarm = None if alarm.over else alarm
         return alarm
 
-    def marked(self, mark: str, at: float, *, until: float = 0.0, reason: str = "") -> Alarm:
+    def marked(self, mark: str, t: float, *, until: float = 0.0, reason: str = "") -> Alarm:
         """Return the alarm after a person's word, one of `MARKS`, at clock `at` [s].
 
         `until`: clock until which it is shelved [s]; `reason`: why it is invalid. Raises InputError where there is no
@@ -206,10 +211,10 @@ class AlarmJudge:
             "acknowledged": {"state": last if alarm.active else "closed"},
         }
         self.above = self.error = self.below = 0
-        return self._kept(replace(alarm, updated_s=at, **by_mark[mark]))
+        return self._kept(replace(alarm, updated_s=t, **by_mark[mark]))
 
     def state(self) -> dict[str, Any]:
-        """Return all of it as plain values, for `restored`."""
+        """Return the fields as plain values for `restored`."""
         return saved(self, vars(self))
 
 

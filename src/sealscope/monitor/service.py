@@ -83,8 +83,8 @@ class Service:
             watched = settings.actuator, self.store, settings.keep_days
             with threadpool_limits(limits=1):  # as in `run`: sums in another order end in other digits
                 self.actuators = WatchedActuators(*watched)
-            own = self.actuators
-            self.supervisor, self.count, self.plain = own.supervisor, own.count, own.plain
+            actuators = self.actuators
+            self.supervisor, self.count, self.plain = actuators.supervisor, actuators.count, actuators.plain
             self.stopping, self._database = self.supervisor.stopping, self.supervisor.part(DATABASE)
             self._live = LiveSamples(self.store.last_samples)
             self._lines = EventLines(self.store, stdout or sys.stdout)
@@ -109,15 +109,15 @@ class Service:
         if self._queue.put(block, block.bytes):
             return
         self._waits += 1
-        began, said = time.monotonic(), False
+        began, logged = time.monotonic(), False
         while not self.stopping.is_set() and not self._queue.put(block, block.bytes, 0.5):
-            if not said and time.monotonic() - began > _LONG_WAIT_S:
-                said = True
+            if not logged and time.monotonic() - began > _LONG_WAIT_S:
+                logged = True
                 blocks, waiting, _ = self.waits()
                 _log.warning("a source waits: %d blocks are to be stored, %.1f MB", blocks, waiting / 1e6)
 
     def waits(self) -> tuple[int, int, int]:
-        """Return how many blocks are not stored yet, their bytes, and how often a source had to wait for them."""
+        """Count the blocks not stored yet, their bytes, and the waits of sources for them."""
         at_hand = [*self._at_hand]
         blocks, size = self._queue.waiting()
         return blocks + len(at_hand), size + sum(block.bytes for block in at_hand if block is not None), self._waits
@@ -237,5 +237,5 @@ class Service:
 
 
 def _worth_a_line(number: int) -> bool:
-    """Return whether the log gets a line about the same trouble for this time: the first ones, then powers of two."""
+    """Test whether repeat `number` of a trouble is logged: the first ones, then powers of two."""
     return number <= _FIRST_LINES or number & (number - 1) == 0

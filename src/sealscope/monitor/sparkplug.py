@@ -54,7 +54,7 @@ class SparkplugMetric:
     unit: str | None = None
 
     def typed(self, datatype: int) -> SparkplugMetric:
-        """Return it with the value that its field means as one of a type; None for types that are passed over."""
+        """Return the metric with its value converted from a data type; None for types without use here."""
         value = self.value
         if isinstance(value, bytes):
             kind = _ARRAYS.get(datatype)

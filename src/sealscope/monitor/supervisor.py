@@ -31,11 +31,11 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 class PartAway(Exception):  # noqa: N818 (says what happened)
-    """What a part needs is not there, such as a folder: an outage with this reason, and nothing to trace."""
+    """A part lacks a thing it needs, such as a folder: an outage with this reason and no traceback."""
 
 
 class SupervisedPart:
-    """What a monitor runs, or needs and can be without: whether it is reached, and its pause after errors.
+    """A part that a monitor runs, or can do without for a time: its outages, and its pause after errors.
 
     Several threads may say how it is; one at a time attempts it. `since`: clock of its outage [s], None while it is
     reached; `count`, `seconds`: outages so far, and how long those that are over lasted.
@@ -71,12 +71,12 @@ class SupervisedPart:
 
     @property
     def lasting_s(self) -> float:
-        """How long its present outage lasts [s]."""
+        """The length of the present outage so far [s]."""
         return 0.0 if self.since is None else time.monotonic() - self._began
 
     @property
     def pause_s(self) -> float:
-        """How long it still pauses [s]."""
+        """The rest of the pause [s]."""
         return max(0.0, self._due - time.monotonic())
 
     def attempt(self, work: Callable[[], object], *, at_once: bool = False) -> bool:
@@ -128,11 +128,16 @@ class Supervisor:
     def outages(self) -> list[dict[str, Any]]:
         """Return the outages that last: part, clock of its begin [s] and reason."""
         known = [*self._parts.values()]
-        return [{"part": of.name, "since": of.since, "reason": of.reason} for of in known if of.since is not None]
+        return [
+            {"part": part.name, "since": part.since, "reason": part.reason} for part in known if part.since is not None
+        ]
 
     def totals(self) -> dict[str, tuple[bool, int, float]]:
         """Return of each part whether it is reached, how many outages it had and how long they lasted [s]."""
-        return {of.name: (of.since is None, of.count, of.seconds + of.lasting_s) for of in [*self._parts.values()]}
+        return {
+            part.name: (part.since is None, part.count, part.seconds + part.lasting_s)
+            for part in [*self._parts.values()]
+        }
 
     def start(
         self, name: str, work: Callable[[], object], *, again: bool = True, ended: Callable[[], object] = lambda: None
@@ -185,7 +190,7 @@ class LimitedLines(logging.Filter):
         self._places: dict[tuple[str, str, int], tuple[float, int]] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return whether a record is one of the first of its place in this minute."""
+        """Test whether a record is one of the first of its place in this minute."""
         place = (record.name, record.pathname, record.lineno)
         now, most = time.monotonic(), _OWN_LINES if record.name.startswith("sealscope") else _LIBRARY_LINES
         began, count = self._places.get(place, (now, 0))
@@ -202,7 +207,7 @@ class LimitedLines(logging.Filter):
 
 
 def place_of(error: BaseException) -> str:
-    """Return in one line what an error is, and the last place of this package that it passed."""
+    """Describe in one line an error and the last place of this package on its way."""
     kind = "".join(traceback.format_exception_only(error)[-1:]).strip()
     where, step = "", error.__traceback__
     while isinstance(step, TracebackType):

@@ -79,13 +79,13 @@ class Chart(NamedTuple):
 
     @property
     def level_text(self) -> str:
-        """What the level is, in the key of the chart; it says so where the level lies above the frame."""
+        """The level in the key of the chart, with a remark if it lies above the frame."""
         above = self.level is not None and self.limits is not None and self.level > self.limits[1]
         return f"repair limit, {self.level:.2g} {self.unit}" + (", above the frame" if above else "")
 
     @property
     def cut(self) -> bool:
-        """Whether values lie beyond the limits."""
+        """Test whether any values lie beyond the limits."""
         low, high = self.limits or (-np.inf, np.inf)
         return any(bool(np.any((line.values < low) | (line.values > high))) for line in self.lines)
 
@@ -152,18 +152,18 @@ _CHANNELS = (
 def rms_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
     """Return the charts of the windowed RMS: d1..d4 of each chamber, then d3d4 of each."""
     charts = []
-    for names, of, key, height in (
+    for names, quantity, key, height in (
         (QUANTITIES[:-1], "the details", "", 230),
         ((PRODUCT,), label_of(PRODUCT), "-d3d4", 150),
     ):
         for chamber in chambers:
             if not chamber.window_t.size:
                 continue
-            own = chamber.channel
+            channel = chamber.channel
             unit, size = detail_unit(chamber.unit, names[0], pressure_unit)
             lines = tuple(ChartLine(label_of(name), name, chamber.window_rms[name] / size) for name in names)
-            title = f"RMS of {of} of {own}"
-            charts.append(Chart(f"rms-{own}{key}", "rms", title, unit, lines, f"windows-{own}", height))
+            title = f"RMS of {quantity} of {channel}"
+            charts.append(Chart(f"rms-{channel}{key}", "rms", title, unit, lines, f"windows-{channel}", height))
     return charts
 
 
@@ -326,6 +326,6 @@ def still_chart(
         picture.area("interval", t, *lines[1:3])
     if chart.level is not None and chart.level <= high:
         picture.level("level", chart.level)
-    for own, line in zip(chart.lines[: 1 if chart.band else None], lines, strict=False):
-        picture.line(f"line {own.style}", t, line, own.label, digits=0)
+    for line_style, line in zip(chart.lines[: 1 if chart.band else None], lines, strict=False):
+        picture.line(f"line {line_style.style}", t, line, line_style.label, digits=0)
     return picture

@@ -87,13 +87,13 @@ def _browser() -> str | None:
 
 
 def _is_whole_pdf(data: bytes) -> bool:
-    """Return whether a PDF is there to its end, and its table of contents where the end says (ISO 32000-1, 7.5.5)."""
+    """Test whether a PDF is complete, with its cross-reference table where the end says (ISO 32000-1, 7.5.5)."""
     end = re.search(rb"startxref\s+(\d+)\s+%%EOF\s*$", data[-1024:])
     return end is not None and re.match(rb"%PDF.*(xref|\d+ \d+ obj)", data[:4] + data[int(end[1]) :][:20]) is not None
 
 
 def _is_whole_png(data: bytes, width: int, height: int) -> bool:
-    """Return whether a PNG of this size is there to its end, the chunk IEND with its checksum."""
+    """Test whether a PNG of this size is complete, up to the chunk IEND with its checksum."""
     head = struct.pack(">8sL4sLL", b"\x89PNG\r\n\x1a\n", 13, b"IHDR", width, height)
     return data.startswith(head) and data.endswith(b"\0\0\0\0IEND\xaeB`\x82")
 

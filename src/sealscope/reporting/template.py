@@ -90,7 +90,7 @@ def check_page(path: str | os.PathLike[str], *, card: bool = True) -> Path:
 
 
 def write(path: str | os.PathLike[str], page: str) -> Path:
-    """Write a page as UTF-8, or as a PDF where the name ends so, whole or not at all.
+    """Write a page as UTF-8, or as a PDF if the name ends in .pdf; whole or not at all.
 
     Raises InputError where it cannot be written, MissingExtra where nothing on the machine prints a PDF.
     """

@@ -65,12 +65,12 @@ class StoredRows:
         self.pending.append({"actuator": actuator, "number": number, "samples": _packed(samples, follows)})
 
     def add_alarm(self, alarm: Alarm, kind: str, t: float, by_whom: str = "", text: str = "") -> None:
-        """Add an alarm as it is now, and what happened to it, or what a person said of it, unless `kind` is empty."""
-        own, plain = {"actuator": alarm.actuator}, json.dumps(alarm.plain())
-        self.alarms[alarm.id] = {**own, "id": alarm.id, "state": alarm.state, "alarm": plain}
+        """Add an alarm in its present state, and the event or the person's remark if `kind` is not empty."""
+        actuator, plain = {"actuator": alarm.actuator}, json.dumps(alarm.plain())
+        self.alarms[alarm.id] = {**actuator, "id": alarm.id, "state": alarm.state, "alarm": plain}
         if kind:
-            said = {"kind": kind, "by_whom": by_whom, "text": text}
-            self.events.append({**own, **said, "t": t, "alarm_id": alarm.id, "alarm": plain})
+            entry = {"kind": kind, "by_whom": by_whom, "text": text}
+            self.events.append({**actuator, **entry, "t": t, "alarm_id": alarm.id, "alarm": plain})
 
     def add_checkpoint(self, actuator: str, settings: str, state: dict[str, Any]) -> None:
         """Add the state of an actuator, which takes the place of the samples since the last one."""
@@ -159,10 +159,12 @@ class MonitorStore:
             return int(connection.execute(query).scalar() or 0)
 
     def known(self, blocks: Iterable[tuple[str, str]]) -> set[tuple[str, str]]:
-        """Return which of some blocks are stored; a block is an actuator and an identity."""
+        """Select the stored ones among blocks, each an actuator and an identity."""
         # a query for each: SQLite goes through the whole table for a list of pairs
-        of = tables.blocks.c
-        query = select(of.number).where(of.actuator == bindparam("of"), of.identity == bindparam("identity"))
+        columns = tables.blocks.c
+        query = select(columns.number).where(
+            columns.actuator == bindparam("of"), columns.identity == bindparam("identity")
+        )
         with self.engine.connect() as connection:
             return {
                 (actuator, identity)
@@ -171,7 +173,7 @@ class MonitorStore:
             }
 
     def is_known(self, actuator: str, identity: str) -> bool:
-        """Return whether a block is stored."""
+        """Test whether a block is stored."""
         return bool(self.known([(actuator, identity)]))
 
     def keep_blocks(self, connection: sa.Connection, blocks: Iterable[tuple[str, str, int]]) -> None:
@@ -184,9 +186,9 @@ class MonitorStore:
 
     def keep_rows(self, connection: sa.Connection, rows: StoredRows) -> None:
         """Store rows, each table's at once."""
-        of = bindparam("of", type_=sa.String)
+        actuator = bindparam("of", type_=sa.String)
         if rows.actuators:
-            before = tables.pending.delete().where(tables.pending.c.actuator == of)
+            before = tables.pending.delete().where(tables.pending.c.actuator == actuator)
             connection.execute(before, [{"of": name} for name in rows.actuators])
         if rows.events and self.engine.dialect.name == "postgresql":
             # events become known in the order of their numbers: an output that is past one never looks back
@@ -199,7 +201,7 @@ class MonitorStore:
         for place, table in enumerate((tables.blocks, tables.estimates)):
             old = [{"of": name, "last": numbers[place]} for name, numbers in rows.old.items() if numbers[place] > 0]
             if old:
-                chosen = (table.c.actuator == of) & (table.c.number <= bindparam("last"))
+                chosen = (table.c.actuator == actuator) & (table.c.number <= bindparam("last"))
                 connection.execute(table.delete().where(chosen), old)
 
     def keep(self, rows: StoredRows) -> None:
@@ -223,21 +225,21 @@ class MonitorStore:
 
     def keep_refused(self, rows: Sequence[dict[str, Any]]) -> None:
         """Store what was refused, `KEPT_REFUSED` at most with those before, in a transaction of its own."""
-        table, of = tables.refused, tables.refused.c
+        table, columns = tables.refused, tables.refused.c
         with self.writing() as connection:
             connection.execute(table.insert(), rows[-KEPT_REFUSED:])
-            last = int(connection.execute(select(func.max(of.number))).scalar() or 0)
-            connection.execute(table.delete().where(of.number <= last - KEPT_REFUSED))
+            last = int(connection.execute(select(func.max(columns.number))).scalar() or 0)
+            connection.execute(table.delete().where(columns.number <= last - KEPT_REFUSED))
 
     def refused(self, most: int = KEPT_REFUSED) -> list[dict[str, Any]]:
-        """Return what was refused, the last one first."""
+        """Return the refused messages and files, the last one first."""
         rows = self._rows(select(tables.refused).order_by(tables.refused.c.number.desc()).limit(most))
         return [dict(row._mapping) for row in rows]
 
     def begin_decoding(self, reader: str, digest: str) -> int:
         """Note that a reader begins to decode a message; return how often it began before and did not end."""
-        table, of = tables.decodings, tables.decodings.c
-        before = select(of.attempts).where(of.reader == reader, of.digest == digest)
+        table, columns = tables.decodings, tables.decodings.c
+        before = select(columns.attempts).where(columns.reader == reader, columns.digest == digest)
         with self._noting() as connection:
             attempts = int(connection.execute(before).scalar() or 0)
             self.put(connection, table, [{"reader": reader, "digest": digest, "attempts": attempts + 1}])
@@ -245,9 +247,9 @@ class MonitorStore:
 
     def end_decoding(self, reader: str, digest: str) -> None:
         """Forget that a reader began to decode a message."""
-        of = tables.decodings.c
+        columns = tables.decodings.c
         with self._noting() as connection:
-            connection.execute(tables.decodings.delete().where(of.reader == reader, of.digest == digest))
+            connection.execute(tables.decodings.delete().where(columns.reader == reader, columns.digest == digest))
 
     def last_number(self, table: sa.Table, actuator: str) -> int:
         """Return the number of an actuator's last row of a table, `tables.blocks` or `tables.estimates`."""
@@ -270,30 +272,30 @@ class MonitorStore:
         return [samples for samples, _ in (self.checkpoint(actuator) or ("", {}, []))[2]]
 
     def summaries(self) -> dict[str, dict[str, Any]]:
-        """Return what each actuator showed last."""
+        """Return the last summary of each actuator."""
         return {row.actuator: json.loads(row.summary) for row in self._rows(select(tables.summaries))}
 
     def alarms(self, *, open_only: bool = False, actuator: str | None = None) -> list[dict[str, Any]]:
         """Return alarms as plain values, by actuator, the latest first, whatever its clock said."""
-        of = tables.alarms.c
-        query = select(of.alarm)
+        columns = tables.alarms.c
+        query = select(columns.alarm)
         if open_only:
-            query = query.where(of.state.not_in(("closed", "invalid")))
+            query = query.where(columns.state.not_in(("closed", "invalid")))
         if actuator is not None:
-            query = query.where(of.actuator == actuator)
+            query = query.where(columns.actuator == actuator)
         values = [json.loads(text) for (text,) in self._rows(query)]
         return sorted(values, key=lambda alarm: (alarm["actuator"], -int(alarm["id"].rpartition("-")[2])))
 
     def events_since(self, number: int, most: int = 1000) -> list[tuple[int, dict[str, Any]]]:
         """Return events beyond a number with their own numbers, in their order."""
-        of = tables.events.c
-        rows = self._rows(select(tables.events).where(of.number > number).order_by(of.number).limit(most))
+        columns = tables.events.c
+        rows = self._rows(select(tables.events).where(columns.number > number).order_by(columns.number).limit(most))
         return [(row.number, _event(row)) for row in rows]
 
     def last_events(self, actuator: str, most: int = 200) -> list[dict[str, Any]]:
         """Return the latest events of an actuator, the last one first."""
-        of = tables.events.c
-        query = select(tables.events).where(of.actuator == actuator).order_by(of.number.desc()).limit(most)
+        columns = tables.events.c
+        query = select(tables.events).where(columns.actuator == actuator).order_by(columns.number.desc()).limit(most)
         return [_event(row) for row in self._rows(query)]
 
     def course(self, actuator: str, most: int = 600, seconds: float | None = None) -> list[dict[str, Any]]:
@@ -301,14 +303,14 @@ class MonitorStore:
 
         `seconds`: only the last of them, by the clock of the newest one, which may have been set back.
         """
-        of = tables.estimates.c
-        chosen = of.actuator == actuator
+        columns = tables.estimates.c
+        chosen = columns.actuator == actuator
         if seconds is not None:
-            newest = select(of.t).where(chosen).order_by(of.number.desc()).limit(1).scalar_subquery()
-            chosen &= of.t.between(newest - seconds, newest)
+            newest = select(columns.t).where(chosen).order_by(columns.number.desc()).limit(1).scalar_subquery()
+            chosen &= columns.t.between(newest - seconds, newest)
         every = max(1, -(-self._value(select(func.count()).where(chosen)) // most))
-        group = of.number - of.number % every
-        query = select(*(func.avg(of[name]).label(name) for name in ("t", *tables.FIGURES)))
+        group = columns.number - columns.number % every
+        query = select(*(func.avg(columns[name]).label(name) for name in ("t", *tables.FIGURES)))
         return [dict(row._mapping) for row in self._rows(query.where(chosen).group_by(group).order_by(group))]
 
     def estimates(self) -> Iterator[dict[str, Any]]:
@@ -336,7 +338,7 @@ class MonitorStore:
 
 
 def away(error: BaseException) -> str | None:
-    """Return in one line why the database does not answer or does not write, None for an error of another kind.
+    """Give the reason in one line if the database does not answer or write; None for an error of another kind.
 
     Values that it cannot hold are another kind: they would be refused again.
     """
@@ -373,6 +375,6 @@ def _event(row: Any) -> dict[str, Any]:
 
 def _prepare_sqlite(connection: Any, record: object) -> None:
     # a page holds a second of samples, and the cache all that a transaction writes
-    own = "page_size=16384", "cache_size=-32000", "busy_timeout=5000", "foreign_keys=ON"
-    for setting in (*own, "journal_mode=WAL", "synchronous=FULL"):
+    settings = "page_size=16384", "cache_size=-32000", "busy_timeout=5000", "foreign_keys=ON"
+    for setting in (*settings, "journal_mode=WAL", "synchronous=FULL"):
         connection.execute(f"PRAGMA {setting}")

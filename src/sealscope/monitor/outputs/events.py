@@ -22,7 +22,7 @@ _BY_ITSELF = ("raised", "error", "warning", "returned")
 
 
 def _announced(event: dict[str, Any]) -> bool:
-    """Whether an event goes out: what happens to a shelved alarm by itself does not, what a person does always."""
+    """Test whether an event is announced: of a shelved alarm only a person's acts are."""
     return event["event"] not in _BY_ITSELF or not event["alarm"]["shelved"]
 
 

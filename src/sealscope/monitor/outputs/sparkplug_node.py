@@ -114,19 +114,21 @@ class SparkplugNode:
         if message.qos:
             client.ack(message.mid, message.qos)
         try:
-            asked = spb.decoded_payload(message.payload).named(spb.REBIRTH)
+            request = spb.decoded_payload(message.payload).named(spb.REBIRTH)
         except ValueError as error:
             self._count("Sparkplug commands that are none")
             _log.info("a command that is none: %s", error)
             return
-        if asked is not None and asked.value is True:
+        if request is not None and request.value is True:
             self._due.set()
 
     def _sent_event(self, event: dict[str, Any]) -> bool:
-        alarm, at = event["alarm"], _clock(event["t"])
+        alarm, timestamp = event["alarm"], _clock(event["t"])
         if alarm["actuator"] not in self._shown:  # it is no longer in the settings
             return True
-        metrics = _metrics("alarm", _values("alarm", alarm), at) + _metrics("event", _values("event", event), at)
+        metrics = _metrics("alarm", _values("alarm", alarm), timestamp) + _metrics(
+            "event", _values("event", event), timestamp
+        )
         return self._send("DDATA", metrics, alarm["actuator"])
 
     def _bear(self) -> None:
@@ -182,10 +184,10 @@ def _values(table: str, values: Mapping[str, Any]) -> dict[str, Any]:
     return known
 
 
-def _metrics(table: str, values: Mapping[str, Any], at: int) -> list[spb.SparkplugMetric]:
+def _metrics(table: str, values: Mapping[str, Any], timestamp: int) -> list[spb.SparkplugMetric]:
     """Return metrics of a table with their values, of the time `at` [ms]."""
     rows = {name: _table(table)[name] for name in values}
     return [
-        spb.SparkplugMetric(name, values[name], getattr(spb, row["type"]), timestamp=at, unit=row.get("unit"))
+        spb.SparkplugMetric(name, values[name], getattr(spb, row["type"]), timestamp=timestamp, unit=row.get("unit"))
         for name, row in rows.items()
     ]

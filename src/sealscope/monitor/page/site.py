@@ -112,7 +112,7 @@ class _Pages:
         return Response(str(packaged(name)) if name.startswith("vendor/") else _packaged(name), media_type=kind)
 
     def _known(self) -> dict[str, Any]:
-        """Return what is known without the database."""
+        """Return the counters, waiting blocks and outages, which need no database."""
         counters, outages = self._actuators.counters, self._supervisor.outages()
         return {"counters": counters, "waiting": self._waits()[0], "outages": outages}
 
@@ -147,8 +147,8 @@ class _Pages:
             values = parse_json(await _body(request))
             if not isinstance(values, dict) or not all(isinstance(value, str) for value in values.values()):
                 raise InputError("a mark must be a mapping of texts")
-            said = {"by_whom": values.get("by", ""), "text": values.get("text", "")}
-            alarm = await asyncio.to_thread(self._actuators.mark, name, values.get("mark", ""), **said)
+            note = {"by_whom": values.get("by", ""), "text": values.get("text", "")}
+            alarm = await asyncio.to_thread(self._actuators.mark, name, values.get("mark", ""), **note)
         except TimeoutError:
             return _refusal(f"a request must have come within {_BODY_S:g} s", 408)
         except ValueError as error:
@@ -158,8 +158,12 @@ class _Pages:
     async def changes(self, request: Request) -> Response:
         if self._listeners >= self._most_listeners:
             return _refusal("too many listeners", 503)
-        asked = request.query_params
-        name, pressure, drawn = asked.get("actuator", ""), asked.get("pressure", "p_A"), asked.get("drawn", "rms")
+        parameters = request.query_params
+        name, pressure, drawn = (
+            parameters.get("actuator", ""),
+            parameters.get("pressure", "p_A"),
+            parameters.get("drawn", "rms"),
+        )
         if name and name not in self._machines:
             return _refusal("no such actuator", 404)
         if pressure not in PRESSURES or drawn not in DRAWN:
@@ -195,7 +199,7 @@ class _Pages:
         return metrics_text(summaries, self._actuators.counters, self._supervisor.totals(), self._waits())
 
     async def not_answering(self, request: Request, error: Exception) -> Response:
-        """Say in the form that was asked for that the database is away, and what is known without it."""
+        """Answer in the requested form if the database is away, with the values known without it."""
         reason = away(error)
         if reason is None:
             raise error
@@ -210,10 +214,10 @@ class _Pages:
         if request.method == "POST" and admission is not None:
             if wait := admission.pause_s(address):
                 return _later(wait)
-            given = ""
+            token = ""
             with suppress(InputError, TimeoutError):
-                given = parse_qs((await _body(request)).decode("utf-8", "replace")).get("token", [""])[0]
-            if admission.admits(address, given):
+                token = parse_qs((await _body(request)).decode("utf-8", "replace")).get("token", [""])[0]
+            if admission.admits(address, token):
                 answer = RedirectResponse("/", 303)
                 secure, longest = request.url.scheme == "https", 30 * 86_400
                 answer.set_cookie(_COOKIE, admission.session, longest, secure=secure, httponly=True, samesite="strict")
@@ -226,12 +230,12 @@ class _Pages:
         admission = self._admission
         if admission is None or request.url.path in ("/login", "/login.css"):
             return None
-        given, session = request.headers.get("authorization"), request.cookies.get(_COOKIE)
-        if given is not None or session is not None:
+        authorization, session = request.headers.get("authorization"), request.cookies.get(_COOKIE)
+        if authorization is not None or session is not None:
             address = _address(request)
             if wait := admission.pause_s(address):
                 return _later(wait)
-            if given is not None and admission.admits(address, given.removeprefix("Bearer ")):
+            if authorization is not None and admission.admits(address, authorization.removeprefix("Bearer ")):
                 return None
             if session is not None and admission.admits(address, session, session=True):
                 return None

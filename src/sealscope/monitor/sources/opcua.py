@@ -111,8 +111,8 @@ class _OpcUaSession:
         """Take a value of a subscription."""
         name, channel = self._channels[node.nodeid]
         stamped = data.monitored_item.Value
-        at = stamped.SourceTimestamp or stamped.ServerTimestamp or datetime.now(UTC)
-        t = (at if at.tzinfo is not None else at.replace(tzinfo=UTC)).timestamp()
+        moment = stamped.SourceTimestamp or stamped.ServerTimestamp or datetime.now(UTC)
+        t = (moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)).timestamp()
         known = stamped.StatusCode is None or stamped.StatusCode.is_good()
         try:
             samples = np.atleast_1d(np.asarray(value if known else math.nan, dtype=np.float64))

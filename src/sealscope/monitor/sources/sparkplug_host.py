@@ -42,7 +42,7 @@ _BRACKETED = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\]]*)\]")
 
 @dataclass
 class _Birth:
-    """What a birth says of the metrics that are channels, or the rate.
+    """The metrics of a birth that are channels or the rate.
 
     `names`: channel -> name of its metric; `aliases`: alias -> name; `metrics`: name -> metric as it was last.
     """
@@ -54,12 +54,12 @@ class _Birth:
     @classmethod
     def of(cls, metrics: Iterable[spb.SparkplugMetric], actuator: ActuatorSettings) -> _Birth:
         """Return the birth of an actuator: a name counts with a unit in brackets behind it, too."""
-        birth, wanted = cls(), {actuator.map.get(channel, channel): channel for channel in (*CHANNELS, _RATE)}
+        birth, channel_of = cls(), {actuator.map.get(channel, channel): channel for channel in (*CHANNELS, _RATE)}
         for metric in metrics:
             name, unit = metric.name or "", metric.unit
-            channel, bracketed = wanted.get(name), _BRACKETED.fullmatch(name)
+            channel, bracketed = channel_of.get(name), _BRACKETED.fullmatch(name)
             if bracketed is not None:
-                channel, unit = channel or wanted.get(bracketed["name"]), unit or bracketed["unit"]
+                channel, unit = channel or channel_of.get(bracketed["name"]), unit or bracketed["unit"]
             if channel is None:
                 continue
             birth.names[channel], birth.metrics[name] = name, replace(metric, unit=unit)
@@ -207,20 +207,20 @@ class SparkplugHost:
         by_name = {name: channel for channel, name in birth.names.items() if channel != _RATE}
         groups: dict[int, dict[str, spb.SparkplugMetric]] = defaultdict(dict)
         for metric in metrics:
-            name, at = str(metric.name), sent if metric.timestamp is None else metric.timestamp
+            name, timestamp = str(metric.name), sent if metric.timestamp is None else metric.timestamp
             if name not in by_name or (by_name[name] in SLOW and not isinstance(metric.value, np.ndarray)):
                 birth.metrics[name] = metric
-            elif at is None:
+            elif timestamp is None:
                 raise RefusedMessage(blocks.NO_CLOCK, f"the metric {name[:40]!r} must have a time, got none")
             else:
-                groups[at][by_name[name]] = metric
+                groups[timestamp][by_name[name]] = metric
         if not groups:
             return None
         rate, pieces = birth.rate(actuator), []
-        for at in sorted(groups):
-            piece = _piece(groups[at], birth, by_name)
+        for timestamp in sorted(groups):
+            piece = _piece(groups[timestamp], birth, by_name)
             size = next(iter(piece.values())).size
-            pieces.append({"t": self._clock(actuator.name, at / 1000.0, size, rate), **piece})
+            pieces.append({"t": self._clock(actuator.name, timestamp / 1000.0, size, rate), **piece})
         if (count := sum(piece["t"].size for piece in pieces)) > MOST_SAMPLES:
             raise RefusedMessage(blocks.OVERSIZED, f"{MOST_SAMPLES} samples are the most, got {count}")
         values = {
@@ -236,12 +236,12 @@ class SparkplugHost:
         converted = {channel: in_si(array, units.get(channel), channel) for channel, array in values.items()}
         return Recording(t, converted, {channel: CHANNEL_UNITS[channel] for channel in converted}, rate)
 
-    def _clock(self, actuator: str, at: float, size: int, rate: float) -> Array:
+    def _clock(self, actuator: str, t: float, size: int, rate: float) -> Array:
         """Return the times of samples that begin at `at` [s], a whole millisecond."""
-        first, expected = at, self._follows.get(actuator, math.nan)
-        if abs(expected - at) < 3.0 * _LATE:
-            beyond = min(max(expected, at - _EARLY), at + _LATE) - expected
-            first = expected + min(max(beyond, -_YIELDS / rate), _YIELDS / rate)
+        first, expected = t, self._follows.get(actuator, math.nan)
+        if abs(expected - t) < 3.0 * _LATE:
+            excess = min(max(expected, t - _EARLY), t + _LATE) - expected
+            first = expected + min(max(excess, -_YIELDS / rate), _YIELDS / rate)
         self._follows[actuator] = first + size / rate
         return np.asarray(first + np.arange(size) / rate)
 

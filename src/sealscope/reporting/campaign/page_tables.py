@@ -51,14 +51,14 @@ def page_tables(judgement: Judgement, unit: str, part: str = "") -> dict[str, Pa
 
 
 def _cell(row: Any, content: str) -> str:
-    """Return what stands in a column of a row, as the layout says it."""
+    """Format one cell of a row by the layout of its column."""
     how, _, path = content.rpartition(" ")
     value = attribute_of(row, path)
     return _FORMATS[how](value) if how in _FORMATS else format(value, how)
 
 
 class CauseTable(NamedTuple):
-    """What one detector names (`columns`) for which cause there is: a name, the records, and the share of each.
+    """The causes named by one detector (`columns`) for each true cause: its name, its records, the share of each.
 
     `right`: records whose cause is named alone; `covered`: alone or with the one that no channel tells from it.
     """
