@@ -100,7 +100,7 @@ def _side_by_side(
     if jobs == 1:
         yield "", work(files)
         return
-    for part, result in in_order(jobs, partial(_aside, work), [[file] for file in files]):
+    for part, result in in_order(jobs, partial(_collect_messages, work), [[file] for file in files]):
         yield result or (f"sealscope: the process that diagnosed {part[0]} died\n", [None])
 
 
@@ -178,7 +178,7 @@ def _began(result: Judged) -> float | None:
     return file_seconds(recording, path) if path.is_file() else start_seconds(recording, path.name)
 
 
-def _aside(
+def _collect_messages(
     work: Callable[[Sequence[Path]], Iterator[Dated | None]], files: Sequence[Path]
 ) -> tuple[str, list[Dated | None]]:
     """Run the work. Return its messages on standard error, and its results."""

@@ -63,13 +63,13 @@ def new(
         areas = piston_areas(*diameters, both=double_rod)
     else:
         sides = (area_A, "Piston area on side A", "--area-A"), (area_B, "... on side B", "--area-B")
-        areas = tuple(_si(text or _asked(what, _MM2), "m^2", _MM2, option) for text, what, option in sides)  # type: ignore[assignment]
-    length = _si(stroke or _asked("Stroke", _MM), "m", _MM, "--stroke")
+        areas = tuple(_si(text or _ask_size(what, _MM2), "m^2", _MM2, option) for text, what, option in sides)  # type: ignore[assignment]
+    length = _si(stroke or _ask_size("Stroke", _MM), "m", _MM, "--stroke")
     if kind == "pump":
-        volume = displacement or _asked("Displacement of the pump", _CM3)
+        volume = displacement or _ask_size("Displacement of the pump", _CM3)
         text = rig_text(name, *areas, length, _si(volume, "m^3/rev", _CM3, "--displacement"))
     else:
-        flow = _si(valve or _asked("Rated flow of the valve", "L/min"), "m^3/s", "L/min", "--valve")
+        flow = _si(valve or _ask_size("Rated flow of the valve", "L/min"), "m^3/s", "L/min", "--valve")
         pressures = (None if pressure is None else _si(pressure, "Pa", "bar", option) for pressure, option in (
             (drop, "--drop"), (supply, "--supply")))  # fmt: skip
         text = valve_rig_text(name, *areas, length, flow, *pressures)
@@ -84,7 +84,7 @@ def new(
     echo(f"replace what is assumed (grep 'assumed:' {path}), then:\nsealscope simulate --rig {path} -o run.nc")
 
 
-def _asked(what: str, unit: str) -> str:
+def _ask_size(what: str, unit: str) -> str:
     """Ask for a size at the terminal."""
     return str(prompt(f"{what} [{unit}]"))
 

@@ -29,7 +29,7 @@ from sealscope.diagnosis.verdict.states import LEAKING, MachineState, state_of
 from sealscope.errors import InputError
 from sealscope.monitor.alarms import Alarm, AlarmJudge
 from sealscope.monitor.database.machine_files import pass_on
-from sealscope.monitor.database.store import KEPT_IDENTITIES, MonitorStore, StoredRows, away
+from sealscope.monitor.database.store import KEPT_IDENTITIES, MonitorStore, StoredRows, outage_reason
 from sealscope.monitor.settings import ActuatorSettings, WatchSettings
 from sealscope.monitor.sources.source_block import SourceBlock, bytes_of
 from sealscope.monitor.supervisor import Supervisor
@@ -67,7 +67,7 @@ class _Actuator:
     judged_s: float | None = None
     kept: list[Recording] = field(default_factory=list)
 
-    def judged(
+    def judge_samples(
         self, samples: Recording, follows: bool, settings: WatchSettings
     ) -> tuple[list[BlockEstimate], list[tuple[Alarm, str, float]]]:
         """Return the estimates of samples, and what happened to alarms: the same whenever it is gone through."""
@@ -164,16 +164,16 @@ class WatchedActuators:
         self._keep_s = keep_days * 86_400.0
         self._counters, self._counting = Counter[str](), threading.Lock()
         self._changes, self.changed, self.closed = itertools.count(1), 0, False
-        self.supervisor = Supervisor(away, self._tell)
+        self.supervisor = Supervisor(outage_reason, self._tell)
         self._lock = threading.RLock()
         self._actuators = {name: self._restored(self.settings[name]) for name in self.settings}
 
     def _restored(self, settings: ActuatorSettings) -> _Actuator:
         """Return an actuator as its last transaction left it, or begun anew where it is new or the settings changed."""
         name, rate = settings.name, settings.false_alarms_per_1000_h
-        state, taken = self.store.checkpoint(name), self.store.last_number(self.store.tables.blocks, name)
+        state, block_count = self.store.checkpoint(name), self.store.last_number(self.store.tables.blocks, name)
         fresh = watch(load_watched(settings.rig).rig, false_alarms_per_1000_h=rate, learn_hours=settings.learn_hours)
-        actuator, anew = _Actuator(settings, fresh, AlarmJudge(name), taken=taken), True
+        actuator, anew = _Actuator(settings, fresh, AlarmJudge(name), taken=block_count), True
         if state is not None:
             stored, checkpoint, pending = state
             before = _settings_of(stored)
@@ -189,7 +189,7 @@ class WatchedActuators:
                 )
                 actuator.oil_celsius, actuator.judged_s = checkpoint.get("oil_celsius"), checkpoint.get("judged_s")
                 for samples, follows in pending:  # as they were judged before
-                    actuator.judged(samples, follows, before or settings)
+                    actuator.judge_samples(samples, follows, before or settings)
                 anew = before != settings.watched_with
                 actuator.watch.false_alarms_per_1000_h = rate  # with the same baseline
                 if not _learned_alike(actuator.watch, fresh):
@@ -239,7 +239,7 @@ class WatchedActuators:
             try:
                 self._stored(fresh)
             except _Repeated:
-                known = self.store.known(new)
+                known = self.store.select_stored(new)
                 fresh = [block for block in fresh if (block.actuator, block.identity) not in known]
                 self._stored(fresh)
         except BaseException:
@@ -268,7 +268,7 @@ class WatchedActuators:
             for block, actuator in mine:
                 actuator.taken += 1
                 if block.samples is not None:
-                    self._taken(rows, actuator, block.samples, block.follows)
+                    self._add_samples(rows, actuator, block.samples, block.follows)
             self.store.keep_rows(connection, rows)
 
     def _actuator(self, name: str) -> _Actuator:
@@ -276,10 +276,10 @@ class WatchedActuators:
             self._actuators[name] = self._restored(self.settings[name])
         return self._actuators[name]
 
-    def _taken(self, rows: StoredRows, actuator: _Actuator, samples: Recording, follows: bool) -> None:
+    def _add_samples(self, rows: StoredRows, actuator: _Actuator, samples: Recording, follows: bool) -> None:
         """Add to the rows what samples make of an actuator."""
         name = actuator.settings.name
-        estimates, happened = actuator.judged(samples, follows, actuator.settings)
+        estimates, happened = actuator.judge_samples(samples, follows, actuator.settings)
         rows.add_estimates(name, estimates, actuator.oil_celsius)
         for alarm, kind, t in happened:
             rows.add_alarm(alarm, kind, t)

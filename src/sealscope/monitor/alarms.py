@@ -177,16 +177,16 @@ class AlarmJudge:
         if leak is not None:
             leak_lpm, interval = estimate.leak_lpm, estimate.leak_interval_lpm
             now = replace(now, leak_lpm=leak_lpm, leak_interval_lpm=interval, by_chance_per_1000_h=by_chance)
-        return self._kept(now), happened
+        return self._keep(now), happened
 
-    def _kept(self, alarm: Alarm) -> Alarm:
+    def _keep(self, alarm: Alarm) -> Alarm:
         if not alarm.active:
             self.over_s = alarm.updated_s
         self.alarm = None if alarm.over else alarm
         return alarm
 
     def marked(self, mark: str, t: float, *, until: float = 0.0, reason: str = "") -> Alarm:
-        """Return the alarm after a person's word, one of `MARKS`, at clock `at` [s].
+        """Return the alarm after a person's word, one of `MARKS`, at clock `t` [s].
 
         `until`: clock until which it is shelved [s]; `reason`: why it is invalid. Raises InputError where there is no
         alarm, it is so marked already, or an invalid one has no reason.
@@ -211,7 +211,7 @@ class AlarmJudge:
             "acknowledged": {"state": last if alarm.active else "closed"},
         }
         self.above = self.error = self.below = 0
-        return self._kept(replace(alarm, updated_s=t, **by_mark[mark]))
+        return self._keep(replace(alarm, updated_s=t, **by_mark[mark]))
 
     def state(self) -> dict[str, Any]:
         """Return the fields as plain values for `restored`."""

@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from sealscope.errors import InputError
 from sealscope.monitor.actuators import DROPPED, WatchedActuators
-from sealscope.monitor.database.store import MonitorStore, away
+from sealscope.monitor.database.store import MonitorStore, outage_reason
 from sealscope.monitor.outputs.events import EventLines, Webhook
 from sealscope.monitor.outputs.sparkplug_node import SparkplugNode
 from sealscope.monitor.page.live import LiveSamples
@@ -211,7 +211,7 @@ class Service:
         try:
             write(blocks)
         except Exception as error:
-            if away(error) is not None:
+            if outage_reason(error) is not None:
                 self.count("waits for the database")
                 self._blocked = True
                 raise

@@ -75,7 +75,7 @@ class SparkplugPayload:
     metrics: tuple[SparkplugMetric, ...]
     seq: int | None = None
 
-    def named(self, name: str) -> SparkplugMetric | None:
+    def find_metric(self, name: str) -> SparkplugMetric | None:
         """Return the first metric of a name, None where there is none."""
         return next((metric for metric in self.metrics if metric.name == name), None)
 
@@ -138,7 +138,7 @@ def decoded_payload(data: bytes) -> SparkplugPayload:
         message.ParseFromString(data)
         if len(message.metrics) > _MOST_METRICS:
             raise ValueError(f"got {len(message.metrics)} metrics")
-        timestamp, seq = _stated(message, "timestamp", "seq")
+        timestamp, seq = _get_fields(message, "timestamp", "seq")
         if seq is not None and seq > 255:
             raise ValueError(f"seq must be 0 to 255, got {seq}")
         return SparkplugPayload(timestamp, tuple(map(_metric, message.metrics)), seq)
@@ -146,7 +146,7 @@ def decoded_payload(data: bytes) -> SparkplugPayload:
         raise ValueError(f"it must be a payload of Sparkplug B: {' '.join(str(error).split())[:80]}") from None
 
 
-def _stated(message: Any, *names: str) -> list[Any]:
+def _get_fields(message: Any, *names: str) -> list[Any]:
     return [getattr(message, name) if message.HasField(name) else None for name in names]
 
 
@@ -157,7 +157,7 @@ def _metric(entry: Any) -> SparkplugMetric:
         raise ValueError("a text must be UTF-8")  # damaged text is returned as bytes
     properties = zip(entry.properties.keys, entry.properties.values, strict=False)
     unit = next((str(value.string_value)[:40] for key, value in properties if key == _UNIT), None)
-    name, alias, timestamp = _stated(entry, "name", "alias", "timestamp")
+    name, alias, timestamp = _get_fields(entry, "name", "alias", "timestamp")
     metric = SparkplugMetric(name, value, 0, alias, timestamp, unit or None)
     return metric.typed(int(entry.datatype)) if entry.datatype else metric
 

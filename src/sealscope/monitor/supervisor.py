@@ -88,7 +88,7 @@ class SupervisedPart:
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # a panic of an extension in Rust and an exit of uvicorn are no Exception
-            reason = self._supervisor.away(error)
+            reason = self._supervisor.outage_reason(error)
             longest = LONGEST_PAUSE_S if reason is None else DATABASE_PAUSE_S
             self._pause = min(max(2.0 * self._pause, FIRST_PAUSE_S), longest)
             self._due = time.monotonic() + self._pause
@@ -105,16 +105,16 @@ class SupervisedPart:
 class Supervisor:
     """The parts of a monitor; those that run in threads of their own do so until `stopping` is set.
 
-    `away`: returns of an error why the database does not answer, None for one of another kind; `changed`: called when
+    `outage_reason`: why the database does not answer, None for another error; `changed`: called when
     an outage begins or ends.
     """
 
     def __init__(
         self,
-        away: Callable[[BaseException], str | None] = lambda error: None,
+        outage_reason: Callable[[BaseException], str | None] = lambda error: None,
         changed: Callable[[], None] = lambda: None,
     ) -> None:
-        self.away, self.changed, self.stopping = away, changed, threading.Event()
+        self.outage_reason, self.changed, self.stopping = outage_reason, changed, threading.Event()
         self._parts: dict[str, SupervisedPart] = {}
         self._lock = threading.Lock()
 

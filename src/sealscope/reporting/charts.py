@@ -84,7 +84,7 @@ class Chart(NamedTuple):
         return f"repair limit, {self.level:.2g} {self.unit}" + (", above the frame" if above else "")
 
     @property
-    def cut(self) -> bool:
+    def is_cut(self) -> bool:
         """Test whether any values lie beyond the limits."""
         low, high = self.limits or (-np.inf, np.inf)
         return any(bool(np.any((line.values < low) | (line.values > high))) for line in self.lines)

@@ -136,7 +136,7 @@ class Picture:
 
 
 def ticks(low: float, high: float, count: int) -> list[float]:
-    """Return round values (1, 2 or 5 times a power of ten apart) between low and high, `about` so many."""
+    """Return round values (1, 2 or 5 times a power of ten apart) between low and high, about `count` of them."""
     raw = (high - low) / count
     power = 10.0 ** np.floor(np.log10(raw))
     step = float(next(m for m in (1, 2, 5, 10) if m * power >= raw * 0.999) * power)

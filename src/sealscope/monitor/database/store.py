@@ -158,7 +158,7 @@ class MonitorStore:
         with self.engine.connect() as connection:
             return int(connection.execute(query).scalar() or 0)
 
-    def known(self, blocks: Iterable[tuple[str, str]]) -> set[tuple[str, str]]:
+    def select_stored(self, blocks: Iterable[tuple[str, str]]) -> set[tuple[str, str]]:
         """Select the stored ones among blocks, each an actuator and an identity."""
         # a query for each: SQLite goes through the whole table for a list of pairs
         columns = tables.blocks.c
@@ -174,7 +174,7 @@ class MonitorStore:
 
     def is_known(self, actuator: str, identity: str) -> bool:
         """Test whether a block is stored."""
-        return bool(self.known([(actuator, identity)]))
+        return bool(self.select_stored([(actuator, identity)]))
 
     def keep_blocks(self, connection: sa.Connection, blocks: Iterable[tuple[str, str, int]]) -> None:
         """Store blocks: actuator, identity, and number among those of the actuator.
@@ -197,7 +197,7 @@ class MonitorStore:
             if values := getattr(rows, new.name):
                 connection.execute(new.insert(), values)
         for changed in (tables.actuators, tables.summaries, tables.alarms):
-            self.put(connection, changed, [*getattr(rows, changed.name).values()])
+            self.upsert(connection, changed, [*getattr(rows, changed.name).values()])
         for place, table in enumerate((tables.blocks, tables.estimates)):
             old = [{"of": name, "last": numbers[place]} for name, numbers in rows.old.items() if numbers[place] > 0]
             if old:
@@ -209,7 +209,7 @@ class MonitorStore:
         with self.writing() as connection:
             self.keep_rows(connection, rows)
 
-    def put(self, connection: sa.Connection, table: sa.Table, rows: list[dict[str, Any]]) -> None:
+    def upsert(self, connection: sa.Connection, table: sa.Table, rows: list[dict[str, Any]]) -> None:
         """Change rows of a table by its primary key, or insert those that are missing."""
         if not rows:
             return
@@ -221,7 +221,7 @@ class MonitorStore:
                 connection.execute(table.insert(), rows)
             else:
                 for row in rows:
-                    self.put(connection, table, [row])
+                    self.upsert(connection, table, [row])
 
     def keep_refused(self, rows: Sequence[dict[str, Any]]) -> None:
         """Store what was refused, `KEPT_REFUSED` at most with those before, in a transaction of its own."""
@@ -242,7 +242,7 @@ class MonitorStore:
         before = select(columns.attempts).where(columns.reader == reader, columns.digest == digest)
         with self._noting() as connection:
             attempts = int(connection.execute(before).scalar() or 0)
-            self.put(connection, table, [{"reader": reader, "digest": digest, "attempts": attempts + 1}])
+            self.upsert(connection, table, [{"reader": reader, "digest": digest, "attempts": attempts + 1}])
         return attempts
 
     def end_decoding(self, reader: str, digest: str) -> None:
@@ -327,7 +327,7 @@ class MonitorStore:
     def keep_position(self, name: str, number: int) -> None:
         """Store how far an output is."""
         with self.writing() as connection:
-            self.put(connection, tables.facts, [{"name": name, "value": str(number)}])
+            self.upsert(connection, tables.facts, [{"name": name, "value": str(number)}])
 
     def pass_on(self, output: str, send: Callable[[dict[str, Any]], bool]) -> None:
         """Hand events to `send` in their order until it returns False, and store how far the output is after each."""
@@ -337,7 +337,7 @@ class MonitorStore:
             self.keep_position(output, number)
 
 
-def away(error: BaseException) -> str | None:
+def outage_reason(error: BaseException) -> str | None:
     """Give the reason in one line if the database does not answer or write; None for an error of another kind.
 
     Values that it cannot hold are another kind: they would be refused again.

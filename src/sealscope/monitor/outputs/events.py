@@ -38,9 +38,9 @@ class EventLines:
 
     def pass_on(self) -> None:
         """Write what is new; raises PartAway where the stream takes no more."""
-        self._store.pass_on("lines", self._written)
+        self._store.pass_on("lines", self._write_line)
 
-    def _written(self, event: dict[str, Any]) -> bool:
+    def _write_line(self, event: dict[str, Any]) -> bool:
         """Write a line to the stream's file, past its buffer: what a full disk refuses must not stay in there."""
         if event["number"] != self._number:
             self._left, self._number = (json.dumps(event) + "\n").encode(), event["number"]

@@ -114,7 +114,7 @@ class SparkplugNode:
         if message.qos:
             client.ack(message.mid, message.qos)
         try:
-            request = spb.decoded_payload(message.payload).named(spb.REBIRTH)
+            request = spb.decoded_payload(message.payload).find_metric(spb.REBIRTH)
         except ValueError as error:
             self._count("Sparkplug commands that are none")
             _log.info("a command that is none: %s", error)
@@ -185,7 +185,7 @@ def _values(table: str, values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _metrics(table: str, values: Mapping[str, Any], timestamp: int) -> list[spb.SparkplugMetric]:
-    """Return metrics of a table with their values, of the time `at` [ms]."""
+    """Return metrics of a table with their values, of the time `timestamp` [ms]."""
     rows = {name: _table(table)[name] for name in values}
     return [
         spb.SparkplugMetric(name, values[name], getattr(spb, row["type"]), timestamp=timestamp, unit=row.get("unit"))

@@ -29,7 +29,7 @@ from starlette.routing import Route
 from sealscope.errors import InputError
 from sealscope.monitor.actuators import WatchedActuators
 from sealscope.monitor.alarms import ranked
-from sealscope.monitor.database.store import away
+from sealscope.monitor.database.store import outage_reason
 from sealscope.monitor.outputs.prometheus import CONTENT_TYPE, metrics_text
 from sealscope.monitor.page.guard import BACKLOG, Admission, limited_protocol, most_connections
 from sealscope.monitor.page.live import DRAWN, PRESSURES, LiveSamples, machine_of
@@ -111,7 +111,7 @@ class _Pages:
         name, kind = _FILES[request.url.path]
         return Response(str(packaged(name)) if name.startswith("vendor/") else _packaged(name), media_type=kind)
 
-    def _known(self) -> dict[str, Any]:
+    def _counters_and_outages(self) -> dict[str, Any]:
         """Return the counters, waiting blocks and outages, which need no database."""
         counters, outages = self._actuators.counters, self._supervisor.outages()
         return {"counters": counters, "waiting": self._waits()[0], "outages": outages}
@@ -119,7 +119,7 @@ class _Pages:
     def fleet(self, request: Request) -> Response:
         rows = ranked(self._actuators.plain(), self._store.alarms(open_only=True))
         budget = self._actuators.false_alarms_per_1000_h
-        return JSONResponse({"actuators": rows, **self._known(), "false_alarms_per_1000_h": budget})
+        return JSONResponse({"actuators": rows, **self._counters_and_outages(), "false_alarms_per_1000_h": budget})
 
     def actuator(self, request: Request) -> Response:
         name, span = request.query_params.get("name", ""), request.query_params.get("hours", "")
@@ -169,9 +169,9 @@ class _Pages:
         if pressure not in PRESSURES or drawn not in DRAWN:
             return _refusal(f"pressure must be one of {PRESSURES}, drawn one of {DRAWN}", 400)
         self._listeners += 1
-        return _Listening(self._lines(request, name, pressure, drawn), self._left)
+        return _Listening(self._lines(request, name, pressure, drawn), self._remove_listener)
 
-    def _left(self) -> None:
+    def _remove_listener(self) -> None:
         self._listeners -= 1
 
     async def _lines(self, request: Request, name: str, pressure: str, drawn: str) -> AsyncIterator[str]:
@@ -200,14 +200,14 @@ class _Pages:
 
     async def not_answering(self, request: Request, error: Exception) -> Response:
         """Answer in the requested form if the database is away, with the values known without it."""
-        reason = away(error)
+        reason = outage_reason(error)
         if reason is None:
             raise error
         self._supervisor.part(DATABASE).lost(reason)
         text = f"the database does not answer: {reason}"
         if request.url.path == "/metrics":
             return Response(f"# {text}\n{self._measured({})}", 503, {**_LATER, "Content-Type": CONTENT_TYPE})
-        return JSONResponse({"error": text, **self._known()}, 503, _LATER)
+        return JSONResponse({"error": text, **self._counters_and_outages()}, 503, _LATER)
 
     async def login(self, request: Request) -> Response:
         status, admission, address = 200, self._admission, _address(request)

@@ -90,7 +90,7 @@ class _Connection:
         self._client.on_connect_fail = self._unreached
         self._client.on_connect = self._connected
         self._client.on_message = self._message
-        self._client.on_disconnect = self._lost
+        self._client.on_disconnect = self._report_disconnect
 
     def run(self) -> None:
         """Hand messages over and pass alarms on until the service stops."""
@@ -138,7 +138,7 @@ class _Connection:
         state = json.dumps({"online": online, "timestamp": self._online})
         return f"{NAMESPACE}/STATE/{self._settings.host_id}", state
 
-    def _lost(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
+    def _report_disconnect(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
         if not self._service.stopping.is_set() and self._refusing != self._connection:
             self._broker.lost(f"the connection to {self._settings.host} is lost: {reason}")
 
@@ -201,7 +201,7 @@ class _Connection:
     def _decoded(self, topic: str, payload: bytes) -> SourceBlock | None:
         """Return the block of a message, None for one of Sparkplug without; raises RefusedMessage."""
         if self._host is not None and topic.startswith(f"{NAMESPACE}/"):
-            return self._host.taken(topic, payload)
+            return self._host.receive(topic, payload)
         return decoded(payload, self._names.get(topic))
 
     @contextmanager

@@ -134,9 +134,9 @@ class WatchedFolder:
         try:
             return read_of_machine(path, self._channel_map, self._rate), ""
         except (SealscopeError, OSError, MemoryError) as error:
-            return None, _shown(str(error)) or type(error).__name__
+            return None, _printable(str(error)) or type(error).__name__
         except Exception as error:
-            return None, f"{_shown(path.name)}: {place_of(error)}"
+            return None, f"{_printable(path.name)}: {place_of(error)}"
 
     def _refusal(self, samples: Recording | None, path: Path, written: float) -> str:
         """Return why a recording is not watched, "" where it is: one of before the newest watched comes too late."""
@@ -144,11 +144,11 @@ class WatchedFolder:
             return ""
         start, now = file_seconds(samples, path), time.time()
         if max(start, written) > now + _AHEAD_S:
-            _log.warning("%s: %s is dated in the future", self.actuator, _shown(path.name))
+            _log.warning("%s: %s is dated in the future", self.actuator, _printable(path.name))
         if start >= self._newest_s or self._newest_s > now + _AHEAD_S or _is_day(start, self._newest_s):
             return ""
         dates = (datetime.fromtimestamp(clock, UTC).isoformat(" ", "seconds")[:19] for clock in (start, self._newest_s))
-        return "{} must not be older than what was watched, got {} after {}".format(_shown(path.name), *dates)
+        return "{} must not be older than what was watched, got {} after {}".format(_printable(path.name), *dates)
 
     def _on_the_clock(self, samples: Recording | None, path: Path) -> Recording | None:
         """Return a recording at the times at which it was made [s since 1970].
@@ -184,14 +184,14 @@ class WatchedFolder:
             try:
                 if path.is_symlink() and not path.resolve().is_relative_to(root):
                     if path.name not in self._outside:  # said once: what is there is nobody's recording
-                        _log.warning("%s: %s is a link out of the folder", self.actuator, _shown(path.name))
+                        _log.warning("%s: %s is a link out of the folder", self.actuator, _printable(path.name))
                     self._outside.add(path.name)
                     continue
                 status = path.stat()
             except (OSError, RuntimeError):  # gone meanwhile, or links in a circle
                 continue
             if S_ISREG(status.st_mode):
-                yield status.st_mtime, path, f"{_shown(path.name[:60])} {status.st_size} {status.st_mtime_ns}"
+                yield status.st_mtime, path, f"{_printable(path.name[:60])} {status.st_size} {status.st_mtime_ns}"
 
 
 def folders_of(service: BlockReceiver, *, once: bool) -> None:
@@ -224,7 +224,7 @@ def folders_of(service: BlockReceiver, *, once: bool) -> None:
         service.stopping.wait(_LOOK_S)
 
 
-def _shown(name: str) -> str:
+def _printable(name: str) -> str:
     """Return a name as text that a log and a database can hold, whatever its bytes are."""
     return "".join(sign if sign.isprintable() else sign.encode("unicode_escape").decode() for sign in name)
 

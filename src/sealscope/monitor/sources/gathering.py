@@ -38,7 +38,7 @@ class _Channel:
     def last(self) -> float | None:
         return self.values[max(self.values)] if self.values else self.held
 
-    def taken(self, first: int, stop: int) -> Array:
+    def pop_values(self, first: int, stop: int) -> Array:
         """Return the values from `first` to `stop`, those that are missing as before them, and forget them."""
         known = sorted(k for k in self.values if k < stop)
         places = np.searchsorted(known, np.arange(first, stop), side="right")
@@ -124,7 +124,7 @@ class ValueGatherer:
         known = min(last for last in newest if last is not None) + 1
         while known - self._start >= self._length:
             clock = np.arange(self._start, self._start + self._length)
-            samples = {name: values.taken(clock[0], clock[-1] + 1) for name, values in self._channels.items()}
+            samples = {name: values.pop_values(clock[0], clock[-1] + 1) for name, values in self._channels.items()}
             units = {name: CHANNEL_UNITS[name] for name in samples}
             blocks.append(Recording(clock / self.rate, samples, units, self.rate))
             self._start += self._length

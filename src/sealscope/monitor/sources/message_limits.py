@@ -108,7 +108,7 @@ def _count_marks(data: Any) -> tuple[int, int, int]:
 
 @law
 def _argument(data: Any, position: int, info: int) -> tuple[int, int]:
-    """Return the argument of the item whose head ends before byte `at`, and the byte after it, -1 where it is cut."""
+    """Return the argument of an item whose head ends before byte `position`, and the next byte, -1 if it is cut off."""
     if info < 24:
         return info, position
     width = 1 << (info - 24)

@@ -67,7 +67,7 @@ class _Birth:
                 birth.aliases[metric.alias] = name
         return birth
 
-    def known(self, metric: spb.SparkplugMetric, *, whole: bool) -> spb.SparkplugMetric | None:
+    def complete_metric(self, metric: spb.SparkplugMetric, *, whole: bool) -> spb.SparkplugMetric | None:
         """Return a metric with name, type and unit of the birth, None where it is no channel; `whole`: none missed."""
         if metric.name is None and not whole:
             raise RefusedMessage(blocks.OUT_OF_SEQUENCE, "after a missing message an alias must wait for a birth")
@@ -142,7 +142,7 @@ class SparkplugHost:
             self._publish(spb.topic_of(group, "NCMD", node), spb.encoded(request))
 
     @refusing()
-    def taken(self, topic: str, data: bytes) -> SourceBlock | None:
+    def receive(self, topic: str, data: bytes) -> SourceBlock | None:
         """Take a message; return the block that it brings, None where it brings none.
 
         Raises RefusedMessage where it is not what its topic says, or nothing of it can be used.
@@ -164,7 +164,7 @@ class SparkplugHost:
         except ValueError as error:
             raise RefusedMessage(blocks.UNREADABLE, error) from None
         if kind in ("NBIRTH", "NDEATH"):
-            number = getattr(payload.named(spb.BIRTH_SEQUENCE), "value", None)
+            number = getattr(payload.find_metric(spb.BIRTH_SEQUENCE), "value", None)
             number = number if isinstance(number, int) else None
             if kind == "NDEATH" and state.birth_sequence not in (None, number):
                 raise RefusedMessage(blocks.STALE_DEATH, "a death must bear the bdSeq of the last birth")
@@ -194,7 +194,7 @@ class SparkplugHost:
         if birth is None:
             self._ask(group, node)
             raise RefusedMessage(blocks.UNBORN, f"data of {path} must follow its birth")
-        known = [birth.known(metric, whole=state.whole) for metric in payload.metrics]
+        known = [birth.complete_metric(metric, whole=state.whole) for metric in payload.metrics]
         samples = self._samples(actuator, birth, [metric for metric in known if metric is not None], payload.timestamp)
         if samples is None:
             return None
@@ -237,7 +237,7 @@ class SparkplugHost:
         return Recording(t, converted, {channel: CHANNEL_UNITS[channel] for channel in converted}, rate)
 
     def _clock(self, actuator: str, t: float, size: int, rate: float) -> Array:
-        """Return the times of samples that begin at `at` [s], a whole millisecond."""
+        """Return the times of samples that begin at `t` [s], a whole millisecond."""
         first, expected = t, self._follows.get(actuator, math.nan)
         if abs(expected - t) < 3.0 * _LATE:
             excess = min(max(expected, t - _EARLY), t + _LATE) - expected

@@ -60,7 +60,7 @@ def main_table(result: CampaignResult) -> tuple[list[str], list[list[str]]]:
     table = []
     for name, results in by_detector.items():
         cells = [percent(results[f"{size}"].alarms) if f"{size}" in results else "–" for size in sizes]
-        knowledge = [_given(result.known.get(name))] if result.known else []
+        knowledge = [_name_knowledge(result.known.get(name))] if result.known else []
         alarms = percent(next(iter(results.values())).false_alarm)
         table.append([name, *knowledge, alarms, *cells, areas.get(name, "–"), *_smallest(pods.get(name))])
     of_sizes = ["any leak" if math.isnan(size) else f"{size:g} {result.plan.unit}" for size in sizes]
@@ -68,7 +68,7 @@ def main_table(result: CampaignResult) -> tuple[list[str], list[list[str]]]:
     return ["detector", *knowledge, "false alarms", *of_sizes, "AUC, any leak", "a90", "a90/95"], table
 
 
-def _given(known: PriorKnowledge | None) -> str:
+def _name_knowledge(known: PriorKnowledge | None) -> str:
     """Name the prior knowledge of a detector in a word or two."""
     if known is None:
         return "–"
@@ -252,7 +252,7 @@ def _section(pod: DetectorPod, judgement: Judgement, unit: str) -> dict[str, Any
             by_levels[tuple(map(str, cell.levels.values()))][cell.leak_lpm] = percent(cell.alarms)
     return {
         "name": name,
-        "about": _about(name),
+        "about": _describe_score(name),
         "plots": [plot for plot in (_pod_plot(pod, unit), _roc_plot(shown, unit)) if plot is not None],
         "areas": [(_size_text(roc, unit), _area(roc.area)) for roc in shown],
         "cell_columns": [*factors, *("no leak" if size == 0 else f"{size:g} {unit}" for size in sizes)],
@@ -266,7 +266,7 @@ def _size_text(roc: SizeRoc, unit: str) -> str:
     return "any size" if math.isnan(roc.leak_lpm) else f"{roc.leak_lpm:g} {unit}"
 
 
-def _about(name: str) -> str:
+def _describe_score(name: str) -> str:
     """Describe the score of a detector; "" if only its name is known."""
     detector = plan_detector(name)
     through = f", given the channels of {detector.view} alone" if detector.view else ""
