@@ -206,7 +206,7 @@ class StatedMachine:
         return read_of_machine(file, self._map_of_rig, self.rate)
 
     def read_all(self, files: Sequence[Path], joined: bool = False) -> Iterator[tuple[Path, Recording | None]]:
-        """Yield each file and its recording, None with a line on standard error where it cannot be read.
+        """Yield each file and its recording, or None and a line on standard error if it is unreadable.
 
         `joined`: the first file and the recording of all files joined instead, None where one is bad.
         """
@@ -265,7 +265,7 @@ def _experiment(rig: str, set: Sequence[str] | None, **arguments: Any) -> Experi
 def _taking(
     name: str, make: Callable[..., Any], options: Sequence[Parameter]
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command options in place of its parameter `name`, which is what `make` makes of them."""
+    """Replace a command's parameter `name` by options, from which `make` builds its value."""
 
     def decorated(command: Callable[..., None]) -> Callable[..., None]:
         command.__annotations__[name] = Any  # the type may not be loaded yet
@@ -287,7 +287,7 @@ def _taking(
 
 
 def _assumed_rig(name: str | None, area: Sequence[str] | None, displacement: str | None) -> Rig | None:
-    """Return the rig of `--rig` with what `--area` and `--displacement` state; None where none of them is given."""
+    """Return the rig of `--rig` with the values of `--area` and `--displacement`, None without these options."""
     from sealscope.diagnosis.verdict.machine import unstated
     from sealscope.parameters import load_rig
     from sealscope.units import parse_quantity
@@ -347,7 +347,7 @@ def complain(message: object) -> None:
 
 
 def attempt(file: Path, work: Callable[[], T]) -> T | None:
-    """Return `work()`; None, with one line on standard error, where it fails with this file: the others go on."""
+    """Return `work()`, or None and one line on standard error if it fails with this file."""
     try:
         return work()
     except SealscopeError as error:
@@ -361,7 +361,7 @@ def attempt(file: Path, work: Callable[[], T]) -> T | None:
 
 
 def check_folder(file: Path) -> None:
-    """Refuse a file whose folder is not there before the long work, not after it; remove what a killed call left."""
+    """Refuse a file in a missing folder before the long work, and remove the remains of a killed call."""
     from sealscope.storage import atomic
 
     atomic.check_folder(file)

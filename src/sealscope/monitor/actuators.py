@@ -70,7 +70,7 @@ class _Actuator:
     def judge_samples(
         self, samples: Recording, follows: bool, settings: WatchSettings
     ) -> tuple[list[BlockEstimate], list[tuple[Alarm, str, float]]]:
-        """Return the estimates of samples, and what happened to alarms: the same whenever it is gone through."""
+        """Judge samples: return their estimates and the events of alarms. A replay gives the same."""
         estimates, happened = [], []
         self.pending += 1
         self.bytes += bytes_of(samples)
@@ -169,7 +169,7 @@ class WatchedActuators:
         self._actuators = {name: self._restored(self.settings[name]) for name in self.settings}
 
     def _restored(self, settings: ActuatorSettings) -> _Actuator:
-        """Return an actuator as its last transaction left it, or begun anew where it is new or the settings changed."""
+        """Restore an actuator from its last transaction, or begin anew if it is new or its settings changed."""
         name, rate = settings.name, settings.false_alarms_per_1000_h
         state, block_count = self.store.checkpoint(name), self.store.last_number(self.store.tables.blocks, name)
         fresh = watch(load_watched(settings.rig).rig, false_alarms_per_1000_h=rate, learn_hours=settings.learn_hours)
@@ -277,7 +277,7 @@ class WatchedActuators:
         return self._actuators[name]
 
     def _add_samples(self, rows: StoredRows, actuator: _Actuator, samples: Recording, follows: bool) -> None:
-        """Add to the rows what samples make of an actuator."""
+        """Judge samples of an actuator, and add the results to the rows."""
         name = actuator.settings.name
         estimates, happened = actuator.judge_samples(samples, follows, actuator.settings)
         rows.add_estimates(name, estimates, actuator.oil_celsius)
@@ -301,7 +301,7 @@ class WatchedActuators:
 
     @staticmethod
     def _show(actuator: _Actuator, rows: StoredRows) -> None:
-        """Add what an actuator shows to the rows, where it has changed."""
+        """Add the summary of an actuator to the rows if it has changed."""
         summary = actuator.summary()
         if summary != actuator.shown:
             actuator.shown = summary

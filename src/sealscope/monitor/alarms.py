@@ -79,7 +79,7 @@ class Alarm:
 
     @property
     def condition(self) -> str:
-        """Condition of the states of NE 107 that it is."""
+        """The condition of the alarm in the states of NE 107."""
         return _CONDITIONS[self.level] if self.active else "watched"
 
     @property

@@ -180,7 +180,7 @@ class Service:
         return threads
 
     def _store_next(self) -> None:
-        """Store what comes next; what raises an error is still at hand then."""
+        """Store the next blocks; after an error they are still at hand."""
         if not self._at_hand:
             self._at_hand = self._queue.take(_TOGETHER, 0.2)
             if 0 < len(self._at_hand) < _TOGETHER and None not in self._at_hand:

@@ -127,7 +127,7 @@ def encoded(payload: SparkplugPayload) -> bytes:
 
 
 def decoded_payload(data: bytes) -> SparkplugPayload:
-    """Return the payload that bytes hold; raises ValueError of one line where they hold none.
+    """Decode a payload from bytes. Raise ValueError of one line if they hold none.
 
     A value stays as its field has it where the metric states no type: `SparkplugMetric.typed` gives it its meaning.
     """

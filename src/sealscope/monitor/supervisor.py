@@ -49,7 +49,7 @@ class SupervisedPart:
         self._lock = threading.Lock()
 
     def lost(self, reason: object) -> None:
-        """State that it is not reached; the first reason of an outage is kept."""
+        """Begin an outage, or continue it with its first reason."""
         with self._lock:
             if self.since is not None:
                 return
@@ -59,7 +59,7 @@ class SupervisedPart:
         self._supervisor.changed()
 
     def back(self) -> None:
-        """State that it is reached."""
+        """End the outage, if there is one."""
         with self._lock:
             self._pause = 0.0
             if self.since is None:
@@ -133,7 +133,7 @@ class Supervisor:
         ]
 
     def totals(self) -> dict[str, tuple[bool, int, float]]:
-        """Return of each part whether it is reached, how many outages it had and how long they lasted [s]."""
+        """Return the availability, the number of outages and their total length [s] of each part."""
         return {
             part.name: (part.since is None, part.count, part.seconds + part.lasting_s)
             for part in [*self._parts.values()]

@@ -91,7 +91,7 @@ class Chart(NamedTuple):
 
 
 def shown_values(recording: Recording, name: str, pressure_unit: str) -> tuple[str, Array]:
-    """Return the unit in which a channel is shown and its values (n,) in it; a temperature is in that of its log."""
+    """Return the display unit of a channel and its values (n,) in it; a temperature keeps the unit of its log."""
     if recording.units[name] == "K":
         unit = recording.unit_in_log(name) or "degC"
         return unit, from_si(recording[name], unit, "K")
@@ -100,7 +100,7 @@ def shown_values(recording: Recording, name: str, pressure_unit: str) -> tuple[s
 
 
 def shown_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tuple[str, float]:
-    """Return the unit in which a channel is shown, and how many of the channel's own units it holds.
+    """Return the display unit of a channel and its size in the channel's own unit.
 
     Raises InputError for an unknown pressure unit.
     """
@@ -120,7 +120,7 @@ def detail_unit(unit: str, name: str, pressure_unit: str) -> tuple[str, float]:
 
 
 def label_of(name: str) -> str:
-    """Return a detail's name as it is shown."""
+    """Return the displayed name of a detail."""
     return "d3·d4" if name == PRODUCT else name
 
 
@@ -282,7 +282,7 @@ def draw(
 
 
 def _drawable(values: Array) -> Array:
-    """Return values with those beyond +-1e100 there, so that no scale overflows."""
+    """Clip values to +-1e100, so that no scale overflows."""
     return np.where(np.isfinite(values), np.clip(values, -_LARGEST, _LARGEST), values)
 
 

@@ -129,7 +129,7 @@ def _pump_share(diagnosis: Diagnosis) -> str | None:
 
 
 def _why_no_flow(diagnosis: Diagnosis) -> str:
-    """Return why a leak has no L/min, and what would state it."""
+    """Give the reason for a leak without L/min, and the remedy."""
     if "leak_lpm" not in diagnosis.refuses:
         small = diagnosis.total_leakage is not None and diagnosis.total_leakage.lpm is not None
         return say(f"how_much.{'too_small' if small else 'channels'}")
@@ -146,7 +146,7 @@ def rests_on(diagnosis: Diagnosis) -> str | None:
 
 
 def machine_text(machine: AssumedMachine) -> str:
-    """Return area and displacement that a flow rests on, and who stated them."""
+    """Format the area and displacement behind a flow, and their origin."""
     if machine.flow_meter:
         key = "meter"
     elif machine.stated_by == "recording":
@@ -182,7 +182,7 @@ def _span(low: float, high: float) -> str:
 
 
 def other_sizes(diagnosis: Diagnosis) -> str | None:
-    """Return the other sizes of the leak: beside the pump's flow, and as a creep; None where none is known."""
+    """Format the leak in mL/min, as a share of the pump's flow and as a creep; None if none is known."""
     severity = diagnosis.severity
     if severity is None:
         return None
@@ -196,7 +196,7 @@ def other_sizes(diagnosis: Diagnosis) -> str | None:
 
 
 def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
-    """Return the leakage of pump and piston together, and which step would have been found; None where not known.
+    """Format the leakage of pump and piston together and the smallest detectable step, None if not known.
 
     `basis`: with what L/min rests on.
     """
@@ -224,7 +224,7 @@ def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
 
 
 def leakage_in_short(diagnosis: Diagnosis) -> str | None:
-    """Return the leakage of pump and piston in a few words; None where it is not known or there is a leak."""
+    """Format the leakage of pump and piston in a few words, None if it is not known or there is a leak."""
     leakage = diagnosis.total_leakage
     if leakage is None or diagnosis.verdict == "leak":
         return None

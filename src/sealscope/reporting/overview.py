@@ -20,7 +20,7 @@ CURVE = 20
 
 
 def curve(values: Array, width: int = CURVE) -> str:
-    """Return values (n,) as `width` bars between their least and largest; a blank where all samples are missing."""
+    """Draw values (n,) as `width` bars between their least and largest, blank for missing samples."""
     known = values[np.isfinite(values)]
     if not known.size:
         return " " * width

@@ -106,7 +106,7 @@ def write_page(path: str | os.PathLike[str], recording: Recording, diagnosis: Di
 
 
 def _rig_of(diagnosis: Diagnosis, rig: Rig | str | os.PathLike[str] | None) -> Rig | None:
-    """Return the rig of the call, else the one that the diagnosis states; None where nobody stated one."""
+    """Return the rig of the call, else that of the diagnosis, else None."""
     from sealscope.parameters import load_rig, rig_names
 
     if rig is not None:

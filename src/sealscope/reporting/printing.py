@@ -23,7 +23,7 @@ _LONGEST = 120.0
 
 
 def print_page(page: str, path: str | os.PathLike[str]) -> str:
-    """Write a page (HTML) as a PDF, whole or not at all, and return what printed it.
+    """Write a page (HTML) as a PDF, whole or not at all, and return the program's name.
 
     Raises MissingExtra where neither a browser nor WeasyPrint is installed, and InputError where printing fails.
     """
@@ -47,7 +47,7 @@ def print_page(page: str, path: str | os.PathLike[str]) -> str:
 
 
 def draw_page(page: str, path: str | os.PathLike[str], width: int, height: int) -> str:
-    """Write a page (HTML) as a PNG of `width` x `height` pixels, whole or not at all, and return what drew it.
+    """Write a page (HTML) as a PNG of `width` x `height` pixels, whole or not at all, and return the program's name.
 
     Raises MissingExtra where no browser is installed, and InputError where drawing fails.
     """
@@ -101,7 +101,7 @@ def _is_whole_png(data: bytes, width: int, height: int) -> bool:
 def _by_browser(
     browser: str, page: str, target: Path, options: list[str], kind: str, is_whole: Callable[[bytes], bool]
 ) -> None:
-    """Let a browser write `target`, a file of this kind; InputError where it is not there to its end."""
+    """Let a browser write `target`, a file of this kind. Raise InputError if the file is incomplete."""
     with tempfile.TemporaryDirectory(prefix="sealscope-", ignore_cleanup_errors=True) as folder:
         source = Path(folder) / "page.html"
         source.write_text(page, encoding="utf-8", errors="backslashreplace")

@@ -101,7 +101,7 @@ def schematic(recording: Recording, diagnosis: Diagnosis, circuit: Circuit) -> s
 
 
 def columns_of(recording: Recording) -> dict[str, str]:
-    """Return channel -> the column of the file that it was read from, where the file has a name of its own for it."""
+    """Map each channel to its column in the file, if the file names it differently."""
     columns: Any = recording.provenance.get("columns")
     if not isinstance(columns, dict):
         return {}

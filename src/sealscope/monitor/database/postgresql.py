@@ -43,7 +43,7 @@ def limit_answers(engine: Engine) -> None:
     from psycopg import Connection, OperationalError
 
     class LimitedConnection(Connection[Any]):
-        """A connection that is closed where the server does not answer in time."""
+        """A connection, closed if the server does not answer in time."""
 
         def wait(self, gen: Any, *arguments: Any, **options: Any) -> Any:
             return super().wait(self._limited(gen), *arguments, **options)

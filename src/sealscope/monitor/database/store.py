@@ -210,7 +210,7 @@ class MonitorStore:
             self.keep_rows(connection, rows)
 
     def upsert(self, connection: sa.Connection, table: sa.Table, rows: list[dict[str, Any]]) -> None:
-        """Change rows of a table by its primary key, or insert those that are missing."""
+        """Change rows of a table by its primary key, or insert the missing ones."""
         if not rows:
             return
         key = table.primary_key.columns.keys()
@@ -224,7 +224,7 @@ class MonitorStore:
                     self.upsert(connection, table, [row])
 
     def keep_refused(self, rows: Sequence[dict[str, Any]]) -> None:
-        """Store what was refused, `KEPT_REFUSED` at most with those before, in a transaction of its own."""
+        """Store refused messages in a transaction of their own, and keep the last `KEPT_REFUSED`."""
         table, columns = tables.refused, tables.refused.c
         with self.writing() as connection:
             connection.execute(table.insert(), rows[-KEPT_REFUSED:])
@@ -237,7 +237,7 @@ class MonitorStore:
         return [dict(row._mapping) for row in rows]
 
     def begin_decoding(self, reader: str, digest: str) -> int:
-        """Note that a reader begins to decode a message; return how often it began before and did not end."""
+        """Note the start of decoding a message; return the number of earlier starts without an end."""
         table, columns = tables.decodings, tables.decodings.c
         before = select(columns.attempts).where(columns.reader == reader, columns.digest == digest)
         with self._noting() as connection:
@@ -256,7 +256,7 @@ class MonitorStore:
         return self._value(select(func.max(table.c.number)).where(table.c.actuator == actuator))
 
     def checkpoint(self, actuator: str) -> tuple[str, dict[str, Any], list[tuple[Recording, bool]]] | None:
-        """Return settings and state as of the checkpoint, and the samples since then; None where there is none.
+        """Return the settings and state of the checkpoint and the samples since, None without a checkpoint.
 
         Of the samples of each block, whether they follow those before.
         """
@@ -361,7 +361,7 @@ def _head(units: tuple[tuple[str, str], ...], rate: float, follows: bool) -> byt
 
 
 def _unpacked(data: bytes) -> tuple[Recording, bool]:
-    """Return the samples that `_packed` made bytes of, and whether they follow those before."""
+    """Unpack samples from the bytes of `_packed`; the flag tells whether they follow the samples before."""
     line, _, numbers = data.partition(b"\n")
     head = json.loads(line)
     t, *channels = np.frombuffer(numbers, dtype="<f8").reshape(1 + len(head["units"]), -1)

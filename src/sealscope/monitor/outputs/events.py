@@ -37,7 +37,7 @@ class EventLines:
         self._left, self._number = b"", 0  # of the line under way, and its event
 
     def pass_on(self) -> None:
-        """Write what is new; raises PartAway where the stream takes no more."""
+        """Write the new events. Raise PartAway if the stream accepts no more."""
         self._store.pass_on("lines", self._write_line)
 
     def _write_line(self, event: dict[str, Any]) -> bool:
@@ -76,7 +76,7 @@ class Webhook:
             self._headers["Authorization"] = f"Bearer {token}"
 
     def pass_on(self) -> None:
-        """Post what is new; raises PartAway where an event does not arrive."""
+        """Post the new events. Raise PartAway if one does not arrive."""
         self._store.pass_on("webhook", self._posted)
 
     def _posted(self, event: dict[str, Any]) -> bool:

@@ -168,7 +168,7 @@ def _table(name: str) -> Mapping[str, Mapping[str, str]]:
 
 
 def _clock(t: float | None) -> int:
-    """Return a clock of samples [s] in [ms]; where it does not count from 1970, the present."""
+    """Convert a clock of samples [s] to [ms]; the present if it does not count from 1970."""
     return round(1000.0 * (t if t is not None and counts_from_1970(t) else time.time()))
 
 

@@ -104,7 +104,7 @@ def limited_protocol(most: int, silent_s: float = SILENT_S) -> type[asyncio.Prot
             return self.cycle is not None and not self.cycle.response_complete
 
         def look(self) -> None:
-            """Close it where it has been silent for too long, else look again later."""
+            """Close the connection if it has been silent for too long, else check again later."""
             if self.transport.is_closing():
                 return
             now = self.loop.time()

@@ -106,7 +106,7 @@ class LiveSamples:
                     del self._lookers[name], self._windows[name]
 
     def take(self, name: str, samples: Recording | None) -> None:
-        """Take samples of an actuator as they come; nothing is done where nobody looks."""
+        """Add new samples of an actuator to its window, if anybody views it."""
         if samples is None or name not in self._windows:
             return
         with self._lock:
@@ -151,7 +151,7 @@ class LiveSamples:
 
 
 def _plain(values: Array, digits: int = 3) -> list[float | None]:
-    """Return numbers of so many decimals, None for what is none."""
+    """Round numbers to so many decimals, with None for those not finite."""
     rounded = np.round(values, digits)
     return [value if math.isfinite(value) else None for value in rounded.tolist()]
 
@@ -193,7 +193,7 @@ def _details_of(t: Array, signal: Array | None, pressure: str, drawn: str) -> di
 
 
 def _motion_of(t: Array, channels: dict[str, Array], rate: float) -> dict[str, Any]:
-    """Return means over short times of what moves, and speeds between them."""
+    """Compute short-time means of the position, pressures and pump, and the speeds between them."""
     size = max(1, round(rate / _MOTION_HZ))
     count = min(t.size // size, round(_MOTION_S * rate / size))
     if count < 2:

@@ -226,7 +226,7 @@ class _Pages:
         return Response(_packaged("login.html"), status, media_type="text/html")
 
     def _refused(self, request: Request) -> Response | None:
-        """Return the answer to a request without the token, None where it has it."""
+        """Return the refusal of a request without the token, None if it has the token."""
         admission = self._admission
         if admission is None or request.url.path in ("/login", "/login.css"):
             return None

@@ -139,7 +139,7 @@ class WatchedFolder:
             return None, f"{_printable(path.name)}: {place_of(error)}"
 
     def _refusal(self, samples: Recording | None, path: Path, written: float) -> str:
-        """Return why a recording is not watched, "" where it is: one of before the newest watched comes too late."""
+        """Return the reason not to watch a recording, "" if none: one before the newest watched is too late."""
         if samples is None:
             return ""
         start, now = file_seconds(samples, path), time.time()
@@ -195,7 +195,7 @@ class WatchedFolder:
 
 
 def folders_of(service: BlockReceiver, *, once: bool) -> None:
-    """Hand over what appears in the folders of a service's actuators; `once`: what is there now."""
+    """Hand over new files in the folders of a service's actuators; `once`: only the present ones."""
     settle_s, part = 0.0 if once else service.settings.settle_s, service.supervisor.part
     shown = service.plain()
 
@@ -225,7 +225,7 @@ def folders_of(service: BlockReceiver, *, once: bool) -> None:
 
 
 def _printable(name: str) -> str:
-    """Return a name as text that a log and a database can hold, whatever its bytes are."""
+    """Escape the unprintable signs of a name, for a log and a database."""
     return "".join(sign if sign.isprintable() else sign.encode("unicode_escape").decode() for sign in name)
 
 

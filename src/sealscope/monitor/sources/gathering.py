@@ -39,7 +39,7 @@ class _Channel:
         return self.values[max(self.values)] if self.values else self.held
 
     def pop_values(self, first: int, stop: int) -> Array:
-        """Return the values from `first` to `stop`, those that are missing as before them, and forget them."""
+        """Remove and return the values from `first` to `stop`; a missing one repeats the value before it."""
         known = sorted(k for k in self.values if k < stop)
         places = np.searchsorted(known, np.arange(first, stop), side="right")
         held = math.nan if self.held is None else self.held

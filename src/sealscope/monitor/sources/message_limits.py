@@ -48,7 +48,7 @@ class MessageLimit(ValueError):  # noqa: N818 (names what is exceeded)
 
 
 def check_cbor(payload: bytes) -> int:
-    """Return the number of pairs of a message of CBOR; raises MessageLimit where it breaks a rule."""
+    """Count the pairs of a CBOR message. Raise MessageLimit if it breaks a rule."""
     code, place, pairs = _walk(np.frombuffer(payload, dtype=np.uint8))
     if code:
         raise MessageLimit(f"{_RULES[code]} (byte {place})", oversized=code == _TOO_LONG)
@@ -122,7 +122,7 @@ def _argument(data: Any, position: int, info: int) -> tuple[int, int]:
 
 @kernel
 def _walk(data: Any) -> tuple[int, int, int]:
-    """Return the rule that bytes break (0: none), the byte where, and how many pairs their mappings have.
+    """Walk through the items; return the number of the broken rule (0: none), its byte, and the count of pairs.
 
     Each byte is looked at once. Of each container `left` holds how many items it still has, below 0 for an unknown
     number; `turn` is 0 in a list, in a mapping 1 before a key and 2 before its value; `counts`: items so far.

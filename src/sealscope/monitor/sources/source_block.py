@@ -139,7 +139,7 @@ class SourceBlock:
 
 @refusing()
 def decoded(payload: bytes, actuator: str | None = None) -> SourceBlock:
-    """Return the block of a message, JSON where it begins with ``{``, else CBOR.
+    """Decode the block of a message: JSON if it begins with ``{``, else CBOR.
 
     Its mapping has ``t``, the clock of the first sample [s], ``rate`` [Hz], and for each channel a list of numbers,
     null where one is missing, or in CBOR a typed array of floats (RFC 8746), NaN where one is missing; a channel that
@@ -191,7 +191,7 @@ def digest_of(payload: bytes) -> str:
 
 
 def _identity(value: Any) -> str:
-    """Return the identity that a message states, "" where it states none; a database must be able to hold it."""
+    """Return the stated identity of a message, "" without one. Refuse one that a database cannot hold."""
     if value is None:
         return ""
     if isinstance(value, bool) or not isinstance(value, (str, int)):

@@ -68,7 +68,7 @@ class _Birth:
         return birth
 
     def complete_metric(self, metric: spb.SparkplugMetric, *, whole: bool) -> spb.SparkplugMetric | None:
-        """Return a metric with name, type and unit of the birth, None where it is no channel; `whole`: none missed."""
+        """Complete a metric by the name, type and unit of its birth, None if it is no channel; `whole`: none missed."""
         if metric.name is None and not whole:
             raise RefusedMessage(blocks.OUT_OF_SEQUENCE, "after a missing message an alias must wait for a birth")
         name = self.aliases.get(metric.alias) if metric.name is None else metric.name
@@ -143,7 +143,7 @@ class SparkplugHost:
 
     @refusing()
     def receive(self, topic: str, data: bytes) -> SourceBlock | None:
-        """Take a message; return the block that it brings, None where it brings none.
+        """Process a message; return its block, or None if it brings none.
 
         Raises RefusedMessage where it is not what its topic says, or nothing of it can be used.
         """
@@ -203,7 +203,7 @@ class SparkplugHost:
     def _samples(
         self, actuator: ActuatorSettings, birth: _Birth, metrics: list[spb.SparkplugMetric], sent: int | None
     ) -> Recording | None:
-        """Return the samples that metrics bring, None where none of them is a channel."""
+        """Return the samples of metrics, None if none of them is a channel."""
         by_name = {name: channel for channel, name in birth.names.items() if channel != _RATE}
         groups: dict[int, dict[str, spb.SparkplugMetric]] = defaultdict(dict)
         for metric in metrics:
@@ -247,7 +247,7 @@ class SparkplugHost:
 
 
 def _piece(group: Mapping[str, spb.SparkplugMetric], birth: _Birth, by_name: Mapping[str, str]) -> dict[str, Array]:
-    """Return the samples (n,) of the metrics of one time; a single one that is missing is as it was last."""
+    """Return the samples (n,) of the metrics of one time; a missing single value repeats its last one."""
     if any(isinstance(metric.value, np.ndarray) for metric in group.values()):
         piece = {name: np.atleast_1d(metric.value) for name, metric in group.items() if metric.value is not None}
         sizes = {values.size for values in piece.values()}

@@ -42,7 +42,7 @@ def _area(area: Area) -> str:
 
 
 def sizes_of(judgement: Judgement) -> list[float]:
-    """Return the sizes of leak that get a column each; nan for all of them together where they are many or none."""
+    """Return the leak sizes with a column each; nan stands for all sizes together if they are many or none."""
     sizes = sorted({row.leak_lpm for row in judgement.table if row.leak_lpm > 0})
     return sizes if 0 < len(sizes) <= _MOST_SIZES else [math.nan]
 
@@ -76,7 +76,7 @@ def _name_knowledge(known: PriorKnowledge | None) -> str:
 
 
 def _smallest(pod: DetectorPod | None) -> tuple[str, str]:
-    """Return a90 and a90/95; beyond the sizes that were tested only that they lie there."""
+    """Format a90 and a90/95, or only that they lie beyond the tested sizes."""
     if pod is None or pod.curve is None:
         return "–", "–"
     largest = max(tested.size for tested in pod.sizes)

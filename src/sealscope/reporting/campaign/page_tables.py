@@ -38,7 +38,7 @@ class PageTable(NamedTuple):
 
 
 def page_tables(judgement: Judgement, unit: str, part: str = "") -> dict[str, PageTable]:
-    """Return the tables of what detectors state and of faults and families, by name; those that have rows."""
+    """Return the tables of statements, faults and families by name, without the empty ones."""
     tables = {}
     for name, layout in tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")).items():
         columns = layout["columns"]
@@ -71,7 +71,7 @@ class CauseTable(NamedTuple):
 
 
 def cause_tables(judgement: Judgement) -> list[CauseTable]:
-    """Return, for each detector that names causes, how often it names which."""
+    """Tabulate the causes named by each detector, for each true cause."""
     tables = []
     for causes in judgement.causes:
         confusion = causes.confusion

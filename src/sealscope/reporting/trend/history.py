@@ -127,7 +127,7 @@ def _dates(ordered: Sequence[Judged]) -> list[str]:
 
 
 def _overlay(ordered: Sequence[Judged]) -> tuple[list[charts.Chart], charts.DrawnCharts | None, list[str]]:
-    """Return charts of the newest recording's channels, those of the last one judged `no leak` before it over them.
+    """Draw the newest recording's channels, with those of the last earlier one judged `no leak` over them.
 
     Both begin together. With them the two files; nothing where there is no other recording, or no channel of both.
     """

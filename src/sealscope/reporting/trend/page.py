@@ -102,7 +102,7 @@ def _draw(trend: Trend, picture: Picture) -> None:
 
 
 def _levels(trend: Trend) -> tuple[float, float]:
-    """Return the ends of the axis of levels: a limit is on it where it is near."""
+    """Return the ends of the axis of levels, which includes a nearby limit."""
     ends = [value for point in trend.points for value in (point.low, point.high) if value is not None]
     ends += [end for episode in trend.episodes for end in (episode.wear.healthy.low, episode.wear.healthy.high)]
     low, high = min(ends), max(ends)

@@ -45,7 +45,7 @@ def recordings(trend: Trend) -> str:
 
 
 def headline(trend: Trend) -> str:
-    """Return verdict and what it rests on, in one line."""
+    """Format the verdict and its basis in one line."""
     wear, line, since = trend.wear, "trend", ""
     if trend.verdict == "no leak" and trend.repairs:  # what was before is over
         line, since = "trend_fell", moment(trend, trend.repairs[-1].day)
@@ -98,7 +98,7 @@ def figures(trend: Trend) -> dict[str, str]:
 
 
 def healthy_end(wear: Wear) -> float:
-    """Return the upper end of what is called healthy: it ends at the limit, even where recordings scatter further."""
+    """Return the upper end of the healthy range, cut off at the limit despite any wider scatter."""
     high = wear.healthy.high
     return high if wear.limit is None else min(high, max(wear.limit, wear.healthy.value))
 
