@@ -224,7 +224,7 @@ class Service:
                 _log.exception("a block is dropped: %s", str(getattr(blocks[0], "actuator", blocks[0]))[:60])
         else:
             self._blocked = False
-            self._database.back()
+            self._database.end_outage()
         stored = set(map(id, blocks))
         self._at_hand = [block for block in self._at_hand if id(block) not in stored]
         for block in blocks:
@@ -233,7 +233,7 @@ class Service:
     def _pass_on(self) -> None:
         self._lines.pass_on()
         if not self._blocked:  # what can be read may still refuse to be written
-            self._database.back()
+            self._database.end_outage()
 
 
 def _worth_a_line(number: int) -> bool:

@@ -48,7 +48,7 @@ class SupervisedPart:
         self._pause = self._due = 0.0
         self._lock = threading.Lock()
 
-    def lost(self, reason: object) -> None:
+    def begin_outage(self, reason: object) -> None:
         """Begin an outage, or continue it with its first reason."""
         with self._lock:
             if self.since is not None:
@@ -58,7 +58,7 @@ class SupervisedPart:
         _log.error("the %s is not reached: %s", self.name, self.reason)
         self._supervisor.changed()
 
-    def back(self) -> None:
+    def end_outage(self) -> None:
         """End the outage, if there is one."""
         with self._lock:
             self._pause = 0.0
@@ -93,12 +93,12 @@ class SupervisedPart:
             self._pause = min(max(2.0 * self._pause, FIRST_PAUSE_S), longest)
             self._due = time.monotonic() + self._pause
             if reason is not None:
-                self._supervisor.part(DATABASE).lost(reason)
+                self._supervisor.part(DATABASE).begin_outage(reason)
             else:
-                self.lost(error if isinstance(error, PartAway) else place_of(error))
+                self.begin_outage(error if isinstance(error, PartAway) else place_of(error))
                 _log.debug("the %s raised an error", self.name, exc_info=error)
             return False
-        self.back()
+        self.end_outage()
         return True
 
 
@@ -149,7 +149,7 @@ class Supervisor:
         part = self.part(name)
 
         def lasting() -> None:
-            timer = threading.Timer(_WORKING_S, part.back)
+            timer = threading.Timer(_WORKING_S, part.end_outage)
             timer.daemon = True
             timer.start()
             try:

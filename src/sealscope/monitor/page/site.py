@@ -203,7 +203,7 @@ class _Pages:
         reason = outage_reason(error)
         if reason is None:
             raise error
-        self._supervisor.part(DATABASE).lost(reason)
+        self._supervisor.part(DATABASE).begin_outage(reason)
         text = f"the database does not answer: {reason}"
         if request.url.path == "/metrics":
             return Response(f"# {text}\n{self._measured({})}", 503, {**_LATER, "Content-Type": CONTENT_TYPE})

@@ -118,9 +118,9 @@ class _Connection:
     def _connected(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
         self._connection += 1
         if reason.is_failure:
-            self._broker.lost(f"{self._settings.host} refuses the connection: {reason}")
+            self._broker.begin_outage(f"{self._settings.host} refuses the connection: {reason}")
             return
-        self._broker.back()
+        self._broker.end_outage()
         self._states.clear()
         if self._settings.host_id is not None:
             client.publish(*self._state(online=True), qos=1, retain=True)
@@ -140,14 +140,16 @@ class _Connection:
 
     def _report_disconnect(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
         if not self._service.stopping.is_set() and self._refusing != self._connection:
-            self._broker.lost(f"the connection to {self._settings.host} is lost: {reason}")
+            self._broker.begin_outage(f"the connection to {self._settings.host} is lost: {reason}")
 
     def _unreached(self, client: Any, userdata: Any) -> None:
         error = sys.exc_info()[1]  # paho calls while it handles the error
         reason = " ".join(str(getattr(error, "strerror", None) or error or "").split())[:120]
         if isinstance(error, ssl.SSLCertVerificationError):
             reason = f"its certificate is not trusted ({error.verify_message})"
-        self._broker.lost(f"no connection to {self._settings.host}:{self._settings.port}: {reason}".removesuffix(": "))
+        self._broker.begin_outage(
+            f"no connection to {self._settings.host}:{self._settings.port}: {reason}".removesuffix(": ")
+        )
 
     def _message(self, client: Any, userdata: Any, message: Any) -> None:
         """Take a message in; must not wait, for the connection would be lost meanwhile."""

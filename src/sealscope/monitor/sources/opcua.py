@@ -102,7 +102,7 @@ class _OpcUaSession:
                 for (node, channel), answer in zip(nodes.items(), answers, strict=True):
                     if not isinstance(answer, int):
                         raise ConnectionError(f"{actuator.name}: {channel} is no node, got {node.nodeid} ({answer})")
-            self._server.back()
+            self._server.end_outage()
             while not self._service.stopping.is_set():
                 await client.check_connection()
                 await asyncio.sleep(_LOOK_S)
