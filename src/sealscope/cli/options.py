@@ -238,7 +238,7 @@ class StatedMachine:
 def stating(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Give a command the options of `StatedMachine.of`, or those of these names, in place of its parameter `stated`."""
     every = inspect.signature(StatedMachine.of, eval_str=True).parameters
-    return _taking("stated", StatedMachine.of, [every[name] for name in names or every])
+    return _replace_parameter("stated", StatedMachine.of, [every[name] for name in names or every])
 
 
 def simulating(command: Callable[..., None]) -> Callable[..., None]:
@@ -253,7 +253,7 @@ def simulating(command: Callable[..., None]) -> Callable[..., None]:
         kind = str | None if default is None else type(default)
         annotation = known.get(argument.name, Annotated[kind, declared(argument.name)])
         options.append(Parameter(argument.name, Parameter.KEYWORD_ONLY, default=default, annotation=annotation))
-    return _taking("experiment", _experiment, options)(command)
+    return _replace_parameter("experiment", _experiment, options)(command)
 
 
 def _experiment(rig: str, set: Sequence[str] | None, **arguments: Any) -> Experiment:
@@ -262,7 +262,7 @@ def _experiment(rig: str, set: Sequence[str] | None, **arguments: Any) -> Experi
     return Experiment.of(rig=rig_with(rig, set), **arguments)
 
 
-def _taking(
+def _replace_parameter(
     name: str, make: Callable[..., Any], options: Sequence[Parameter]
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Replace a command's parameter `name` by options, from which `make` builds its value."""

@@ -67,7 +67,7 @@ def diagnose(
 
         files = recordings_in(files)
         form = form if form == "jsonl" else "table"
-    work = partial(_dated, machine=stated, joined=join, false_alarm=false_alarm)
+    work = partial(_date_diagnoses, machine=stated, joined=join, false_alarm=false_alarm)
     piped = _check_standard_input([*files, *stated.baseline])
     # what a baseline costs is spent once, and standard input is this process's
     alone = join or piped or stated.baseline or stated.known or len(files) < _FEWEST_SIDE_BY_SIDE
@@ -164,7 +164,7 @@ def _diagnoses(
             yield None if diagnosis is None else (recording, diagnosis)
 
 
-def _dated(files: Sequence[Path], **options: Any) -> Iterator[Dated | None]:
+def _date_diagnoses(files: Sequence[Path], **options: Any) -> Iterator[Dated | None]:
     """Yield when each recording began [s since 1970] and its diagnosis; None and `options` as of `_diagnoses`."""
     for result in _diagnoses(files, **options):
         yield None if result is None else (_began(result), result[1])

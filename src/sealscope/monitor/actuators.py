@@ -166,9 +166,9 @@ class WatchedActuators:
         self._changes, self.changed, self.closed = itertools.count(1), 0, False
         self.supervisor = Supervisor(outage_reason, self._tell)
         self._lock = threading.RLock()
-        self._actuators = {name: self._restored(self.settings[name]) for name in self.settings}
+        self._actuators = {name: self._restore(self.settings[name]) for name in self.settings}
 
-    def _restored(self, settings: ActuatorSettings) -> _Actuator:
+    def _restore(self, settings: ActuatorSettings) -> _Actuator:
         """Restore an actuator from its last transaction, or begin anew if it is new or its settings changed."""
         name, rate = settings.name, settings.false_alarms_per_1000_h
         state, block_count = self.store.checkpoint(name), self.store.last_number(self.store.tables.blocks, name)
@@ -237,11 +237,11 @@ class WatchedActuators:
         fresh = [block for block in blocks if new[block.actuator, block.identity] is block]
         try:
             try:
-                self._stored(fresh)
+                self._store_new(fresh)
             except _Repeated:
                 known = self.store.select_stored(new)
                 fresh = [block for block in fresh if (block.actuator, block.identity) not in known]
-                self._stored(fresh)
+                self._store_new(fresh)
         except BaseException:
             # what the detectors took is not stored: the next blocks begin at the last transaction
             for name in {block.actuator for block in blocks}:
@@ -250,7 +250,7 @@ class WatchedActuators:
         self.count("blocks stored already", len(blocks) - len(fresh))
         self._tell()
 
-    def _stored(self, blocks: Sequence[SourceBlock]) -> None:
+    def _store_new(self, blocks: Sequence[SourceBlock]) -> None:
         """Take blocks in one transaction.
 
         Raises _Repeated, and no detector has taken anything, where one of the blocks is stored already.
@@ -273,7 +273,7 @@ class WatchedActuators:
 
     def _actuator(self, name: str) -> _Actuator:
         if name not in self._actuators:
-            self._actuators[name] = self._restored(self.settings[name])
+            self._actuators[name] = self._restore(self.settings[name])
         return self._actuators[name]
 
     def _add_samples(self, rows: StoredRows, actuator: _Actuator, samples: Recording, follows: bool) -> None:

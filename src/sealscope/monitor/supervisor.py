@@ -162,7 +162,7 @@ class Supervisor:
                 pass
             ended()
 
-        return _started(attempts, name)
+        return _start_thread(attempts, name)
 
     def repeat(
         self, name: str, step: Callable[[], object], every_s: float, *, last: Callable[[], object] | None = None
@@ -176,7 +176,7 @@ class Supervisor:
             if last is not None:
                 part.attempt(last, at_once=True)
 
-        return _started(attempts, name)
+        return _start_thread(attempts, name)
 
 
 class LimitedLines(logging.Filter):
@@ -218,7 +218,7 @@ def place_of(error: BaseException) -> str:
     return f"{' '.join(kind.split())[:120]}{where}"
 
 
-def _started(work: Callable[[], None], name: str) -> threading.Thread:
+def _start_thread(work: Callable[[], None], name: str) -> threading.Thread:
     thread = threading.Thread(target=work, name=name, daemon=True)
     thread.start()
     return thread

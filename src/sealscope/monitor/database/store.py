@@ -62,7 +62,7 @@ class StoredRows:
 
     def add_pending(self, actuator: str, number: int, samples: Recording, follows: bool) -> None:
         """Add samples that a restart goes through once more after the checkpoint."""
-        self.pending.append({"actuator": actuator, "number": number, "samples": _packed(samples, follows)})
+        self.pending.append({"actuator": actuator, "number": number, "samples": _pack(samples, follows)})
 
     def add_alarm(self, alarm: Alarm, kind: str, t: float, by_whom: str = "", text: str = "") -> None:
         """Add an alarm in its present state, and the event or the person's remark if `kind` is not empty."""
@@ -102,14 +102,14 @@ class MonitorStore:
             limit_answers(self.engine)
             if self.engine.dialect.name == "sqlite":
                 sa.event.listen(self.engine, "connect", _prepare_sqlite)
-            known = self._prepared(_ATTEMPTS)
+            known = self._prepare_tables(_ATTEMPTS)
         except (SQLAlchemyError, ImportError, ValueError) as error:
             reason = str(getattr(error, "orig", None) or error).splitlines()[0]
             raise InputError(f"the monitor's database must be a file of SQLite or a URL, got: {reason}") from None
         if known != str(tables.SCHEMA):
             raise InputError(f"the monitor's database must have version {tables.SCHEMA}, got {known} ({database})")
 
-    def _prepared(self, attempts: int) -> str:
+    def _prepare_tables(self, attempts: int) -> str:
         """Make the tables where they are missing, and return their version."""
         facts = tables.facts
         try:
@@ -122,7 +122,7 @@ class MonitorStore:
             if attempts == 1:
                 raise
             time.sleep(0.2)  # another monitor makes the tables at this moment
-            return self._prepared(attempts - 1)
+            return self._prepare_tables(attempts - 1)
         return str(known or tables.SCHEMA)
 
     @contextmanager
@@ -132,7 +132,7 @@ class MonitorStore:
             yield connection
 
     @contextmanager
-    def _noting(self) -> Iterator[sa.Connection]:
+    def _begin_notes(self) -> Iterator[sa.Connection]:
         """Return a connection for changes that the death of this process leaves, a loss of power perhaps not."""
         is_file = self.engine.dialect.name == "sqlite"
         with self._writing_lock, self.engine.connect() as connection:
@@ -240,7 +240,7 @@ class MonitorStore:
         """Note the start of decoding a message; return the number of earlier starts without an end."""
         table, columns = tables.decodings, tables.decodings.c
         before = select(columns.attempts).where(columns.reader == reader, columns.digest == digest)
-        with self._noting() as connection:
+        with self._begin_notes() as connection:
             attempts = int(connection.execute(before).scalar() or 0)
             self.upsert(connection, table, [{"reader": reader, "digest": digest, "attempts": attempts + 1}])
         return attempts
@@ -248,7 +248,7 @@ class MonitorStore:
     def end_decoding(self, reader: str, digest: str) -> None:
         """Forget that a reader began to decode a message."""
         columns = tables.decodings.c
-        with self._noting() as connection:
+        with self._begin_notes() as connection:
             connection.execute(tables.decodings.delete().where(columns.reader == reader, columns.digest == digest))
 
     def last_number(self, table: sa.Table, actuator: str) -> int:
@@ -264,7 +264,7 @@ class MonitorStore:
         samples = select(pending.c.samples).where(pending.c.actuator == actuator).order_by(pending.c.number)
         with self.engine.connect() as connection:
             row = connection.execute(select(states).where(states.c.actuator == actuator)).first()
-            blocks = [_unpacked(data) for (data,) in connection.execute(samples)]
+            blocks = [_unpack(data) for (data,) in connection.execute(samples)]
         return None if row is None else (row.settings, json.loads(row.checkpoint), blocks)
 
     def last_samples(self, actuator: str) -> list[Recording]:
@@ -349,7 +349,7 @@ def outage_reason(error: BaseException) -> str | None:
     return " ".join(str(error.orig).split())[:200]
 
 
-def _packed(samples: Recording, follows: bool) -> bytes:
+def _pack(samples: Recording, follows: bool) -> bytes:
     """Return samples as one line of JSON and their numbers, little endian, the clock first."""
     head = _head(tuple((name, samples.units[name]) for name in samples.channels), samples.rate, follows)
     return head + np.array([samples.t, *samples.channels.values()], dtype="<f8").tobytes()
@@ -360,8 +360,8 @@ def _head(units: tuple[tuple[str, str], ...], rate: float, follows: bool) -> byt
     return json.dumps({"units": dict(units), "rate": rate, "follows": follows}).encode() + b"\n"
 
 
-def _unpacked(data: bytes) -> tuple[Recording, bool]:
-    """Unpack samples from the bytes of `_packed`; the flag tells whether they follow the samples before."""
+def _unpack(data: bytes) -> tuple[Recording, bool]:
+    """Unpack samples from the bytes of `_pack`; the flag tells whether they follow the samples before."""
     line, _, numbers = data.partition(b"\n")
     head = json.loads(line)
     t, *channels = np.frombuffer(numbers, dtype="<f8").reshape(1 + len(head["units"]), -1)

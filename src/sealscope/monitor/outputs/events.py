@@ -21,7 +21,7 @@ logging.getLogger("httpx").setLevel(logging.WARNING)  # which tells each request
 _BY_ITSELF = ("raised", "error", "warning", "returned")
 
 
-def _announced(event: dict[str, Any]) -> bool:
+def _is_announced(event: dict[str, Any]) -> bool:
     """Test whether an event is announced: of a shelved alarm only a person's acts are."""
     return event["event"] not in _BY_ITSELF or not event["alarm"]["shelved"]
 
@@ -45,7 +45,7 @@ class EventLines:
         if event["number"] != self._number:
             self._left, self._number = (json.dumps(event) + "\n").encode(), event["number"]
         try:
-            if not _announced(event):
+            if not _is_announced(event):
                 return True
             if self._stream is None:
                 raise OSError("it is closed")
@@ -80,7 +80,7 @@ class Webhook:
         self._store.pass_on("webhook", self._posted)
 
     def _posted(self, event: dict[str, Any]) -> bool:
-        if not _announced(event):
+        if not _is_announced(event):
             return True
         try:
             asyncio.run(self._post(event))

@@ -48,7 +48,7 @@ class SparkplugNode:
         name = f"{broker.client_id}-{settings.group}-{settings.node}"
         self._link = MqttLink(broker, name, password, will=self._death)
         self._client = self._link.client
-        self._client.on_connect = self._connected
+        self._client.on_connect = self._on_connect
         self._client.on_message = self._message
         self._born = self._birth_number = 0  # bdSeq of the last birth, and of this connection
         self._seq = 255
@@ -103,7 +103,7 @@ class SparkplugNode:
         self._birth_number = (self._born + 1) % 256
         return self._topic("NDEATH"), spb.encoded(spb.SparkplugPayload(_clock(None), (self._number(),)))
 
-    def _connected(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
+    def _on_connect(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
         if reason.is_failure:
             _log.error("the broker %s refuses the Sparkplug node: %s", self._broker.host, reason)
             return

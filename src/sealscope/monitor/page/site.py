@@ -109,7 +109,7 @@ class _Pages:
 
     def file(self, request: Request) -> Response:
         name, kind = _FILES[request.url.path]
-        return Response(str(packaged(name)) if name.startswith("vendor/") else _packaged(name), media_type=kind)
+        return Response(str(packaged(name)) if name.startswith("vendor/") else _read_packaged(name), media_type=kind)
 
     def _counters_and_outages(self) -> dict[str, Any]:
         """Return the counters, waiting blocks and outages, which need no database."""
@@ -193,9 +193,9 @@ class _Pages:
                 silent += _LOOK_S
 
     def metrics(self, request: Request) -> Response:
-        return Response(self._measured(self._actuators.plain()), media_type=CONTENT_TYPE)
+        return Response(self._render_metrics(self._actuators.plain()), media_type=CONTENT_TYPE)
 
-    def _measured(self, summaries: Mapping[str, Mapping[str, Any]]) -> str:
+    def _render_metrics(self, summaries: Mapping[str, Mapping[str, Any]]) -> str:
         return metrics_text(summaries, self._actuators.counters, self._supervisor.totals(), self._waits())
 
     async def not_answering(self, request: Request, error: Exception) -> Response:
@@ -206,7 +206,7 @@ class _Pages:
         self._supervisor.part(DATABASE).begin_outage(reason)
         text = f"the database does not answer: {reason}"
         if request.url.path == "/metrics":
-            return Response(f"# {text}\n{self._measured({})}", 503, {**_LATER, "Content-Type": CONTENT_TYPE})
+            return Response(f"# {text}\n{self._render_metrics({})}", 503, {**_LATER, "Content-Type": CONTENT_TYPE})
         return JSONResponse({"error": text, **self._counters_and_outages()}, 503, _LATER)
 
     async def login(self, request: Request) -> Response:
@@ -223,9 +223,9 @@ class _Pages:
                 answer.set_cookie(_COOKIE, admission.session, longest, secure=secure, httponly=True, samesite="strict")
                 return answer
             status = 401
-        return Response(_packaged("login.html"), status, media_type="text/html")
+        return Response(_read_packaged("login.html"), status, media_type="text/html")
 
-    def _refused(self, request: Request) -> Response | None:
+    def _find_refusal(self, request: Request) -> Response | None:
         """Return the refusal of a request without the token, None if it has the token."""
         admission = self._admission
         if admission is None or request.url.path in ("/login", "/login.css"):
@@ -246,7 +246,7 @@ class _Pages:
         return answer
 
     async def guard(self, request: Request, call_next: Callable[[Request], Awaitable[Response]]) -> Response:
-        answer = self._refused(request) or await call_next(request)
+        answer = self._find_refusal(request) or await call_next(request)
         answer.headers.update(_HEADERS)
         return answer
 
@@ -265,7 +265,7 @@ class _Listening(StreamingResponse):
             self._ended()
 
 
-def _packaged(name: str) -> str:
+def _read_packaged(name: str) -> str:
     return (resources.files("sealscope.monitor.page") / name).read_text("utf-8")
 
 
@@ -310,13 +310,13 @@ class PageServer:
         self._actuators, self._host, self.port = actuators, settings.host, settings.port
         self._application = site(actuators, settings, token, waits, live)
         self._proxies = [str(address) for address in settings.proxies]
-        self._socket: socket.socket | None = self._opened()
+        self._socket: socket.socket | None = self._open_socket()
         self.port = int(self._socket.getsockname()[1])
         self.address = f"http://{settings.host}:{self.port}/"
         self._server: uvicorn.Server | None = None
         self._thread = actuators.supervisor.start("page", self._serve)
 
-    def _opened(self) -> socket.socket:
+    def _open_socket(self) -> socket.socket:
         try:
             family = socket.AF_INET6 if ":" in self._host else socket.AF_INET
             return socket.create_server((self._host, self.port), family=family, backlog=BACKLOG)
@@ -326,7 +326,7 @@ class PageServer:
 
     def _serve(self) -> None:
         """Serve the page until `leave`; uvicorn closes the socket."""
-        opened, self._socket = self._socket or self._opened(), None
+        opened, self._socket = self._socket or self._open_socket(), None
         config = uvicorn.Config(
             self._application,
             http=limited_protocol(most_connections()),

@@ -74,12 +74,12 @@ class _OpcUaSession:
     async def _connect(self) -> None:
         """Stay connected until the service ends; raises PartAway where the server is not reached any more."""
         try:
-            await self._connected()
+            await self._run_connection()
         except Exception as error:  # whatever the library and the server make of a lost connection
             reason = " ".join(str(error).split()) or type(error).__name__
             raise PartAway(f"{self._settings.url}: {reason}") from None
 
-    async def _connected(self) -> None:
+    async def _run_connection(self) -> None:
         """Connect, subscribe, and stay until the connection is lost, which raises, or the service ends."""
         from asyncua import Client
 

@@ -136,7 +136,7 @@ def _notes(result: CampaignResult) -> list[str]:
     with_onset = [name for name, known in result.known.items() if known.onset]
     notes += [_say("true_onset", detectors=", ".join(with_onset))] if with_onset else []
     notes += _known_notes(result)
-    notes += [_say("batched", mode=result.mode)] if _batched(result) else []
+    notes += [_say("batched", mode=result.mode)] if _is_batched(result) else []
     notes += [plan.note] if plan.note else []
     notes += [_say("missing", count=result.missing)] if result.missing else []
     notes += [_say("failed", count=len(judgement.failed))] if judgement.failed else []
@@ -159,7 +159,7 @@ def _known_notes(result: CampaignResult) -> list[str]:
     return notes + [_say("rig", rig=rig, detectors=", ".join(names)) for rig, names in by_rig.items() if rig]
 
 
-def _batched(result: CampaignResult) -> bool:
+def _is_batched(result: CampaignResult) -> bool:
     return result.mode not in ("", RUN_BY_RUN)
 
 
@@ -210,11 +210,11 @@ def _facts(result: CampaignResult) -> list[tuple[str, str]]:
         ("records", f"{plan.duration_s:g} s at {plan.rig.daq.sample_rate:g} Hz, leaks open at {plan.onset_s:g} s"),
         *((name, ", ".join(str(level) for level in levels)) for name, levels in plan.factors.items()),
         ("base seed", str(plan.seed)),
-        *([("simulated", result.mode)] if _batched(result) else []),
+        *([("simulated", result.mode)] if _is_batched(result) else []),
         *((f"seen by @ {name}" if name else "seen", ", ".join(channels)) for name, channels in plan.views.items()),
     ]
     if any(plan_detector(name).scorer is None for name in plan.detectors):
-        facts.append(("assumed by detectors", _assumed(plan)))
+        facts.append(("assumed by detectors", _describe_assumed_machine(plan)))
     for size, (mean, spread) in judgement.realised.items():
         deviation = "" if math.isnan(spread) else f" ± {spread:.2g}"
         facts.append(
@@ -226,7 +226,7 @@ def _facts(result: CampaignResult) -> list[tuple[str, str]]:
     return facts
 
 
-def _assumed(plan: SimulatedPlan) -> str:
+def _describe_assumed_machine(plan: SimulatedPlan) -> str:
     """Describe the machine assumed by the detectors."""
     if plan.assumed == plan.rig:
         return f"the rig {plan.rig.name} as it stands, not the machine that was drawn"
