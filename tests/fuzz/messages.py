@@ -230,7 +230,7 @@ def sparkplug(folder: Path) -> Use:
 
         def work() -> None:
             try:
-                host.taken(f"spBv1.0/{place}", message)
+                host.receive(f"spBv1.0/{place}", message)
             except RefusedMessage as error:
                 _refused(error)
 

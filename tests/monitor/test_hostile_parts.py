@@ -66,13 +66,13 @@ def test_a_deep_message_is_refused_whatever_its_depth(key):
 def test_a_death_whose_number_is_an_array_is_stale():
     host = SparkplugHost([ActuatorSettings(name="a", sparkplug="g/n", rate=50.0)], lambda *_: None, lambda _: None)
     birth = SparkplugPayload(1, (SparkplugMetric(BIRTH_SEQUENCE, 3, INT64),), 0)
-    assert host.taken("spBv1.0/g/NBIRTH/n", encoded(birth)) is None
+    assert host.receive("spBv1.0/g/NBIRTH/n", encoded(birth)) is None
     for value in (np.arange(3.0), np.empty(0), np.array([3.0])):
         death = SparkplugPayload(1, (SparkplugMetric(BIRTH_SEQUENCE, value, 31),), None)
         with pytest.raises(RefusedMessage) as raised:
-            host.taken("spBv1.0/g/NDEATH/n", encoded(death))
+            host.receive("spBv1.0/g/NDEATH/n", encoded(death))
         assert raised.value.reason == STALE_DEATH
-    assert host.taken("spBv1.0/g/NDEATH/n", encoded(birth)) is None
+    assert host.receive("spBv1.0/g/NDEATH/n", encoded(birth)) is None
 
 
 @pytest.mark.skipif(MOSQUITTO is None, reason="mosquitto is not installed")

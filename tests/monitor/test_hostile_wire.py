@@ -154,7 +154,7 @@ def test_what_is_shown_of_any_samples_can_be_stored(factor: float, names: tuple[
         settings = ActuatorSettings(name="press 1", learn_hours=0.01)
         actuator = _Actuator(settings, ss.watch("thesis", learn_hours=0.01), AlarmJudge("press 1"))
         for start, part in ((0.0, first), (40.0, then)):
-            estimates, _ = actuator.judged(part.between(start, start + 40.0), True, settings)
+            estimates, _ = actuator.judge_samples(part.between(start, start + 40.0), True, settings)
             for own in estimates:
                 orjson.dumps(vars(own))
         orjson.dumps(actuator.summary())

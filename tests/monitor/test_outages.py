@@ -36,17 +36,17 @@ def test_an_outage_is_said_once_and_measured(caplog):
     changes: list[int] = []
     supervisor = Supervisor(changed=lambda: changes.append(1))
     database, broker = (supervisor.part(name) for name in (DATABASE, BROKER))
-    database.back()
+    database.end_outage()
     assert supervisor.outages() == [] == changes
-    broker.lost("gone\nwith the wind")
-    broker.lost("still gone")
+    broker.begin_outage("gone\nwith the wind")
+    broker.begin_outage("still gone")
     (outage,) = supervisor.outages()
     assert (outage["part"], outage["reason"]) == ("broker", "gone")
     reached, number, seconds = supervisor.totals()["broker"]
     assert (reached, number, seconds >= 0.0) == (False, 1, True)
-    broker.back()
-    broker.back()
-    broker.lost("again")
+    broker.end_outage()
+    broker.end_outage()
+    broker.begin_outage("again")
     assert supervisor.totals()["broker"][:2] == (False, 2)
     assert supervisor.totals()["database"] == (True, 0, 0.0)
     assert len(changes) == 3

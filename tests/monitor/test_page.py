@@ -261,11 +261,11 @@ def test_the_page_in_a_browser(service: Service, tmp_path: Path):
                 assert view.locator("#alarm").is_visible()
                 look_at_the_live_part(view, live)
                 assert errors == []
-                service.supervisor.part("broker").lost("<b>gone</b>")
+                service.supervisor.part("broker").begin_outage("<b>gone</b>")
                 view.locator("#outages", has_text="The broker is not reached").wait_for()
                 assert "<b>gone</b>" in (view.text_content("#outages") or "")
                 assert view.evaluate("document.documentElement.scrollWidth") <= width
-                service.supervisor.part("broker").back()
+                service.supervisor.part("broker").end_outage()
                 view.locator("#outages").wait_for(state="hidden")
                 view.close()
             browser.close()

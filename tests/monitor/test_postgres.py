@@ -21,7 +21,7 @@ from starlette.testclient import TestClient
 
 from sealscope.diagnosis.live.estimates import BlockEstimate
 from sealscope.monitor.alarms import AlarmJudge
-from sealscope.monitor.database.store import MonitorStore, StoredRows, away
+from sealscope.monitor.database.store import MonitorStore, StoredRows, outage_reason
 from sealscope.monitor.database.tables import metadata
 from sealscope.monitor.page.site import site
 from sealscope.monitor.service import Service
@@ -207,7 +207,7 @@ def test_a_statement_that_waits_for_a_lock_is_ended_by_the_server(server: Postgr
             connection.execute(text("lock table facts in access exclusive mode"))
             with pytest.raises(OperationalError, match="statement timeout") as raised:
                 store.position("nobody")
-            assert away(raised.value) == "canceling statement due to statement timeout"
+            assert outage_reason(raised.value) == "canceling statement due to statement timeout"
         assert store.position("nobody") == 0
     finally:
         store.engine.dispose()

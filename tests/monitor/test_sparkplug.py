@@ -151,7 +151,7 @@ class Plant:
             self.seq = 0 if kind == "NBIRTH" else (self.seq + 1 + skip) % 256
         device = self.device if kind.startswith("D") else None
         topic = sparkplug.topic_of("plant", kind, "edge", device)
-        return self.host.taken(topic, encoded(SparkplugPayload(at, metrics, None if kind == "NDEATH" else self.seq)))
+        return self.host.receive(topic, encoded(SparkplugPayload(at, metrics, None if kind == "NDEATH" else self.seq)))
 
     def born(self, *metrics: SparkplugMetric, number: int = 1) -> None:
         assert self.send("NBIRTH", SparkplugMetric("bdSeq", number, sparkplug.INT64)) is None
@@ -202,7 +202,7 @@ def as_source(samples: dict[str, Recording], size: int) -> Callable[[BlockReceiv
                     messages.append(("DDATA", device, metrics))
         for seq, (kind, device, metrics) in enumerate(messages):
             wire = encoded(SparkplugPayload(1, tuple(metrics), seq % 256))
-            block = host.taken(sparkplug.topic_of("plant", kind, "edge", device), wire)
+            block = host.receive(sparkplug.topic_of("plant", kind, "edge", device), wire)
             if block is not None:
                 service.hand(block)
 
@@ -341,9 +341,9 @@ def test_topics_of_others_are_refused():
     wire = encoded(SparkplugPayload(1, (), 0))
     for topic in ("spBv1.0/plant/NBIRTH/other", "spBv1.0/plant/DDATA/edge", "spBv1.0/plant/STATE", "spBv1.0/a/b/c/d/e"):
         with pytest.raises(RefusedMessage) as raised:
-            plant.host.taken(topic, wire)
+            plant.host.receive(topic, wire)
         assert raised.value.reason == WRONG_ACTUATOR
-    assert plant.host.taken("spBv1.0/plant/NCMD/edge", wire) is None
+    assert plant.host.receive("spBv1.0/plant/NCMD/edge", wire) is None
     assert plant.host.topics == ["spBv1.0/plant/+/edge/#"]
     plant.host.ask_all()
     assert len(plant.asked) == 1
@@ -386,7 +386,7 @@ def test_mutated_payloads_are_blocks_or_refused(count):
                 data[at : at + int(random.integers(20))] = random.bytes(int(random.integers(20)))
         topic = sparkplug.topic_of("plant", kind, "edge", "press" if kind[0] == "D" else None)
         try:
-            block = plant.host.taken(topic, bytes(data))
+            block = plant.host.receive(topic, bytes(data))
             outcomes["nothing" if block is None else "block"] += 1
         except RefusedMessage as error:
             assert len(str(error)) < 400

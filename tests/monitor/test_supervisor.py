@@ -13,7 +13,7 @@ import pytest
 from sqlalchemy.exc import OperationalError
 
 from sealscope.errors import InputError
-from sealscope.monitor.database.store import away
+from sealscope.monitor.database.store import outage_reason
 from sealscope.monitor.service import Service
 from sealscope.monitor.sources.source_block import BlockReceiver, decoded
 from sealscope.monitor.supervisor import DATABASE, LimitedLines, PartAway, Supervisor
@@ -32,7 +32,7 @@ class Panic(BaseException):
 def test_a_part_that_fails_is_an_outage_and_starts_again(monkeypatch, caplog, error):
     monkeypatch.setattr("sealscope.monitor.supervisor.FIRST_PAUSE_S", 0.03)
     monkeypatch.setattr("sealscope.monitor.supervisor._WORKING_S", 0.3)
-    supervised = Supervisor(away)
+    supervised = Supervisor(outage_reason)
     stopping = supervised.stopping
     starts: list[float] = []
 
@@ -61,7 +61,7 @@ def test_a_part_that_fails_is_an_outage_and_starts_again(monkeypatch, caplog, er
 
 
 def test_the_place_of_an_error_is_that_in_this_package():
-    supervised = Supervisor(away)
+    supervised = Supervisor(outage_reason)
     with pytest.raises(InputError):
         to_si([1.0], "furlong^2", "m", name="x")
     supervised.part("source").attempt(lambda: to_si([1.0], "furlong^2", "m", name="x"))
@@ -70,7 +70,7 @@ def test_the_place_of_an_error_is_that_in_this_package():
 
 
 def test_what_is_away_is_no_error_of_the_part():
-    supervised = Supervisor(away)
+    supervised = Supervisor(outage_reason)
     part = supervised.part("folder")
 
     def fails(error: Exception) -> bool:
@@ -89,7 +89,7 @@ def test_what_is_away_is_no_error_of_the_part():
 
 
 def test_a_step_is_taken_at_the_end_though_its_part_pauses():
-    supervised, steps = Supervisor(away), []
+    supervised, steps = Supervisor(outage_reason), []
 
     def step() -> None:
         steps.append(1)

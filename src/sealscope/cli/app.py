@@ -164,10 +164,10 @@ def main() -> None:
 
 @contextmanager
 def _no_interrupt_lost() -> Iterator[None]:
-    """Send an interrupt again that came where Python ignores exceptions, such as in a finalizer of the compiler."""
+    """Repeat an interrupt that Python ignored, for example in a finalizer of the compiler."""
     usual = sys.unraisablehook
 
-    def again(unraisable: Any) -> None:
+    def repeat_interrupt(unraisable: Any) -> None:
         if unraisable.exc_type is not KeyboardInterrupt:
             usual(unraisable)
             return
@@ -175,7 +175,7 @@ def _no_interrupt_lost() -> Iterator[None]:
         timer.daemon = True
         timer.start()
 
-    sys.unraisablehook = again
+    sys.unraisablehook = repeat_interrupt
     try:
         yield
     finally:

@@ -104,10 +104,10 @@ def report(plan: PlanArgument, folder: FolderOption = None, data: DataOption = N
     _report(loaded, _folder(loaded, folder), data)
 
 
-def _folder(plan: AnyPlan, given: Path | None) -> Path:
+def _folder(plan: AnyPlan, stated: Path | None) -> Path:
     """Return the campaign's folder; InputError where the default one is a link that came with the folder."""
-    if given is not None:
-        return given
+    if stated is not None:
+        return stated
     folder = Path("sealscope-campaigns") / plan.name
     for part in (folder.parent, folder):
         if part.is_symlink():

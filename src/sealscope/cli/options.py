@@ -126,7 +126,7 @@ SheetOption = Annotated[Path | None, Option("--sheet", help=_SHEET)]
 
 @dataclass(frozen=True)
 class StatedMachine:
-    """What a call states of the machine: by its file (`known`), or how to read its files, rig, limit and baseline."""
+    """The machine as a call states it: its file (`known`), or how to read its files, its rig, limit and baseline."""
 
     known: CommissionedMachine | None = None
     channel_map: ChannelMap = field(default_factory=dict)
@@ -147,16 +147,16 @@ class StatedMachine:
         limit: LimitOption = None,
         baseline: BaselineOption = None,
     ) -> StatedMachine:
-        """Return what the options state; InputError where it cannot be, or stands beside `--machine`."""
+        """Read the stated machine from the options. Raise InputError for a wrong option, or one next to `--machine`."""
         from sealscope.diagnosis.verdict.severity import RepairLimit
         from sealscope.recordings.formats.columns import check_call
 
         if machine is not None:
             from sealscope.diagnosis.commissioned.machine_file import read_machine
 
-            beside = {"--baseline": baseline, "--map": maps, "--rate": rate, "--rig": rig}
-            beside |= {"--area": area, "--displacement": displacement, "--limit": limit}
-            for name, value in beside.items():
+            options = {"--baseline": baseline, "--map": maps, "--rate": rate, "--rig": rig}
+            options |= {"--area": area, "--displacement": displacement, "--limit": limit}
+            for name, value in options.items():
                 if value:
                     raise InputError(f"{name} must not stand beside --machine, whose file states it")
             known = read_machine(machine)
@@ -175,7 +175,7 @@ class StatedMachine:
 
     @property
     def maps(self) -> bool:
-        """Whether any map is stated."""
+        """Test whether the call or its rig states a map."""
         return bool(self.channel_map or self._map_of_rig)
 
     def read(self, file: Path) -> Recording:
@@ -206,7 +206,7 @@ class StatedMachine:
         return read_of_machine(file, self._map_of_rig, self.rate)
 
     def read_all(self, files: Sequence[Path], joined: bool = False) -> Iterator[tuple[Path, Recording | None]]:
-        """Yield each file and its recording, None with a line on standard error where it cannot be read.
+        """Yield each file and its recording, or None and a line on standard error if it is unreadable.
 
         `joined`: the first file and the recording of all files joined instead, None where one is bad.
         """
@@ -229,8 +229,8 @@ class StatedMachine:
         from sealscope.diagnosis.diagnose import diagnose
 
         if self.known is not None:
-            own = self.known.diagnose(recording, false_alarm_probability=false_alarm)
-            return replace(own, file=str(file))
+            diagnosis = self.known.diagnose(recording, false_alarm_probability=false_alarm)
+            return replace(diagnosis, file=str(file))
         stated: dict[str, Any] = {"rig": self.rig, "limit": self.limit, "file": file}
         return diagnose(recording, baseline, false_alarm_probability=false_alarm, **stated)
 
@@ -238,7 +238,7 @@ class StatedMachine:
 def stating(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Give a command the options of `StatedMachine.of`, or those of these names, in place of its parameter `stated`."""
     every = inspect.signature(StatedMachine.of, eval_str=True).parameters
-    return _taking("stated", StatedMachine.of, [every[name] for name in names or every])
+    return _replace_parameter("stated", StatedMachine.of, [every[name] for name in names or every])
 
 
 def simulating(command: Callable[..., None]) -> Callable[..., None]:
@@ -246,48 +246,48 @@ def simulating(command: Callable[..., None]) -> Callable[..., None]:
     known = {"rig": RigOption, "set": SetOption, "x_0": Annotated[str, declared("x_0", option="--start-position")]}
     known |= {name: Annotated[list[str] | None, declared(name, several=True)] for name in ("leak", "fault")}
     options = []
-    for own in fields(Arguments):
-        if own.name == "drifts":  # no text says what drifts
+    for argument in fields(Arguments):
+        if argument.name == "drifts":  # no text says what drifts
             continue
-        default = f"{own.default:g}" if isinstance(own.default, float) else own.default
+        default = f"{argument.default:g}" if isinstance(argument.default, float) else argument.default
         kind = str | None if default is None else type(default)
-        annotation = known.get(own.name, Annotated[kind, declared(own.name)])
-        options.append(Parameter(own.name, Parameter.KEYWORD_ONLY, default=default, annotation=annotation))
-    return _taking("experiment", _experiment, options)(command)
+        annotation = known.get(argument.name, Annotated[kind, declared(argument.name)])
+        options.append(Parameter(argument.name, Parameter.KEYWORD_ONLY, default=default, annotation=annotation))
+    return _replace_parameter("experiment", _experiment, options)(command)
 
 
-def _experiment(rig: str, set: Sequence[str] | None, **given: Any) -> Experiment:
+def _experiment(rig: str, set: Sequence[str] | None, **arguments: Any) -> Experiment:
     from sealscope.simulation.experiment import Experiment
 
-    return Experiment.of(rig=rig_with(rig, set), **given)
+    return Experiment.of(rig=rig_with(rig, set), **arguments)
 
 
-def _taking(
+def _replace_parameter(
     name: str, make: Callable[..., Any], options: Sequence[Parameter]
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command options in place of its parameter `name`, which is what `make` makes of them."""
+    """Replace a command's parameter `name` by options, from which `make` builds its value."""
 
     def decorated(command: Callable[..., None]) -> Callable[..., None]:
         command.__annotations__[name] = Any  # the type may not be loaded yet
-        own = inspect.signature(command, eval_str=True)
+        signature = inspect.signature(command, eval_str=True)
 
         @wraps(command)
-        def call(**given: Any) -> None:
-            made = make(**{option.name: given.pop(option.name) for option in options})
-            command(**{name: made}, **given)
+        def call(**arguments: Any) -> None:
+            value = make(**{option.name: arguments.pop(option.name) for option in options})
+            command(**{name: value}, **arguments)
 
-        parameters = list(own.parameters.values())
-        place = list(own.parameters).index(name)
+        parameters = list(signature.parameters.values())
+        place = list(signature.parameters).index(name)
         parameters[place : place + 1] = options
         by_name = [parameter.replace(kind=parameter.KEYWORD_ONLY) for parameter in parameters]
-        call.__signature__ = own.replace(parameters=by_name)  # type: ignore[attr-defined]
+        call.__signature__ = signature.replace(parameters=by_name)  # type: ignore[attr-defined]
         return call
 
     return decorated
 
 
 def _assumed_rig(name: str | None, area: Sequence[str] | None, displacement: str | None) -> Rig | None:
-    """Return the rig of `--rig` with what `--area` and `--displacement` state; None where none of them is given."""
+    """Return the rig of `--rig` with the values of `--area` and `--displacement`, None without these options."""
     from sealscope.diagnosis.verdict.machine import unstated
     from sealscope.parameters import load_rig
     from sealscope.units import parse_quantity
@@ -327,7 +327,7 @@ def channel_map_of(options: Sequence[str] | None) -> ChannelMap:
 
 
 def verbose(context: Context) -> bool:
-    """Return whether the call has `-v`."""
+    """Test whether the call has `-v`."""
     return bool(context.find_root().params.get("verbose"))
 
 
@@ -347,7 +347,7 @@ def complain(message: object) -> None:
 
 
 def attempt(file: Path, work: Callable[[], T]) -> T | None:
-    """Return `work()`; None, with one line on standard error, where it fails with this file: the others go on."""
+    """Return `work()`, or None and one line on standard error if it fails with this file."""
     try:
         return work()
     except SealscopeError as error:
@@ -361,7 +361,7 @@ def attempt(file: Path, work: Callable[[], T]) -> T | None:
 
 
 def check_folder(file: Path) -> None:
-    """Refuse a file whose folder is not there before the long work, not after it; remove what a killed call left."""
+    """Refuse a file in a missing folder before the long work, and remove the remains of a killed call."""
     from sealscope.storage import atomic
 
     atomic.check_folder(file)
@@ -377,7 +377,7 @@ def write_text(file: Path, text: str) -> None:
 
 
 def say_jobs(jobs: int | None) -> None:
-    """Say so on standard error where fewer processes are started than `--jobs` asks for."""
+    """Complain on standard error if fewer processes start than `--jobs` asks for."""
     from sealscope.campaigns.execution.workers import process_count
 
     if jobs is not None and jobs > (most := process_count(jobs)):
@@ -386,7 +386,7 @@ def say_jobs(jobs: int | None) -> None:
 
 @contextmanager
 def progress(noun: str = "") -> Iterator[Callable[[str, float], None]]:
-    """Return what shows tasks and their shares on standard error, in lines that are gone when done.
+    """Show tasks and their shares on standard error, in lines that disappear at the end.
 
     Without a terminal nothing is shown; of many things, `noun`, a line a minute for the log.
     """
@@ -411,15 +411,15 @@ def progress(noun: str = "") -> Iterator[Callable[[str, float], None]]:
 
 
 def _each_minute() -> Callable[[str, float], None]:
-    """Return what prints a line a minute: what is done, and the time left."""
-    began = said = time.monotonic()
+    """Make a function that prints the task and the time left, once a minute."""
+    began = printed = time.monotonic()
     first: float | None = None
 
     def update(task: str, share: float) -> None:
-        nonlocal said, first
+        nonlocal printed, first
         now, first = time.monotonic(), share if first is None else first
-        if now - said >= 60.0 and share > first:
-            said = now
+        if now - printed >= 60.0 and share > first:
+            printed = now
             echo(f"{task}, about {time_text((now - began) / (share - first) * (1.0 - share))} left", err=True)
 
     return update

@@ -36,8 +36,8 @@ def plan(
     check_probability(false_alarm)
     if not 0.5 <= detection < 1.0:
         raise InputError(f"--detection must be 0.5 to below 1, got {detection:g}")
-    wanted = None if find is None else parse_quantity(find, "m^3/s", name="--find")
-    if wanted is not None and not wanted > 0.0:
+    leak_flow = None if find is None else parse_quantity(find, "m^3/s", name="--find")
+    if leak_flow is not None and not leak_flow > 0.0:
         raise InputError(f"--find must be a flow > 0, got {find}")
     known = opt.rig_with(rig, overrides)
     if machine is not None:
@@ -51,7 +51,7 @@ def plan(
         known = commissioned.rig
     with opt.progress() as update:
         planned = plan_recording(
-            known, wanted, usual=PlannedDuty(command, load), false_alarm=false_alarm, detection=detection,
+            known, leak_flow, usual=PlannedDuty(command, load), false_alarm=false_alarm, detection=detection,
             progress=update,
         )  # fmt: skip
     echo(json.dumps(planned.as_dict(), allow_nan=False) if output == "json" else planned.text())

@@ -67,7 +67,7 @@ def diagnose(
 
         files = recordings_in(files)
         form = form if form == "jsonl" else "table"
-    work = partial(_dated, machine=stated, joined=join, false_alarm=false_alarm)
+    work = partial(_date_diagnoses, machine=stated, joined=join, false_alarm=false_alarm)
     piped = _check_standard_input([*files, *stated.baseline])
     # what a baseline costs is spent once, and standard input is this process's
     alone = join or piped or stated.baseline or stated.known or len(files) < _FEWEST_SIDE_BY_SIDE
@@ -76,11 +76,11 @@ def diagnose(
     starts: list[float | None] = []
     for complaints, judged in results:
         echo(complaints, err=True, nl=False)
-        for own in judged:
-            if own is None:
+        for result in judged:
+            if result is None:
                 complete = False
                 continue
-            start, diagnosis = own
+            start, diagnosis = result
             failed |= any(_fails(reason, diagnosis) for reason in fail_on or ())
             starts.append(start)
             opt.say(_text(diagnosis, form, start))
@@ -100,12 +100,12 @@ def _side_by_side(
     if jobs == 1:
         yield "", work(files)
         return
-    for part, result in in_order(jobs, partial(_aside, work), [[file] for file in files]):
+    for part, result in in_order(jobs, partial(_collect_messages, work), [[file] for file in files]):
         yield result or (f"sealscope: the process that diagnosed {part[0]} died\n", [None])
 
 
 def _text(diagnosis: Diagnosis, form: str, start_s: float | None) -> str:
-    """Return what is printed of a verdict in a form: jsonl, whole, short, line or table."""
+    """Format a diagnosis for printing, in one of the forms jsonl, whole, short, line and table."""
     from sealscope.reporting.messages import diagnosis_text, short_text, table_line
 
     if form == "jsonl":
@@ -117,13 +117,13 @@ def _text(diagnosis: Diagnosis, form: str, start_s: float | None) -> str:
 
 
 def _fails(reason: str, diagnosis: Diagnosis) -> bool:
-    """Return whether the verdict is the one of `--fail-on`, or a leak's level that one or worse."""
+    """Test whether the verdict is the one of `--fail-on`, or the leak has its level or a worse one."""
     level = None if diagnosis.severity is None else diagnosis.severity.level
     return reason == diagnosis.verdict or (reason in _LEVELS and level in _LEVELS[_LEVELS.index(reason) :])
 
 
 def _in_time(files: Sequence[Path], starts: Sequence[float | None]) -> bool:
-    """Return whether files with names of one kind were recorded one after another, an hour apart or more."""
+    """Test whether files have names of one kind and were recorded in turn, an hour or more apart."""
     known = sorted(start for start in starts if start is not None)
     if len(known) < max(_FEWEST_IN_TIME, len(files)):
         return False
@@ -132,7 +132,7 @@ def _in_time(files: Sequence[Path], starts: Sequence[float | None]) -> bool:
 
 
 def _check_standard_input(files: Iterable[Path]) -> bool:
-    """Return whether standard input is among the files; raise InputError where it is so more than once."""
+    """Test whether standard input is among the files. Raise InputError if it is there more than once."""
     count = sum(file == opt.STANDARD_INPUT for file in files)
     if count > 1:
         raise InputError(f"standard input (-) must be given once, got it {count} times")
@@ -153,35 +153,35 @@ def _diagnoses(
         if not known:
             raise UnreadableFile("no baseline could be read, so nothing is diagnosed")
     for file, recording in machine.read_all(files, joined):
-        others = [other for path, other in known if path.resolve() != file.resolve()]
+        healthy = [other for path, other in known if path.resolve() != file.resolve()]
         if recording is None:
             yield None
-        elif baseline and not others:
+        elif baseline and not healthy:
             opt.complain(f"no other baseline than the file itself could be read, so it is not diagnosed ({file})")
             yield None
         else:
-            diagnosis = opt.attempt(file, partial(machine.diagnose, recording, others, file, false_alarm))
+            diagnosis = opt.attempt(file, partial(machine.diagnose, recording, healthy, file, false_alarm))
             yield None if diagnosis is None else (recording, diagnosis)
 
 
-def _dated(files: Sequence[Path], **options: Any) -> Iterator[Dated | None]:
+def _date_diagnoses(files: Sequence[Path], **options: Any) -> Iterator[Dated | None]:
     """Yield when each recording began [s since 1970] and its diagnosis; None and `options` as of `_diagnoses`."""
     for result in _diagnoses(files, **options):
         yield None if result is None else (_began(result), result[1])
 
 
-def _began(own: Judged) -> float | None:
+def _began(result: Judged) -> float | None:
     """Return when a recording of a file began [s since 1970], None of standard input without a date."""
     from sealscope.recordings.joining import file_seconds, start_seconds
 
-    recording, path = own[0], Path(own[1].file)
+    recording, path = result[0], Path(result[1].file)
     return file_seconds(recording, path) if path.is_file() else start_seconds(recording, path.name)
 
 
-def _aside(
+def _collect_messages(
     work: Callable[[Sequence[Path]], Iterator[Dated | None]], files: Sequence[Path]
 ) -> tuple[str, list[Dated | None]]:
-    """Return what the work says on standard error, and its results."""
+    """Run the work. Return its messages on standard error, and its results."""
     with redirect_stderr(StringIO()) as complaints:
         dated = list(work(files))
     return complaints.getvalue(), dated
@@ -301,8 +301,8 @@ def inspect(
             continue
         opt.say(overview_text(str(file), recording, inspected(recording)))
         if by_names(saved):  # a recording of our own states the columns of the file that it was made from
-            own = recording.provenance.get("file") == file.name
-            saved = {**map_taken(recording.provenance), **stated_columns(saved)} if own else {}
+            same_file = recording.provenance.get("file") == file.name
+            saved = {**map_taken(recording.provenance), **stated_columns(saved)} if same_file else {}
     if not complete:
         raise Exit(1)
     if save_map and rig is not None and not by_names(saved):

@@ -51,11 +51,11 @@ def reproduce(
     require_drawing()
     opt.say_jobs(jobs)
     with opt.counted_progress("items") as update:
-        made = build(
+        built = build(
             ids, output, quick=quick, jobs=jobs, sheet=sheet, publish=publish,
             progress=lambda ended, total, in_work: update(ended, total, ", ".join(in_work)),
         )  # fmt: skip
-    statuses = list(made.values())
+    statuses = list(built.values())
     page = write_thesis_page(output, statuses, quick=quick, sheet=find_sheet(sheet) is not None)
     for status in statuses:
         if status.state == "failed":
@@ -74,10 +74,10 @@ def _list(patterns: Sequence[str], sheet: Path | None) -> None:
     from sealscope.thesis.engine.items import collect, select_items
     from sealscope.thesis.sheet import MISSING, find_sheet
 
-    given = find_sheet(sheet) is not None
+    has_sheet = find_sheet(sheet) is not None
     items = select_items(collect(), patterns)
     width = max(len(item.id) for item in items)
     for item in items:
         head = f"{item.id:<{width}}  {item.kind:<6}  "
-        note = f" ({MISSING})" if item.needs_sheet and not given else ""
+        note = f" ({MISSING})" if item.needs_sheet and not has_sheet else ""
         opt.say_wrapped(f"{item.title}{note}", head)

@@ -63,14 +63,14 @@ def new(
         areas = piston_areas(*diameters, both=double_rod)
     else:
         sides = (area_A, "Piston area on side A", "--area-A"), (area_B, "... on side B", "--area-B")
-        areas = tuple(_si(text or _asked(what, _MM2), "m^2", _MM2, option) for text, what, option in sides)  # type: ignore[assignment]
-    length = _si(stroke or _asked("Stroke", _MM), "m", _MM, "--stroke")
+        areas = tuple(_si(text or _ask_size(what, _MM2), "m^2", _MM2, option) for text, what, option in sides)  # type: ignore[assignment]
+    length = _si(stroke or _ask_size("Stroke", _MM), "m", _MM, "--stroke")
     if kind == "pump":
-        volume = displacement or _asked("Displacement of the pump", _CM3)
+        volume = displacement or _ask_size("Displacement of the pump", _CM3)
         text = rig_text(name, *areas, length, _si(volume, "m^3/rev", _CM3, "--displacement"))
     else:
-        flow = _si(valve or _asked("Rated flow of the valve", "L/min"), "m^3/s", "L/min", "--valve")
-        pressures = (None if own is None else _si(own, "Pa", "bar", option) for own, option in (
+        flow = _si(valve or _ask_size("Rated flow of the valve", "L/min"), "m^3/s", "L/min", "--valve")
+        pressures = (None if pressure is None else _si(pressure, "Pa", "bar", option) for pressure, option in (
             (drop, "--drop"), (supply, "--supply")))  # fmt: skip
         text = valve_rig_text(name, *areas, length, flow, *pressures)
     path = output or Path(f"{name}.toml")
@@ -84,7 +84,7 @@ def new(
     echo(f"replace what is assumed (grep 'assumed:' {path}), then:\nsealscope simulate --rig {path} -o run.nc")
 
 
-def _asked(what: str, unit: str) -> str:
+def _ask_size(what: str, unit: str) -> str:
     """Ask for a size at the terminal."""
     return str(prompt(f"{what} [{unit}]"))
 
@@ -112,11 +112,11 @@ def print_margins(
     from sealscope.units import parse_quantity
 
     loaded, force = load_rig(rig), parse_quantity(load, "N", name="--load")
-    made = controller_named(controller, loaded)
-    echo(f"{loaded.name}, {controller}, {made.rate:g} Hz, late by {made.delay} samples, load {force:g} N")
+    control = controller_named(controller, loaded)
+    echo(f"{loaded.name}, {controller}, {control.rate:g} Hz, late by {control.delay} samples, load {force:g} N")
     echo("speed [m/s]  gain [dB]  phase [deg]  crossover [Hz]  delay [ms]  peak 1/|1+L|")
     for speed in (0.0, 0.01, 0.02, 0.05):
-        m = margins(loaded, made, speed, force)
+        m = margins(loaded, control, speed, force)
         gain = "inf" if math.isinf(m.gain) else f"{20 * math.log10(m.gain):.1f}"
         figures = f"{math.degrees(m.phase):11.0f}  {m.crossover:14.2f}  {1e3 * m.delay:10.1f}  {m.peak:12.2f}"
         echo(f"{speed:11g}  {gain:>9}  {figures}" + ("" if m.damped else "\n  the rig alone is not damped here"))

@@ -29,7 +29,7 @@ from sealscope.diagnosis.verdict.states import LEAKING, MachineState, state_of
 from sealscope.errors import InputError
 from sealscope.monitor.alarms import Alarm, AlarmJudge
 from sealscope.monitor.database.machine_files import pass_on
-from sealscope.monitor.database.store import KEPT_IDENTITIES, MonitorStore, StoredRows, away
+from sealscope.monitor.database.store import KEPT_IDENTITIES, MonitorStore, StoredRows, outage_reason
 from sealscope.monitor.settings import ActuatorSettings, WatchSettings
 from sealscope.monitor.sources.source_block import SourceBlock, bytes_of
 from sealscope.monitor.supervisor import Supervisor
@@ -48,7 +48,7 @@ _KEPT_S = 120.0
 
 @dataclass
 class _Actuator:
-    """What is in memory of an actuator.
+    """The state of an actuator in memory.
 
     `pending`, `bytes`: blocks since the checkpoint; `taken`: blocks so far; `judged_s`: end of the last block that was
     judged [s]; `last`: the last estimate, of flows over the cycles seen; `kept`: the last samples while there is an
@@ -67,10 +67,10 @@ class _Actuator:
     judged_s: float | None = None
     kept: list[Recording] = field(default_factory=list)
 
-    def judged(
+    def judge_samples(
         self, samples: Recording, follows: bool, settings: WatchSettings
     ) -> tuple[list[BlockEstimate], list[tuple[Alarm, str, float]]]:
-        """Return the estimates of samples, and what happened to alarms: the same whenever it is gone through."""
+        """Judge samples: return their estimates and the events of alarms. A replay gives the same."""
         estimates, happened = [], []
         self.pending += 1
         self.bytes += bytes_of(samples)
@@ -87,8 +87,8 @@ class _Actuator:
                 self.judged_s = estimate.t
             if change is not None:
                 happened.append((*change, estimate.t))
-        alike = self.kept and (self.kept[0].units, self.kept[0].rate) == (samples.units, samples.rate)
-        if self.judge.alarm is None or not (follows and alike):
+        same_format = self.kept and (self.kept[0].units, self.kept[0].rate) == (samples.units, samples.rate)
+        if self.judge.alarm is None or not (follows and same_format):
             self.kept = []
         if self.judge.alarm is not None and len(samples):
             most = round(_KEPT_S * samples.rate)
@@ -98,7 +98,7 @@ class _Actuator:
         return estimates, happened
 
     def state(self) -> dict[str, Any]:
-        """Return all that a checkpoint keeps, as plain values."""
+        """Return the state for a checkpoint as plain values."""
         return saved(self, ("watch", "judge", "last", "oil_celsius", "judged_s"))
 
     def _machine_state(self) -> MachineState:
@@ -115,7 +115,7 @@ class _Actuator:
         return state_of("watched", since_s=max(baseline.learned_s, over or -math.inf))
 
     def summary(self) -> dict[str, Any]:
-        """Return what it shows now, as plain values."""
+        """Return the present summary as plain values."""
         base, alarm = self.watch.baseline, self.judge.alarm
         last = self.last or BlockEstimate(0, math.nan, "waits for samples")
         return {
@@ -146,9 +146,9 @@ def _settings_of(stored: str) -> WatchSettings | None:
 
 
 def _learned_alike(stored: Watch, fresh: Watch) -> bool:
-    """Return whether a stored watch learned with what a fresh one would, or with a displacement measured since."""
-    (rig, *rest), (before, *others) = fresh.learned_with, stored.learned_with
-    return rest == others and (rig == before or is_remeasured(rig, before))
+    """Test whether a stored watch learned under the conditions of a fresh one, up to a remeasured displacement."""
+    (rig, *rest), (before, *other_conditions) = fresh.learned_with, stored.learned_with
+    return rest == other_conditions and (rig == before or is_remeasured(rig, before))
 
 
 class _Repeated(Exception):  # noqa: N818 (says what happened)
@@ -164,30 +164,32 @@ class WatchedActuators:
         self._keep_s = keep_days * 86_400.0
         self._counters, self._counting = Counter[str](), threading.Lock()
         self._changes, self.changed, self.closed = itertools.count(1), 0, False
-        self.supervisor = Supervisor(away, self._tell)
+        self.supervisor = Supervisor(outage_reason, self._tell)
         self._lock = threading.RLock()
-        self._actuators = {name: self._restored(self.settings[name]) for name in self.settings}
+        self._actuators = {name: self._restore(self.settings[name]) for name in self.settings}
 
-    def _restored(self, settings: ActuatorSettings) -> _Actuator:
-        """Return an actuator as its last transaction left it, or begun anew where it is new or the settings changed."""
+    def _restore(self, settings: ActuatorSettings) -> _Actuator:
+        """Restore an actuator from its last transaction, or begin anew if it is new or its settings changed."""
         name, rate = settings.name, settings.false_alarms_per_1000_h
-        state, taken = self.store.checkpoint(name), self.store.last_number(self.store.tables.blocks, name)
+        state, block_count = self.store.checkpoint(name), self.store.last_number(self.store.tables.blocks, name)
         fresh = watch(load_watched(settings.rig).rig, false_alarms_per_1000_h=rate, learn_hours=settings.learn_hours)
-        actuator, anew = _Actuator(settings, fresh, AlarmJudge(name), taken=taken), True
+        actuator, anew = _Actuator(settings, fresh, AlarmJudge(name), taken=block_count), True
         if state is not None:
-            stored, own, pending = state
+            stored, checkpoint, pending = state
             before = _settings_of(stored)
-            actuator.judge = restored(AlarmJudge, own["judge"], "alarm")
-            if (version := part_of(own["watch"], "version", int)) != STATE_VERSION:
+            actuator.judge = restored(AlarmJudge, checkpoint["judge"], "alarm")
+            if (version := part_of(checkpoint["watch"], "version", int)) != STATE_VERSION:
                 _log.warning("%s: its state has version %s, not %d, begins anew", name, version, STATE_VERSION)
-                learned = part_of(own["watch"], "baseline_version", int)
+                learned = part_of(checkpoint["watch"], "baseline_version", int)
                 fresh.continue_from(self.store.last_number(self.store.tables.estimates, name), learned)
             else:
-                actuator.watch = Watch.from_state(own["watch"])
-                actuator.last = None if own["last"] is None else restored(BlockEstimate, own["last"], "last")
-                actuator.oil_celsius, actuator.judged_s = own.get("oil_celsius"), own.get("judged_s")
+                actuator.watch = Watch.from_state(checkpoint["watch"])
+                actuator.last = (
+                    None if checkpoint["last"] is None else restored(BlockEstimate, checkpoint["last"], "last")
+                )
+                actuator.oil_celsius, actuator.judged_s = checkpoint.get("oil_celsius"), checkpoint.get("judged_s")
                 for samples, follows in pending:  # as they were judged before
-                    actuator.judged(samples, follows, before or settings)
+                    actuator.judge_samples(samples, follows, before or settings)
                 anew = before != settings.watched_with
                 actuator.watch.false_alarms_per_1000_h = rate  # with the same baseline
                 if not _learned_alike(actuator.watch, fresh):
@@ -235,11 +237,11 @@ class WatchedActuators:
         fresh = [block for block in blocks if new[block.actuator, block.identity] is block]
         try:
             try:
-                self._stored(fresh)
+                self._store_new(fresh)
             except _Repeated:
-                known = self.store.known(new)
+                known = self.store.select_stored(new)
                 fresh = [block for block in fresh if (block.actuator, block.identity) not in known]
-                self._stored(fresh)
+                self._store_new(fresh)
         except BaseException:
             # what the detectors took is not stored: the next blocks begin at the last transaction
             for name in {block.actuator for block in blocks}:
@@ -248,7 +250,7 @@ class WatchedActuators:
         self.count("blocks stored already", len(blocks) - len(fresh))
         self._tell()
 
-    def _stored(self, blocks: Sequence[SourceBlock]) -> None:
+    def _store_new(self, blocks: Sequence[SourceBlock]) -> None:
         """Take blocks in one transaction.
 
         Raises _Repeated, and no detector has taken anything, where one of the blocks is stored already.
@@ -266,18 +268,18 @@ class WatchedActuators:
             for block, actuator in mine:
                 actuator.taken += 1
                 if block.samples is not None:
-                    self._taken(rows, actuator, block.samples, block.follows)
+                    self._add_samples(rows, actuator, block.samples, block.follows)
             self.store.keep_rows(connection, rows)
 
     def _actuator(self, name: str) -> _Actuator:
         if name not in self._actuators:
-            self._actuators[name] = self._restored(self.settings[name])
+            self._actuators[name] = self._restore(self.settings[name])
         return self._actuators[name]
 
-    def _taken(self, rows: StoredRows, actuator: _Actuator, samples: Recording, follows: bool) -> None:
-        """Add to the rows what samples make of an actuator."""
+    def _add_samples(self, rows: StoredRows, actuator: _Actuator, samples: Recording, follows: bool) -> None:
+        """Judge samples of an actuator, and add the results to the rows."""
         name = actuator.settings.name
-        estimates, happened = actuator.judged(samples, follows, actuator.settings)
+        estimates, happened = actuator.judge_samples(samples, follows, actuator.settings)
         rows.add_estimates(name, estimates, actuator.oil_celsius)
         for alarm, kind, t in happened:
             rows.add_alarm(alarm, kind, t)
@@ -299,7 +301,7 @@ class WatchedActuators:
 
     @staticmethod
     def _show(actuator: _Actuator, rows: StoredRows) -> None:
-        """Add what an actuator shows to the rows, where it has changed."""
+        """Add the summary of an actuator to the rows if it has changed."""
         summary = actuator.summary()
         if summary != actuator.shown:
             actuator.shown = summary
@@ -322,15 +324,15 @@ class WatchedActuators:
             if name not in self.settings:
                 raise InputError(f"the settings must have the actuator {name[:60]!r}, got none")
             actuator, rows = self._actuator(name), StoredRows()
-            at = getattr(actuator.last, "t", getattr(actuator.judge.alarm, "updated_s", 0.0))
+            t = getattr(actuator.last, "t", getattr(actuator.judge.alarm, "updated_s", 0.0))
             kept = list(actuator.kept)
-            alarm = actuator.judge.marked(mark, at, until=at + hours * 3600.0, reason=text)
+            alarm = actuator.judge.marked(mark, t, until=t + hours * 3600.0, reason=text)
             try:
                 if mark == "invalid":
                     actuator.watch.dismiss()
                 elif mark == "repaired":
                     actuator.watch.relearn()
-                rows.add_alarm(alarm, mark, at, by_whom, text)
+                rows.add_alarm(alarm, mark, t, by_whom, text)
                 self._checkpoint(actuator, rows)
                 self.store.keep(rows)
             except BaseException:  # the next one begins at the last transaction
@@ -338,7 +340,7 @@ class WatchedActuators:
                 raise
         if done := pass_on(self.settings[name].rig, alarm, mark, kept):  # takes a second, and holds nothing up
             rows = StoredRows()
-            rows.add_alarm(alarm, "comment", at, "Sealscope", done)
+            rows.add_alarm(alarm, "comment", t, "Sealscope", done)
             rows.alarms.clear()  # it may have changed meanwhile
             self.store.keep(rows)
         self._tell()
@@ -350,7 +352,7 @@ class WatchedActuators:
         return sum(settings.false_alarms_per_1000_h for settings in self.settings.values())
 
     def plain(self) -> dict[str, dict[str, Any]]:
-        """Return what each actuator of the settings shows now, as its last transaction left it.
+        """Return the present summary of each actuator of the settings, as its last transaction left it.
 
         Where nothing has come for `no_data_s` and no alarm lasts, its state says so.
         """
@@ -358,11 +360,11 @@ class WatchedActuators:
         shown = {}
         for name, settings in self.settings.items():
             if name in known:
-                summary, own = known[name], known[name].get("state")
+                summary, state = known[name], known[name].get("state")
                 silent = now - self._heard[name] > settings.no_data_s
-                if own is None or (silent and own["condition"] not in LEAKING):
-                    own = state_of("no data", since_s=summary["t"]).as_dict()
-                shown[name] = {**summary, "state": own}
+                if state is None or (silent and state["condition"] not in LEAKING):
+                    state = state_of("no data", since_s=summary["t"]).as_dict()
+                shown[name] = {**summary, "state": state}
         return shown
 
     def _tell(self) -> None:

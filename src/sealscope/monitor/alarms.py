@@ -64,22 +64,22 @@ class Alarm:
 
     @property
     def over(self) -> bool:
-        """Whether nothing is left to do about it."""
+        """Test whether the alarm is closed or invalid, with nothing left to do."""
         return self.state in ("invalid", "closed")
 
     @property
     def active(self) -> bool:
-        """Whether its cause lasts."""
+        """Test whether the cause of the alarm lasts."""
         return self.returned_s is None and not self.over
 
     @property
     def shelved(self) -> bool:
-        """Whether it is not to be announced, as of its last change."""
+        """Test whether the alarm was shelved at its last change, and so not to be announced."""
         return self.shelved_until_s > self.updated_s
 
     @property
     def condition(self) -> str:
-        """Condition of the states of NE 107 that it is."""
+        """The condition of the alarm in the states of NE 107."""
         return _CONDITIONS[self.level] if self.active else "watched"
 
     @property
@@ -89,10 +89,15 @@ class Alarm:
         return level | (NEW_BIT if self.state == "new" and not self.shelved else 0)
 
     def plain(self) -> dict[str, Any]:
-        """Return it as plain values, with what follows from its fields."""
-        own = state_of(self.condition, self.cause if self.active else None, since_s=self.onset_s)
+        """Return the fields as plain values, with the machine state and diagnostic number derived from them."""
+        machine_state = state_of(self.condition, self.cause if self.active else None, since_s=self.onset_s)
         number = DIAGNOSTIC_NUMBERS[self.level]
-        return {**vars(self), "diagnostic_number": number, "shelved": self.shelved, "machine_state": own.as_dict()}
+        return {
+            **vars(self),
+            "diagnostic_number": number,
+            "shelved": self.shelved,
+            "machine_state": machine_state.as_dict(),
+        }
 
 
 @dataclass
@@ -172,16 +177,16 @@ class AlarmJudge:
         if leak is not None:
             leak_lpm, interval = estimate.leak_lpm, estimate.leak_interval_lpm
             now = replace(now, leak_lpm=leak_lpm, leak_interval_lpm=interval, by_chance_per_1000_h=by_chance)
-        return self._kept(now), happened
+        return self._keep(now), happened
 
-    def _kept(self, alarm: Alarm) -> Alarm:
+    def _keep(self, alarm: Alarm) -> Alarm:
         if not alarm.active:
             self.over_s = alarm.updated_s
         self.alarm = None if alarm.over else alarm
         return alarm
 
-    def marked(self, mark: str, at: float, *, until: float = 0.0, reason: str = "") -> Alarm:
-        """Return the alarm after a person's word, one of `MARKS`, at clock `at` [s].
+    def marked(self, mark: str, t: float, *, until: float = 0.0, reason: str = "") -> Alarm:
+        """Return the alarm after a person's word, one of `MARKS`, at clock `t` [s].
 
         `until`: clock until which it is shelved [s]; `reason`: why it is invalid. Raises InputError where there is no
         alarm, it is so marked already, or an invalid one has no reason.
@@ -206,10 +211,10 @@ class AlarmJudge:
             "acknowledged": {"state": last if alarm.active else "closed"},
         }
         self.above = self.error = self.below = 0
-        return self._kept(replace(alarm, updated_s=at, **by_mark[mark]))
+        return self._keep(replace(alarm, updated_s=t, **by_mark[mark]))
 
     def state(self) -> dict[str, Any]:
-        """Return all of it as plain values, for `restored`."""
+        """Return the fields as plain values for `restored`."""
         return saved(self, vars(self))
 
 

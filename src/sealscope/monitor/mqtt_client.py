@@ -70,7 +70,7 @@ class MqttLink:
         self.is_open = True
 
     def check(self) -> None:
-        """Raise RuntimeError, and close, where the thread has ended, as after a packet that paho takes for none."""
+        """Close and raise RuntimeError if the thread has ended, for example after a malformed packet."""
         if getattr(self.client, "_thread", self) is None:  # there is no public way to ask
             self.close()
             raise RuntimeError("the thread of the connection to the broker has ended")
@@ -85,7 +85,7 @@ class MqttLink:
         return bool(message.is_published())
 
     def close(self) -> None:
-        """Say what the will says, and disconnect."""
+        """Publish the last will, and disconnect."""
         if self.is_open:
             self.is_open = False
             if self._last_will is not None and self.client.is_connected():

@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from sealscope.errors import InputError
 from sealscope.monitor.actuators import DROPPED, WatchedActuators
-from sealscope.monitor.database.store import MonitorStore, away
+from sealscope.monitor.database.store import MonitorStore, outage_reason
 from sealscope.monitor.outputs.events import EventLines, Webhook
 from sealscope.monitor.outputs.sparkplug_node import SparkplugNode
 from sealscope.monitor.page.live import LiveSamples
@@ -83,8 +83,8 @@ class Service:
             watched = settings.actuator, self.store, settings.keep_days
             with threadpool_limits(limits=1):  # as in `run`: sums in another order end in other digits
                 self.actuators = WatchedActuators(*watched)
-            own = self.actuators
-            self.supervisor, self.count, self.plain = own.supervisor, own.count, own.plain
+            actuators = self.actuators
+            self.supervisor, self.count, self.plain = actuators.supervisor, actuators.count, actuators.plain
             self.stopping, self._database = self.supervisor.stopping, self.supervisor.part(DATABASE)
             self._live = LiveSamples(self.store.last_samples)
             self._lines = EventLines(self.store, stdout or sys.stdout)
@@ -109,15 +109,15 @@ class Service:
         if self._queue.put(block, block.bytes):
             return
         self._waits += 1
-        began, said = time.monotonic(), False
+        began, logged = time.monotonic(), False
         while not self.stopping.is_set() and not self._queue.put(block, block.bytes, 0.5):
-            if not said and time.monotonic() - began > _LONG_WAIT_S:
-                said = True
+            if not logged and time.monotonic() - began > _LONG_WAIT_S:
+                logged = True
                 blocks, waiting, _ = self.waits()
                 _log.warning("a source waits: %d blocks are to be stored, %.1f MB", blocks, waiting / 1e6)
 
     def waits(self) -> tuple[int, int, int]:
-        """Return how many blocks are not stored yet, their bytes, and how often a source had to wait for them."""
+        """Count the blocks not stored yet, their bytes, and the waits of sources for them."""
         at_hand = [*self._at_hand]
         blocks, size = self._queue.waiting()
         return blocks + len(at_hand), size + sum(block.bytes for block in at_hand if block is not None), self._waits
@@ -180,7 +180,7 @@ class Service:
         return threads
 
     def _store_next(self) -> None:
-        """Store what comes next; what raises an error is still at hand then."""
+        """Store the next blocks; after an error they are still at hand."""
         if not self._at_hand:
             self._at_hand = self._queue.take(_TOGETHER, 0.2)
             if 0 < len(self._at_hand) < _TOGETHER and None not in self._at_hand:
@@ -211,7 +211,7 @@ class Service:
         try:
             write(blocks)
         except Exception as error:
-            if away(error) is not None:
+            if outage_reason(error) is not None:
                 self.count("waits for the database")
                 self._blocked = True
                 raise
@@ -224,7 +224,7 @@ class Service:
                 _log.exception("a block is dropped: %s", str(getattr(blocks[0], "actuator", blocks[0]))[:60])
         else:
             self._blocked = False
-            self._database.back()
+            self._database.end_outage()
         stored = set(map(id, blocks))
         self._at_hand = [block for block in self._at_hand if id(block) not in stored]
         for block in blocks:
@@ -233,9 +233,9 @@ class Service:
     def _pass_on(self) -> None:
         self._lines.pass_on()
         if not self._blocked:  # what can be read may still refuse to be written
-            self._database.back()
+            self._database.end_outage()
 
 
 def _worth_a_line(number: int) -> bool:
-    """Return whether the log gets a line about the same trouble for this time: the first ones, then powers of two."""
+    """Test whether repeat `number` of a trouble is logged: the first ones, then powers of two."""
     return number <= _FIRST_LINES or number & (number - 1) == 0

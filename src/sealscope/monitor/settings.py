@@ -49,7 +49,7 @@ class WatchSettings(_Part):
 
     @property
     def watched_with(self) -> WatchSettings:
-        """How it is watched, alone."""
+        """The settings of the watch, without name and source."""
         return WatchSettings(**{name: getattr(self, name) for name in WatchSettings.model_fields})
 
 
@@ -194,20 +194,22 @@ class MonitorSettings(_Part):
                     raise ValueError(f"{rule}, got {value!r}" + (" twice" if count > 1 else ""))
         if (topics or paths or self.sparkplug is not None) and mqtt is None:
             raise ValueError("an actuator with a topic, or Sparkplug B, needs the table [mqtt]")
-        for each in actuators:
-            if each.nodes and (self.opcua is None or each.rate is None):
-                raise ValueError(f"an actuator with nodes needs the table [opcua] and its rate, got {each.name!r}")
-            for channel in {**each.nodes, **each.units} if each.nodes else ():
+        for watched in actuators:
+            if watched.nodes and (self.opcua is None or watched.rate is None):
+                raise ValueError(f"an actuator with nodes needs the table [opcua] and its rate, got {watched.name!r}")
+            for channel in {**watched.nodes, **watched.units} if watched.nodes else ():
                 if channel not in CHANNELS:
                     raise ValueError(f"nodes must be of {', '.join(CHANNELS)}, got {channel[:40]!r}")
-            ways = ways_to_watch(load_watched(each.rig).rig) if each.nodes else ()
-            if each.nodes and not any(each.nodes.keys() >= {*way} for way in ways):
-                raise ValueError(f"nodes of {each.name!r} must give {in_words(ways)}, got {', '.join(each.nodes)}")
+            ways = ways_to_watch(load_watched(watched.rig).rig) if watched.nodes else ()
+            if watched.nodes and not any(watched.nodes.keys() >= {*way} for way in ways):
+                raise ValueError(
+                    f"nodes of {watched.name!r} must give {in_words(ways)}, got {', '.join(watched.nodes)}"
+                )
         sends = self.sparkplug is not None or (mqtt is not None and mqtt.alarms_topic is not None)
         if sends and len({topic_part(actuator.name) for actuator in actuators}) < len(actuators):
             raise ValueError("actuators must have names that differ in more than the letters + # / as topics")
-        own = None if self.sparkplug is None else [self.sparkplug.group, self.sparkplug.node]
-        if any(path.split("/")[:2] == own for path in paths):
+        node_path = None if self.sparkplug is None else [self.sparkplug.group, self.sparkplug.node]
+        if any(path.split("/")[:2] == node_path for path in paths):
             raise ValueError("the node of the alarms must be none of the actuators' nodes")
         if page is not None and page.host not in ("127.0.0.1", "localhost", "::1") and page.token_file is None:
             raise ValueError(f"a page beyond this machine needs page.token_file, got host {page.host!r} without")

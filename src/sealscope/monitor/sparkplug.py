@@ -54,7 +54,7 @@ class SparkplugMetric:
     unit: str | None = None
 
     def typed(self, datatype: int) -> SparkplugMetric:
-        """Return it with the value that its field means as one of a type; None for types that are passed over."""
+        """Return the metric with its value converted from a data type; None for types without use here."""
         value = self.value
         if isinstance(value, bytes):
             kind = _ARRAYS.get(datatype)
@@ -75,7 +75,7 @@ class SparkplugPayload:
     metrics: tuple[SparkplugMetric, ...]
     seq: int | None = None
 
-    def named(self, name: str) -> SparkplugMetric | None:
+    def find_metric(self, name: str) -> SparkplugMetric | None:
         """Return the first metric of a name, None where there is none."""
         return next((metric for metric in self.metrics if metric.name == name), None)
 
@@ -127,7 +127,7 @@ def encoded(payload: SparkplugPayload) -> bytes:
 
 
 def decoded_payload(data: bytes) -> SparkplugPayload:
-    """Return the payload that bytes hold; raises ValueError of one line where they hold none.
+    """Decode a payload from bytes. Raise ValueError of one line if they hold none.
 
     A value stays as its field has it where the metric states no type: `SparkplugMetric.typed` gives it its meaning.
     """
@@ -138,7 +138,7 @@ def decoded_payload(data: bytes) -> SparkplugPayload:
         message.ParseFromString(data)
         if len(message.metrics) > _MOST_METRICS:
             raise ValueError(f"got {len(message.metrics)} metrics")
-        timestamp, seq = _stated(message, "timestamp", "seq")
+        timestamp, seq = _get_fields(message, "timestamp", "seq")
         if seq is not None and seq > 255:
             raise ValueError(f"seq must be 0 to 255, got {seq}")
         return SparkplugPayload(timestamp, tuple(map(_metric, message.metrics)), seq)
@@ -146,7 +146,7 @@ def decoded_payload(data: bytes) -> SparkplugPayload:
         raise ValueError(f"it must be a payload of Sparkplug B: {' '.join(str(error).split())[:80]}") from None
 
 
-def _stated(message: Any, *names: str) -> list[Any]:
+def _get_fields(message: Any, *names: str) -> list[Any]:
     return [getattr(message, name) if message.HasField(name) else None for name in names]
 
 
@@ -157,7 +157,7 @@ def _metric(entry: Any) -> SparkplugMetric:
         raise ValueError("a text must be UTF-8")  # damaged text is returned as bytes
     properties = zip(entry.properties.keys, entry.properties.values, strict=False)
     unit = next((str(value.string_value)[:40] for key, value in properties if key == _UNIT), None)
-    name, alias, timestamp = _stated(entry, "name", "alias", "timestamp")
+    name, alias, timestamp = _get_fields(entry, "name", "alias", "timestamp")
     metric = SparkplugMetric(name, value, 0, alias, timestamp, unit or None)
     return metric.typed(int(entry.datatype)) if entry.datatype else metric
 

@@ -31,11 +31,11 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 class PartAway(Exception):  # noqa: N818 (says what happened)
-    """What a part needs is not there, such as a folder: an outage with this reason, and nothing to trace."""
+    """A part lacks a thing it needs, such as a folder: an outage with this reason and no traceback."""
 
 
 class SupervisedPart:
-    """What a monitor runs, or needs and can be without: whether it is reached, and its pause after errors.
+    """A part that a monitor runs, or can do without for a time: its outages, and its pause after errors.
 
     Several threads may say how it is; one at a time attempts it. `since`: clock of its outage [s], None while it is
     reached; `count`, `seconds`: outages so far, and how long those that are over lasted.
@@ -48,8 +48,8 @@ class SupervisedPart:
         self._pause = self._due = 0.0
         self._lock = threading.Lock()
 
-    def lost(self, reason: object) -> None:
-        """State that it is not reached; the first reason of an outage is kept."""
+    def begin_outage(self, reason: object) -> None:
+        """Begin an outage, or continue it with its first reason."""
         with self._lock:
             if self.since is not None:
                 return
@@ -58,8 +58,8 @@ class SupervisedPart:
         _log.error("the %s is not reached: %s", self.name, self.reason)
         self._supervisor.changed()
 
-    def back(self) -> None:
-        """State that it is reached."""
+    def end_outage(self) -> None:
+        """End the outage, if there is one."""
         with self._lock:
             self._pause = 0.0
             if self.since is None:
@@ -71,12 +71,12 @@ class SupervisedPart:
 
     @property
     def lasting_s(self) -> float:
-        """How long its present outage lasts [s]."""
+        """The length of the present outage so far [s]."""
         return 0.0 if self.since is None else time.monotonic() - self._began
 
     @property
     def pause_s(self) -> float:
-        """How long it still pauses [s]."""
+        """The rest of the pause [s]."""
         return max(0.0, self._due - time.monotonic())
 
     def attempt(self, work: Callable[[], object], *, at_once: bool = False) -> bool:
@@ -88,33 +88,33 @@ class SupervisedPart:
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # a panic of an extension in Rust and an exit of uvicorn are no Exception
-            reason = self._supervisor.away(error)
+            reason = self._supervisor.outage_reason(error)
             longest = LONGEST_PAUSE_S if reason is None else DATABASE_PAUSE_S
             self._pause = min(max(2.0 * self._pause, FIRST_PAUSE_S), longest)
             self._due = time.monotonic() + self._pause
             if reason is not None:
-                self._supervisor.part(DATABASE).lost(reason)
+                self._supervisor.part(DATABASE).begin_outage(reason)
             else:
-                self.lost(error if isinstance(error, PartAway) else place_of(error))
+                self.begin_outage(error if isinstance(error, PartAway) else place_of(error))
                 _log.debug("the %s raised an error", self.name, exc_info=error)
             return False
-        self.back()
+        self.end_outage()
         return True
 
 
 class Supervisor:
     """The parts of a monitor; those that run in threads of their own do so until `stopping` is set.
 
-    `away`: returns of an error why the database does not answer, None for one of another kind; `changed`: called when
+    `outage_reason`: why the database does not answer, None for another error; `changed`: called when
     an outage begins or ends.
     """
 
     def __init__(
         self,
-        away: Callable[[BaseException], str | None] = lambda error: None,
+        outage_reason: Callable[[BaseException], str | None] = lambda error: None,
         changed: Callable[[], None] = lambda: None,
     ) -> None:
-        self.away, self.changed, self.stopping = away, changed, threading.Event()
+        self.outage_reason, self.changed, self.stopping = outage_reason, changed, threading.Event()
         self._parts: dict[str, SupervisedPart] = {}
         self._lock = threading.Lock()
 
@@ -128,11 +128,16 @@ class Supervisor:
     def outages(self) -> list[dict[str, Any]]:
         """Return the outages that last: part, clock of its begin [s] and reason."""
         known = [*self._parts.values()]
-        return [{"part": of.name, "since": of.since, "reason": of.reason} for of in known if of.since is not None]
+        return [
+            {"part": part.name, "since": part.since, "reason": part.reason} for part in known if part.since is not None
+        ]
 
     def totals(self) -> dict[str, tuple[bool, int, float]]:
-        """Return of each part whether it is reached, how many outages it had and how long they lasted [s]."""
-        return {of.name: (of.since is None, of.count, of.seconds + of.lasting_s) for of in [*self._parts.values()]}
+        """Return the availability, the number of outages and their total length [s] of each part."""
+        return {
+            part.name: (part.since is None, part.count, part.seconds + part.lasting_s)
+            for part in [*self._parts.values()]
+        }
 
     def start(
         self, name: str, work: Callable[[], object], *, again: bool = True, ended: Callable[[], object] = lambda: None
@@ -144,7 +149,7 @@ class Supervisor:
         part = self.part(name)
 
         def lasting() -> None:
-            timer = threading.Timer(_WORKING_S, part.back)
+            timer = threading.Timer(_WORKING_S, part.end_outage)
             timer.daemon = True
             timer.start()
             try:
@@ -157,7 +162,7 @@ class Supervisor:
                 pass
             ended()
 
-        return _started(attempts, name)
+        return _start_thread(attempts, name)
 
     def repeat(
         self, name: str, step: Callable[[], object], every_s: float, *, last: Callable[[], object] | None = None
@@ -171,7 +176,7 @@ class Supervisor:
             if last is not None:
                 part.attempt(last, at_once=True)
 
-        return _started(attempts, name)
+        return _start_thread(attempts, name)
 
 
 class LimitedLines(logging.Filter):
@@ -185,7 +190,7 @@ class LimitedLines(logging.Filter):
         self._places: dict[tuple[str, str, int], tuple[float, int]] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return whether a record is one of the first of its place in this minute."""
+        """Test whether a record is one of the first of its place in this minute."""
         place = (record.name, record.pathname, record.lineno)
         now, most = time.monotonic(), _OWN_LINES if record.name.startswith("sealscope") else _LIBRARY_LINES
         began, count = self._places.get(place, (now, 0))
@@ -202,7 +207,7 @@ class LimitedLines(logging.Filter):
 
 
 def place_of(error: BaseException) -> str:
-    """Return in one line what an error is, and the last place of this package that it passed."""
+    """Describe in one line an error and the last place of this package on its way."""
     kind = "".join(traceback.format_exception_only(error)[-1:]).strip()
     where, step = "", error.__traceback__
     while isinstance(step, TracebackType):
@@ -213,7 +218,7 @@ def place_of(error: BaseException) -> str:
     return f"{' '.join(kind.split())[:120]}{where}"
 
 
-def _started(work: Callable[[], None], name: str) -> threading.Thread:
+def _start_thread(work: Callable[[], None], name: str) -> threading.Thread:
     thread = threading.Thread(target=work, name=name, daemon=True)
     thread.start()
     return thread

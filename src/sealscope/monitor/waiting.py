@@ -45,10 +45,10 @@ class Waiting(Generic[_Item]):
             return True
 
     def take(self, most: int, timeout: float) -> list[_Item]:
-        """Return the next things, at most so many: what is there, or what comes first within `timeout` [s]."""
+        """Remove and return up to `most` items: those present, or the first to come within `timeout` [s]."""
         with self._changed:
             self._changed.wait_for(lambda: bool(self._items), timeout)
-            taken = [self._items.popleft() for _ in range(min(most, len(self._items)))]
-            self._bytes -= sum(size for _, size in taken)
+            items = [self._items.popleft() for _ in range(min(most, len(self._items)))]
+            self._bytes -= sum(size for _, size in items)
             self._changed.notify_all()
-            return [item for item, _ in taken]
+            return [item for item, _ in items]

@@ -79,19 +79,19 @@ class Chart(NamedTuple):
 
     @property
     def level_text(self) -> str:
-        """What the level is, in the key of the chart; it says so where the level lies above the frame."""
+        """The level in the key of the chart, with a remark if it lies above the frame."""
         above = self.level is not None and self.limits is not None and self.level > self.limits[1]
         return f"repair limit, {self.level:.2g} {self.unit}" + (", above the frame" if above else "")
 
     @property
-    def cut(self) -> bool:
-        """Whether values lie beyond the limits."""
+    def is_cut(self) -> bool:
+        """Test whether any values lie beyond the limits."""
         low, high = self.limits or (-np.inf, np.inf)
         return any(bool(np.any((line.values < low) | (line.values > high))) for line in self.lines)
 
 
 def shown_values(recording: Recording, name: str, pressure_unit: str) -> tuple[str, Array]:
-    """Return the unit in which a channel is shown and its values (n,) in it; a temperature is in that of its log."""
+    """Return the display unit of a channel and its values (n,) in it; a temperature keeps the unit of its log."""
     if recording.units[name] == "K":
         unit = recording.unit_in_log(name) or "degC"
         return unit, from_si(recording[name], unit, "K")
@@ -100,7 +100,7 @@ def shown_values(recording: Recording, name: str, pressure_unit: str) -> tuple[s
 
 
 def shown_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tuple[str, float]:
-    """Return the unit in which a channel is shown, and how many of the channel's own units it holds.
+    """Return the display unit of a channel and its size in the channel's own unit.
 
     Raises InputError for an unknown pressure unit.
     """
@@ -120,7 +120,7 @@ def detail_unit(unit: str, name: str, pressure_unit: str) -> tuple[str, float]:
 
 
 def label_of(name: str) -> str:
-    """Return a detail's name as it is shown."""
+    """Return the displayed name of a detail."""
     return "d3·d4" if name == PRODUCT else name
 
 
@@ -152,18 +152,18 @@ _CHANNELS = (
 def rms_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
     """Return the charts of the windowed RMS: d1..d4 of each chamber, then d3d4 of each."""
     charts = []
-    for names, of, key, height in (
+    for names, quantity, key, height in (
         (QUANTITIES[:-1], "the details", "", 230),
         ((PRODUCT,), label_of(PRODUCT), "-d3d4", 150),
     ):
         for chamber in chambers:
             if not chamber.window_t.size:
                 continue
-            own = chamber.channel
+            channel = chamber.channel
             unit, size = detail_unit(chamber.unit, names[0], pressure_unit)
             lines = tuple(ChartLine(label_of(name), name, chamber.window_rms[name] / size) for name in names)
-            title = f"RMS of {of} of {own}"
-            charts.append(Chart(f"rms-{own}{key}", "rms", title, unit, lines, f"windows-{own}", height))
+            title = f"RMS of {quantity} of {channel}"
+            charts.append(Chart(f"rms-{channel}{key}", "rms", title, unit, lines, f"windows-{channel}", height))
     return charts
 
 
@@ -282,7 +282,7 @@ def draw(
 
 
 def _drawable(values: Array) -> Array:
-    """Return values with those beyond +-1e100 there, so that no scale overflows."""
+    """Clip values to +-1e100, so that no scale overflows."""
     return np.where(np.isfinite(values), np.clip(values, -_LARGEST, _LARGEST), values)
 
 
@@ -326,6 +326,6 @@ def still_chart(
         picture.area("interval", t, *lines[1:3])
     if chart.level is not None and chart.level <= high:
         picture.level("level", chart.level)
-    for own, line in zip(chart.lines[: 1 if chart.band else None], lines, strict=False):
-        picture.line(f"line {own.style}", t, line, own.label, digits=0)
+    for line_style, line in zip(chart.lines[: 1 if chart.band else None], lines, strict=False):
+        picture.line(f"line {line_style.style}", t, line, line_style.label, digits=0)
     return picture

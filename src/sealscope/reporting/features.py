@@ -75,9 +75,9 @@ def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails 
             ends, levels = windowed_rms(rows[:, inside], first=inside.start)
         except InputError as error:  # such as pressures of 1e300, whose squares overflow
             return None, f"No details of {channel}: {error}."
-        for name, own, level in zip(QUANTITIES, rows, (1, 2, 3, 4, 4), strict=True):
+        for name, row, level in zip(QUANTITIES, rows, (1, 2, 3, 4, 4), strict=True):
             where = transformed.inside(level)
-            values[name][part][where] = own[where]
+            values[name][part][where] = row[where]
         if ends.size:
             centres = t[part.start] + (ends - WINDOW_SIZE / 2) / recording.rate
             if windows:  # a point without a value parts two stretches

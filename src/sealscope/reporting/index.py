@@ -16,9 +16,9 @@ _ORDER = ("leak", "cannot tell", "no leak")
 
 
 def severity(diagnosis: Diagnosis) -> tuple[int, float, float, str]:
-    """Return what pages are ordered by: leaks by their size, then `cannot tell`, then by the total leakage."""
-    own = diagnosis.severity
-    size = 0.0 if own is None or own.of_limit is None else own.of_limit[0]
+    """Return the sort key of a page: leaks by size, then `cannot tell`, then the total leakage."""
+    leak_severity = diagnosis.severity
+    size = 0.0 if leak_severity is None or leak_severity.of_limit is None else leak_severity.of_limit[0]
     flow = diagnosis.total_leakage.lpm if diagnosis.total_leakage is not None else None
     flow = flow if diagnosis.leak_lpm is None else diagnosis.leak_lpm
     return (_ORDER.index(diagnosis.verdict), -size, -(flow or 0.0), diagnosis.file)

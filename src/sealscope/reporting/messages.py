@@ -71,14 +71,14 @@ def headline(diagnosis: Diagnosis) -> str:
 
 
 def cause(diagnosis: Diagnosis) -> str | None:
-    """Return what the change is attributed to; None where there is none, or it is not certain."""
+    """Return the cause of the change, None if there is none or it is not certain."""
     if diagnosis.cause in LEAKS and diagnosis.verdict != "leak":
         return None
     return diagnosis.cause
 
 
 def shows_reason(diagnosis: Diagnosis) -> bool:
-    """Return whether the reason stands beside the verdict: it names what cannot be told, or what else changed."""
+    """Test whether the verdict needs its reason: nothing can be told, or something other than a leak changed."""
     return diagnosis.verdict == "cannot tell" or (diagnosis.verdict != "leak" and cause(diagnosis) is not None)
 
 
@@ -87,9 +87,10 @@ def state(diagnosis: Diagnosis) -> str:
     return state_text(diagnosis.state)
 
 
-def state_text(own: MachineState) -> str:
+def state_text(machine_state: MachineState) -> str:
     """Return a state of NE 107 in words."""
-    return f"{own.name} ({own.symbol} of NE 107{f', severity {own.severity} of 1000' if own.severity else ''})"
+    severity = f", severity {machine_state.severity} of 1000" if machine_state.severity else ""
+    return f"{machine_state.name} ({machine_state.symbol} of NE 107{severity})"
 
 
 def since(diagnosis: Diagnosis) -> str | None:
@@ -105,7 +106,7 @@ def since(diagnosis: Diagnosis) -> str | None:
 
 
 def how_much(diagnosis: Diagnosis) -> str | None:
-    """Return how much oil leaks [L/min], or at most could where no leak was found; None where nothing is known."""
+    """Format the leak flow [L/min], or its upper bound if no leak was found; None if nothing is known."""
     interval, leak = diagnosis.leak_interval_lpm, diagnosis.leak_lpm
     if diagnosis.verdict != "leak":
         if diagnosis.bound_lpm is not None:
@@ -122,13 +123,13 @@ def how_much(diagnosis: Diagnosis) -> str | None:
 
 
 def _pump_share(diagnosis: Diagnosis) -> str | None:
-    own = diagnosis.severity
-    known = own is not None and own.pump_share is not None
-    return f"{_percent(own.pump_share[0])} of the pump's flow in this duty" if known else None  # type: ignore[union-attr, index]
+    severity = diagnosis.severity
+    known = severity is not None and severity.pump_share is not None
+    return f"{_percent(severity.pump_share[0])} of the pump's flow in this duty" if known else None  # type: ignore[union-attr, index]
 
 
 def _why_no_flow(diagnosis: Diagnosis) -> str:
-    """Return why a leak has no L/min, and what would state it."""
+    """Give the reason for a leak without L/min, and the remedy."""
     if "leak_lpm" not in diagnosis.refuses:
         small = diagnosis.total_leakage is not None and diagnosis.total_leakage.lpm is not None
         return say(f"how_much.{'too_small' if small else 'channels'}")
@@ -140,12 +141,12 @@ def _why_no_flow(diagnosis: Diagnosis) -> str:
 
 
 def rests_on(diagnosis: Diagnosis) -> str | None:
-    """Return what every L/min of the diagnosis rests on; None where that is not known."""
+    """Describe the machine behind every L/min of the diagnosis, None if it is not known."""
     return None if diagnosis.machine is None else machine_text(diagnosis.machine)
 
 
 def machine_text(machine: AssumedMachine) -> str:
-    """Return area and displacement that a flow rests on, and who stated them."""
+    """Format the area and displacement behind a flow, and their origin."""
     if machine.flow_meter:
         key = "meter"
     elif machine.stated_by == "recording":
@@ -162,13 +163,13 @@ def machine_text(machine: AssumedMachine) -> str:
 
 def how_bad(diagnosis: Diagnosis) -> str | None:
     """Return the leak against the repair limit, else beside the pump's flow; None where neither is known."""
-    own, limit = diagnosis.severity, diagnosis.limit
-    if own is None:
+    severity, limit = diagnosis.severity, diagnosis.limit
+    if severity is None:
         return None
-    if own.level is not None and own.of_limit is not None:
-        low, high = own.of_limit[1:]
+    if severity.level is not None and severity.of_limit is not None:
+        low, high = severity.of_limit[1:]
         share = f"{_span(low, high)} times" if high >= 10.0 else f"{_span(100.0 * low, 100.0 * high)} % of"
-        return say(f"how_bad.{own.level}", share=share, limit=f"{limit}{'' if limit.stated else ', the default'}")
+        return say(f"how_bad.{severity.level}", share=share, limit=f"{limit}{'' if limit.stated else ', the default'}")
     if limit.stated:
         return say("how_bad.no_area", limit=limit)
     return None if diagnosis.leak_lpm is None else _pump_share(diagnosis)
@@ -181,13 +182,13 @@ def _span(low: float, high: float) -> str:
 
 
 def other_sizes(diagnosis: Diagnosis) -> str | None:
-    """Return the other sizes of the leak: beside the pump's flow, and as a creep; None where none is known."""
-    own = diagnosis.severity
-    if own is None:
+    """Format the leak in mL/min, as a share of the pump's flow and as a creep; None if none is known."""
+    severity = diagnosis.severity
+    if severity is None:
         return None
-    creep = own.creep_mm_per_min
+    creep = severity.creep_mm_per_min
     parts = [
-        None if own.mL_per_min is None else f"{number(own.mL_per_min[0], 2)} mL/min",
+        None if severity.mL_per_min is None else f"{number(severity.mL_per_min[0], 2)} mL/min",
         None if diagnosis.leak_lpm is None else _pump_share(diagnosis),
         None if creep is None else f"as much as a piston that creeps by {number(creep[0], 2)} mm/min",
     ]
@@ -195,46 +196,46 @@ def other_sizes(diagnosis: Diagnosis) -> str | None:
 
 
 def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
-    """Return the leakage of pump and piston together, and which step would have been found; None where not known.
+    """Format the leakage of pump and piston together and the smallest detectable step, None if not known.
 
     `basis`: with what L/min rests on.
     """
-    own = diagnosis.total_leakage
-    if own is None:
+    leakage = diagnosis.total_leakage
+    if leakage is None:
         return None
-    pressure = f"{number(from_si(own.pressure, diagnosis.pressure_unit, 'Pa'), 2)} {diagnosis.pressure_unit}"
-    findable = f"{number(own.findable_lpm, 2)} L/min"
-    if own.lpm is None or own.interval_lpm is None:
-        known = own.pump_share is not None
+    pressure = f"{number(from_si(leakage.pressure, diagnosis.pressure_unit, 'Pa'), 2)} {diagnosis.pressure_unit}"
+    findable = f"{number(leakage.findable_lpm, 2)} L/min"
+    if leakage.lpm is None or leakage.interval_lpm is None:
+        known = leakage.pump_share is not None
         key = "share" if known else "not_measured"
-        text = say(f"leakage.{key}", share=_percent(own.pump_share), pressure=pressure)
-        if own.findable_share is None:
+        text = say(f"leakage.{key}", share=_percent(leakage.pump_share), pressure=pressure)
+        if leakage.findable_share is None:
             return text
-        size = _percent(own.findable_share) + ("" if known else " of the pump's flow")
-        return text + say("leakage.findable", size=size if own.findable_lpm is None else f"{size}, {findable}")
-    low, high = own.interval_lpm
+        size = _percent(leakage.findable_share) + ("" if known else " of the pump's flow")
+        return text + say("leakage.findable", size=size if leakage.findable_lpm is None else f"{size}, {findable}")
+    low, high = leakage.interval_lpm
     key = "none" if not high > 0.0 else "at_most" if not low > 0.0 else "interval"
-    figures = {"lpm": number(own.lpm, 2), "low": number(low, 2), "high": number(high, 2)}
+    figures = {"lpm": number(leakage.lpm, 2), "low": number(low, 2), "high": number(high, 2)}
     text = say(f"leakage.{key}", pressure=pressure, **figures)
     if basis and diagnosis.verdict != "leak" and (machine := rests_on(diagnosis)) is not None:
         text += f" ({machine})"
-    text += "" if own.healthy_lpm is None else say("leakage.healthy", lpm=number(own.healthy_lpm, 2))
-    return text + ("" if own.findable_lpm is None else say("leakage.findable", size=findable))
+    text += "" if leakage.healthy_lpm is None else say("leakage.healthy", lpm=number(leakage.healthy_lpm, 2))
+    return text + ("" if leakage.findable_lpm is None else say("leakage.findable", size=findable))
 
 
 def leakage_in_short(diagnosis: Diagnosis) -> str | None:
-    """Return the leakage of pump and piston in a few words; None where it is not known or there is a leak."""
-    own = diagnosis.total_leakage
-    if own is None or diagnosis.verdict == "leak":
+    """Format the leakage of pump and piston in a few words, None if it is not known or there is a leak."""
+    leakage = diagnosis.total_leakage
+    if leakage is None or diagnosis.verdict == "leak":
         return None
-    if own.lpm is None or own.interval_lpm is None:
-        return None if own.pump_share is None else f"in all {_percent(own.pump_share)} of the pump's flow"
-    low, high = own.interval_lpm
-    return f"in all {number(own.lpm, 2)} L/min" if low > 0.0 else f"in all at most {number(high, 2)} L/min"
+    if leakage.lpm is None or leakage.interval_lpm is None:
+        return None if leakage.pump_share is None else f"in all {_percent(leakage.pump_share)} of the pump's flow"
+    low, high = leakage.interval_lpm
+    return f"in all {number(leakage.lpm, 2)} L/min" if low > 0.0 else f"in all at most {number(high, 2)} L/min"
 
 
 def states_flow(diagnosis: Diagnosis) -> bool:
-    """Return whether the diagnosis states any L/min."""
+    """Test whether the diagnosis states any L/min."""
     return diagnosis.leak_lpm is not None or (
         diagnosis.total_leakage is not None and diagnosis.total_leakage.lpm is not None
     )
@@ -245,7 +246,7 @@ def _percent(share: float | None) -> str:
 
 
 def how_sure(diagnosis: Diagnosis) -> str:
-    """Return how many healthy recordings look like this, the score against its threshold, and what that means."""
+    """Format the share of healthy recordings like this one, the score against its threshold, and its meaning."""
     if diagnosis.score is None or diagnosis.threshold is None:
         return say("how_sure.no_score")
     odds, other = _odds(diagnosis), cause(diagnosis)
@@ -262,12 +263,12 @@ def how_sure(diagnosis: Diagnosis) -> str:
 
 
 def in_short(diagnosis: Diagnosis) -> str:
-    """Return how many healthy recordings look like this; where that is not stated, what the threshold was set for."""
+    """Format the share of healthy recordings like this one, or the false alarms allowed if it is not stated."""
     return _odds(diagnosis) or false_alarms(diagnosis)
 
 
 def _odds(diagnosis: Diagnosis) -> str | None:
-    """Return how many healthy recordings look like this; without a change, how many show as much of one."""
+    """Format the share of healthy recordings like this one, or with as much change if nothing changed."""
     odds = diagnosis.odds
     if odds is None or diagnosis.verdict != "no leak" or diagnosis.alarmed:
         return odds
@@ -275,7 +276,7 @@ def _odds(diagnosis: Diagnosis) -> str | None:
 
 
 def false_alarms(diagnosis: Diagnosis) -> str:
-    """Return what the threshold was set for."""
+    """Format the false-alarm probability of the threshold."""
     p = diagnosis.false_alarm_probability
     if not 0 < p < 1:
         return say("how_sure.probability", probability=number(p))
@@ -284,7 +285,7 @@ def false_alarms(diagnosis: Diagnosis) -> str:
 
 
 def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
-    """Return what to check next, most useful first."""
+    """List the next checks, most useful first."""
     level = None if diagnosis.severity is None else diagnosis.severity.level
     judge = diagnosis.methods[0].detector if diagnosis.methods else ""
     confirmed = say(f"once_confirmed.{level or 'plan'}", limit=diagnosis.limit)
@@ -303,7 +304,7 @@ def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
         steps = [say("next.cause"), say("next.record")]
     trouble = [finding for finding in diagnosis.quality if finding.severity != "note"]
     if trouble:
-        names = [f"{own.code.replace('_', ' ')}{f' ({own.channel})' if own.channel else ''}" for own in trouble]
+        names = [f"{entry.code.replace('_', ' ')}{f' ({entry.channel})' if entry.channel else ''}" for entry in trouble]
         key = "rule_out" if named or diagnosis.verdict == "leak" else "care"
         key, place = ("findings", 1) if not named and diagnosis.verdict == "cannot tell" else (key, 0)
         steps.insert(place, say(f"next.{key}", faults=", ".join(dict.fromkeys(names))))
@@ -311,20 +312,20 @@ def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
 
 
 def quality_summary(diagnosis: Diagnosis) -> str:
-    """Return how many findings there are, and the worst severity among them."""
+    """Count the findings, and name the worst severity among them."""
     severities = {finding.severity for finding in diagnosis.quality}
     worst = next((f" ({severity})" for severity in ("fatal", "warning") if severity in severities), "")
     return f"{counted(len(diagnosis.quality), 'finding')}{worst}"
 
 
 def raw_counts(diagnosis: Diagnosis) -> str | None:
-    """Return which pressures are in raw counts, and what to do; None where none is."""
+    """Name the pressures in raw counts and the remedy; None if there are none."""
     names = [finding.channel for finding in diagnosis.quality if finding.code == "raw_counts" and finding.channel]
     return f"{' and '.join(names)} in raw counts: state the unit, or a leak's size stays relative" if names else None
 
 
 def not_used(diagnosis: Diagnosis) -> str | None:
-    """Return which recorded pressures, positions, speeds and flows no channel is made of; None where all are."""
+    """Name the recorded pressures, positions, speeds and flows without a channel; None if there are none."""
     if not diagnosis.unused:
         return None
     lines = " ".join(f"--map '{suggested_map(Label.parse(name))}'" for name in diagnosis.unused[:4])
@@ -406,7 +407,7 @@ _FILE = 22
 
 
 def table_line(diagnosis: Diagnosis, start_s: float | None = None) -> str:
-    """Return a diagnosis as a line of a table: file, date, verdict, L/min, and what to do where anything changed.
+    """Format a diagnosis as one line of a table: file, date, verdict, L/min, and the remedy of a change.
 
     `start_s`: when the recording began [s since 1970].
     """

@@ -20,7 +20,7 @@ CURVE = 20
 
 
 def curve(values: Array, width: int = CURVE) -> str:
-    """Return values (n,) as `width` bars between their least and largest; a blank where all samples are missing."""
+    """Draw values (n,) as `width` bars between their least and largest, blank for missing samples."""
     known = values[np.isfinite(values)]
     if not known.size:
         return " " * width
@@ -40,7 +40,7 @@ def curve(values: Array, width: int = CURVE) -> str:
 
 
 def overview_text(name: str, recording: Recording, findings: Sequence[Finding]) -> str:
-    """Return what a person checks before a verdict: clock, channels with range and curve, notes, findings."""
+    """Format a recording for inspection before a verdict: clock, channels with range and curve, notes, findings."""
     provenance = recording.provenance
     start = f", from {provenance['start']}" if "start" in provenance else ""
     kind = f"{provenance['format']}; " if "format" in provenance else ""

@@ -106,12 +106,12 @@ def write_page(path: str | os.PathLike[str], recording: Recording, diagnosis: Di
 
 
 def _rig_of(diagnosis: Diagnosis, rig: Rig | str | os.PathLike[str] | None) -> Rig | None:
-    """Return the rig of the call, else the one that the diagnosis states; None where nobody stated one."""
+    """Return the rig of the call, else that of the diagnosis, else None."""
     from sealscope.parameters import load_rig, rig_names
 
     if rig is not None:
-        own = load_rig(rig)
-        return own if states_rig(own) else None
+        loaded = load_rig(rig)
+        return loaded if states_rig(loaded) else None
     machine = diagnosis.machine
     known = machine is not None and machine.stated_by != "nobody" and machine.rig in rig_names()
     return load_rig(machine.rig) if known and machine is not None else None
@@ -191,7 +191,7 @@ def render_page(
         particulars=particulars_of(recording, known_rig),
         truth=(truth_onset_s, truth_leak_lpm),
         marks=all_marks,
-        groups={group: [own for own in shown if own.group == group] for group in charts.GROUPS},
+        groups={group: [chart for chart in shown if chart.group == group] for group in charts.GROUPS},
         drawn=drawn,
         window=WINDOW_SIZE,
         step=WINDOW_STEP,

@@ -12,7 +12,7 @@ from sealscope.recordings.recording import Recording
 
 
 def particulars_of(recording: Recording, rig: Rig | None = None) -> dict[str, str]:
-    """Return what is known of a recording beside its samples, by the names of `particulars.toml`, in their order.
+    """Return the known facts about a recording, by the names of `particulars.toml` and in their order.
 
     The machine and the date fall back on the title of `rig` and on the recording's own start.
     """

@@ -58,7 +58,7 @@ class Picture:
 
     @property
     def view_box(self) -> str:
-        """What of the plane is shown, as SVG names it."""
+        """The shown part of the plane, an SVG viewBox."""
         left, top, right, bottom = self.margins
         return f"{-left:g} {-top:g} {left + self.width + right:g} {top + self.height + bottom:g}"
 
@@ -68,13 +68,13 @@ class Picture:
         return {shape.style for shape in self.shapes}
 
     def x(self, values: Array | float) -> Array:
-        """Return how far from the left values stand."""
+        """Convert values to distances from the left."""
         start, stop = self.x_ends
-        at = np.log10(values) if self.log else np.asarray(values)
-        return np.asarray((at - start) / (stop - start) * self.width)
+        positions = np.log10(values) if self.log else np.asarray(values)
+        return np.asarray((positions - start) / (stop - start) * self.width)
 
     def y(self, values: Array | float) -> Array:
-        """Return how far from the top values stand."""
+        """Convert values to distances from the top."""
         low, high = self.y_ends
         return np.asarray(self.height * (high - np.asarray(values)) / (high - low))
 
@@ -123,9 +123,9 @@ class Picture:
         self.draw("whisker", f"M{self.x(x):.1f} {self.y(ends[0]):.1f}V{self.y(ends[1]):.1f}")
         self.symbol(style, x, float(self.y(y)), title)
 
-    def frame(self, about: int) -> None:
+    def frame(self, count: int) -> None:
         """Draw the frame, and about so many levels with their values."""
-        for value in ticks(*self.y_ends, about):
+        for value in ticks(*self.y_ends, count):
             self.level("grid", value)
             self.labels.append(SvgText(-6.0, float(self.y(value)) + 4.0, f"{value:g}", "end"))
         self.draw("frame", f"M0 0H{self.width:g}V{self.height:g}H0z")
@@ -135,9 +135,9 @@ class Picture:
         self.labels.append(SvgText(float(self.x(x)), self.height + 16.0, text, anchor))
 
 
-def ticks(low: float, high: float, about: int) -> list[float]:
-    """Return round values (1, 2 or 5 times a power of ten apart) between low and high, `about` so many."""
-    raw = (high - low) / about
+def ticks(low: float, high: float, count: int) -> list[float]:
+    """Return round values (1, 2 or 5 times a power of ten apart) between low and high, about `count` of them."""
+    raw = (high - low) / count
     power = 10.0 ** np.floor(np.log10(raw))
     step = float(next(m for m in (1, 2, 5, 10) if m * power >= raw * 0.999) * power)
     first = int(np.ceil(low / step - 1e-9))

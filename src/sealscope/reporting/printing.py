@@ -23,7 +23,7 @@ _LONGEST = 120.0
 
 
 def print_page(page: str, path: str | os.PathLike[str]) -> str:
-    """Write a page (HTML) as a PDF, whole or not at all, and return what printed it.
+    """Write a page (HTML) as a PDF, whole or not at all, and return the program's name.
 
     Raises MissingExtra where neither a browser nor WeasyPrint is installed, and InputError where printing fails.
     """
@@ -47,7 +47,7 @@ def print_page(page: str, path: str | os.PathLike[str]) -> str:
 
 
 def draw_page(page: str, path: str | os.PathLike[str], width: int, height: int) -> str:
-    """Write a page (HTML) as a PNG of `width` x `height` pixels, whole or not at all, and return what drew it.
+    """Write a page (HTML) as a PNG of `width` x `height` pixels, whole or not at all, and return the program's name.
 
     Raises MissingExtra where no browser is installed, and InputError where drawing fails.
     """
@@ -87,13 +87,13 @@ def _browser() -> str | None:
 
 
 def _is_whole_pdf(data: bytes) -> bool:
-    """Return whether a PDF is there to its end, and its table of contents where the end says (ISO 32000-1, 7.5.5)."""
+    """Test whether a PDF is complete, with its cross-reference table where the end says (ISO 32000-1, 7.5.5)."""
     end = re.search(rb"startxref\s+(\d+)\s+%%EOF\s*$", data[-1024:])
     return end is not None and re.match(rb"%PDF.*(xref|\d+ \d+ obj)", data[:4] + data[int(end[1]) :][:20]) is not None
 
 
 def _is_whole_png(data: bytes, width: int, height: int) -> bool:
-    """Return whether a PNG of this size is there to its end, the chunk IEND with its checksum."""
+    """Test whether a PNG of this size is complete, up to the chunk IEND with its checksum."""
     head = struct.pack(">8sL4sLL", b"\x89PNG\r\n\x1a\n", 13, b"IHDR", width, height)
     return data.startswith(head) and data.endswith(b"\0\0\0\0IEND\xaeB`\x82")
 
@@ -101,7 +101,7 @@ def _is_whole_png(data: bytes, width: int, height: int) -> bool:
 def _by_browser(
     browser: str, page: str, target: Path, options: list[str], kind: str, is_whole: Callable[[bytes], bool]
 ) -> None:
-    """Let a browser write `target`, a file of this kind; InputError where it is not there to its end."""
+    """Let a browser write `target`, a file of this kind. Raise InputError if the file is incomplete."""
     with tempfile.TemporaryDirectory(prefix="sealscope-", ignore_cleanup_errors=True) as folder:
         source = Path(folder) / "page.html"
         source.write_text(page, encoding="utf-8", errors="backslashreplace")

@@ -28,7 +28,7 @@ _BORE, _ROD = 78.0, 18.0
 
 
 class Circuit(NamedTuple):
-    """What is drawn of a machine.
+    """The drawn parts of a machine.
 
     `cylinder`: its kind in words; `rods`: the sides that the rod leaves, "A", "B" or "AB"; `rod`: its height in the
     drawing, of a single rod in proportion to the bore: sqrt(1 - A_small / A_large); `throttles`, `make_up`, `bypass`:
@@ -47,7 +47,7 @@ class Circuit(NamedTuple):
 
 
 def circuit_of(rig: Rig | None, recorded: Container[str], machine: AssumedMachine | None = None) -> Circuit:
-    """Return what to draw of a machine: of an unknown one only what every pump-controlled actuator has.
+    """Choose the parts to draw; of an unknown machine only those of every pump-controlled actuator.
 
     `machine`: what is stated of one without a rig. A bypass is drawn where its flow meter was recorded.
     """
@@ -85,7 +85,7 @@ def _value_text(value: float, unit: str, size: float) -> str:
 
 
 def schematic(recording: Recording, diagnosis: Diagnosis, circuit: Circuit) -> str:
-    """Return the drawing as SVG: which sensors recorded and under which name, whether oil bypasses the piston."""
+    """Draw the machine as SVG: the sensors with their column names, and the oil that bypasses the piston."""
     leaking = diagnosis.verdict == "leak"
     amount = f"{messages.number(diagnosis.leak_lpm)} L/min" if leaking and diagnosis.leak_lpm is not None else ""
     return template.render(
@@ -101,7 +101,7 @@ def schematic(recording: Recording, diagnosis: Diagnosis, circuit: Circuit) -> s
 
 
 def columns_of(recording: Recording) -> dict[str, str]:
-    """Return channel -> the column of the file that it was read from, where the file has a name of its own for it."""
+    """Map each channel to its column in the file, if the file names it differently."""
     columns: Any = recording.provenance.get("columns")
     if not isinstance(columns, dict):
         return {}

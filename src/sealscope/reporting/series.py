@@ -43,11 +43,11 @@ class DrawnTimes:
         low = np.fmin.reduceat(values, self.starts)
         high = np.fmax.reduceat(values, self.starts)
         rising = values[self.starts] <= values[self.stops - 1]
-        drawn = _paired(np.where(rising, low, high), np.where(rising, high, low), self.stops - self.starts)
+        drawn = _interleave(np.where(rising, low, high), np.where(rising, high, low), self.stops - self.starts)
         return np.insert(drawn, self.breaks, np.nan)
 
 
-def _paired(first: Array, second: Array, sizes: NDArray[np.int64]) -> Array:
+def _interleave(first: Array, second: Array, sizes: NDArray[np.int64]) -> Array:
     """Return both points of each bucket in turn, the second left out where the bucket is one sample."""
     both = np.stack([first, second], axis=1)
     kept = np.stack([np.ones(sizes.size, dtype=bool), sizes > 1], axis=1)
@@ -81,7 +81,7 @@ def time_base(t: Array, rate: float, points: int, *, near: float | None = None, 
     sizes = stops - starts
     before = np.append(0, np.cumsum(np.where(sizes > 1, 2, 1)))  # points drawn ahead of each bucket
     breaks = before[np.searchsorted(starts, gaps)]
-    drawn = np.insert(_paired(t[starts], t[stops - 1], sizes), breaks, t[gaps - 1])
+    drawn = np.insert(_interleave(t[starts], t[stops - 1], sizes), breaks, t[gaps - 1])
     return DrawnTimes(drawn, starts, stops, width, fine, breaks, by_sample)
 
 

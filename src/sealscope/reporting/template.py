@@ -59,7 +59,7 @@ def render(
 
 
 def packaged(name: str, package: str = _PACKAGE) -> Markup:
-    """Read a file that goes into a page as it is, from a package or else from this one."""
+    """Read a file to include unchanged in a page, from a package or else from this one."""
     from markupsafe import Markup
 
     file = resources.files(package) / name
@@ -67,14 +67,14 @@ def packaged(name: str, package: str = _PACKAGE) -> Markup:
 
 
 def _script_hash(code: str) -> Markup:
-    """Return the source of a script as a content security policy names it."""
+    """Compute the hash of a script for a content security policy."""
     from markupsafe import Markup
 
     return Markup(f"'sha256-{b64encode(sha256(code.encode()).digest()).decode()}'")
 
 
 def _script_json(value: Any) -> Markup:
-    """Return plain JSON values as they stand inside an element `script`: no sign of them ends it."""
+    """Format plain JSON values for an element `script`, escaped so that none ends it."""
     from markupsafe import Markup
 
     text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
@@ -90,7 +90,7 @@ def check_page(path: str | os.PathLike[str], *, card: bool = True) -> Path:
 
 
 def write(path: str | os.PathLike[str], page: str) -> Path:
-    """Write a page as UTF-8, or as a PDF where the name ends so, whole or not at all.
+    """Write a page as UTF-8, or as a PDF if the name ends in .pdf; whole or not at all.
 
     Raises InputError where it cannot be written, MissingExtra where nothing on the machine prints a PDF.
     """

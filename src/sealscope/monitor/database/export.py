@@ -34,13 +34,15 @@ def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
             events[event["alarm"]["id"]].append(event)
     rows, labelled = [], defaultdict[str, list[tuple[float, float, dict[str, str]]]](list)
     for alarm in sorted(reversed(store.alarms()), key=lambda alarm: float(alarm["raised_s"])):
-        own = events[alarm["id"]]
-        judged = next((event for event in reversed(own) if event["event"] in _LABELS), None)
+        history = events[alarm["id"]]
+        judged = next((event for event in reversed(history) if event["event"] in _LABELS), None)
         onset, leak = alarm["onset_interval_s"] or (None, None), alarm["leak_interval_lpm"] or (None, None)
         row = {
             "marked_by": None if judged is None else judged["by"],
             "marked_s": None if judged is None else judged["t"],
-            "comments": "; ".join(f"{event['by']}: {event['text']}" for event in own if event["by"] and event["text"]),
+            "comments": "; ".join(
+                f"{event['by']}: {event['text']}" for event in history if event["by"] and event["text"]
+            ),
             **dict(zip(("onset_low_s", "onset_high_s"), onset, strict=True)),
             **dict(zip(("leak_low_lpm", "leak_high_lpm"), leak, strict=True)),
         }

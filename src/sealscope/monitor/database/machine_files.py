@@ -19,7 +19,7 @@ from sealscope.storage.toml_file import read_toml
 
 
 def pass_on(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording]) -> str:
-    """Write into a machine's file what a person said of an alarm, and return in one line what was done.
+    """Write a person's mark of an alarm into a machine's file, and return a line about the change.
 
     An `invalid` alarm's `samples`, the last ones before the mark, are taught as healthy; the machine's file refuses
     those that it judges leaking. From the onset of a `valid` one on no recording is, until a repair. "" where `mark` is

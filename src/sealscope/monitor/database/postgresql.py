@@ -21,7 +21,7 @@ _DRIVERS = ("postgresql", "postgresql+psycopg", "postgresql+psycopg2")
 
 
 def engine_options(url: URL) -> dict[str, Any]:
-    """Return options of an engine for a URL, {} where it is no PostgreSQL; what its query states is left as it is."""
+    """Return the engine options of a PostgreSQL URL, {} for another; options in its query are left unchanged."""
     if url.drivername not in _DRIVERS:
         return {}
     signs = {"keepalives_idle": 5, "keepalives_interval": 2, "keepalives_count": 3}
@@ -43,7 +43,7 @@ def limit_answers(engine: Engine) -> None:
     from psycopg import Connection, OperationalError
 
     class LimitedConnection(Connection[Any]):
-        """A connection that is closed where the server does not answer in time."""
+        """A connection, closed if the server does not answer in time."""
 
         def wait(self, gen: Any, *arguments: Any, **options: Any) -> Any:
             return super().wait(self._limited(gen), *arguments, **options)
@@ -53,10 +53,10 @@ def limit_answers(engine: Engine) -> None:
             last, ready = time.monotonic(), None
             while True:
                 try:
-                    wanted = gen.send(ready)
+                    condition = gen.send(ready)
                 except StopIteration as end:
                     return end.value
-                ready = yield wanted
+                ready = yield condition
                 now = time.monotonic()
                 if ready:
                     last = now
@@ -65,4 +65,4 @@ def limit_answers(engine: Engine) -> None:
                     self.pgconn.finish()
                     raise OperationalError(f"PostgreSQL has not answered for {ANSWER_S:g} s")
 
-    event.listen(engine, "do_connect", lambda *of: LimitedConnection.connect(*of[2], **of[3]))
+    event.listen(engine, "do_connect", lambda *call: LimitedConnection.connect(*call[2], **call[3]))

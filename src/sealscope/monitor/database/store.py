@@ -62,15 +62,15 @@ class StoredRows:
 
     def add_pending(self, actuator: str, number: int, samples: Recording, follows: bool) -> None:
         """Add samples that a restart goes through once more after the checkpoint."""
-        self.pending.append({"actuator": actuator, "number": number, "samples": _packed(samples, follows)})
+        self.pending.append({"actuator": actuator, "number": number, "samples": _pack(samples, follows)})
 
     def add_alarm(self, alarm: Alarm, kind: str, t: float, by_whom: str = "", text: str = "") -> None:
-        """Add an alarm as it is now, and what happened to it, or what a person said of it, unless `kind` is empty."""
-        own, plain = {"actuator": alarm.actuator}, json.dumps(alarm.plain())
-        self.alarms[alarm.id] = {**own, "id": alarm.id, "state": alarm.state, "alarm": plain}
+        """Add an alarm in its present state, and the event or the person's remark if `kind` is not empty."""
+        actuator, plain = {"actuator": alarm.actuator}, json.dumps(alarm.plain())
+        self.alarms[alarm.id] = {**actuator, "id": alarm.id, "state": alarm.state, "alarm": plain}
         if kind:
-            said = {"kind": kind, "by_whom": by_whom, "text": text}
-            self.events.append({**own, **said, "t": t, "alarm_id": alarm.id, "alarm": plain})
+            entry = {"kind": kind, "by_whom": by_whom, "text": text}
+            self.events.append({**actuator, **entry, "t": t, "alarm_id": alarm.id, "alarm": plain})
 
     def add_checkpoint(self, actuator: str, settings: str, state: dict[str, Any]) -> None:
         """Add the state of an actuator, which takes the place of the samples since the last one."""
@@ -102,14 +102,14 @@ class MonitorStore:
             limit_answers(self.engine)
             if self.engine.dialect.name == "sqlite":
                 sa.event.listen(self.engine, "connect", _prepare_sqlite)
-            known = self._prepared(_ATTEMPTS)
+            known = self._prepare_tables(_ATTEMPTS)
         except (SQLAlchemyError, ImportError, ValueError) as error:
             reason = str(getattr(error, "orig", None) or error).splitlines()[0]
             raise InputError(f"the monitor's database must be a file of SQLite or a URL, got: {reason}") from None
         if known != str(tables.SCHEMA):
             raise InputError(f"the monitor's database must have version {tables.SCHEMA}, got {known} ({database})")
 
-    def _prepared(self, attempts: int) -> str:
+    def _prepare_tables(self, attempts: int) -> str:
         """Make the tables where they are missing, and return their version."""
         facts = tables.facts
         try:
@@ -122,7 +122,7 @@ class MonitorStore:
             if attempts == 1:
                 raise
             time.sleep(0.2)  # another monitor makes the tables at this moment
-            return self._prepared(attempts - 1)
+            return self._prepare_tables(attempts - 1)
         return str(known or tables.SCHEMA)
 
     @contextmanager
@@ -132,7 +132,7 @@ class MonitorStore:
             yield connection
 
     @contextmanager
-    def _noting(self) -> Iterator[sa.Connection]:
+    def _begin_notes(self) -> Iterator[sa.Connection]:
         """Return a connection for changes that the death of this process leaves, a loss of power perhaps not."""
         is_file = self.engine.dialect.name == "sqlite"
         with self._writing_lock, self.engine.connect() as connection:
@@ -158,11 +158,13 @@ class MonitorStore:
         with self.engine.connect() as connection:
             return int(connection.execute(query).scalar() or 0)
 
-    def known(self, blocks: Iterable[tuple[str, str]]) -> set[tuple[str, str]]:
-        """Return which of some blocks are stored; a block is an actuator and an identity."""
+    def select_stored(self, blocks: Iterable[tuple[str, str]]) -> set[tuple[str, str]]:
+        """Select the stored ones among blocks, each an actuator and an identity."""
         # a query for each: SQLite goes through the whole table for a list of pairs
-        of = tables.blocks.c
-        query = select(of.number).where(of.actuator == bindparam("of"), of.identity == bindparam("identity"))
+        columns = tables.blocks.c
+        query = select(columns.number).where(
+            columns.actuator == bindparam("of"), columns.identity == bindparam("identity")
+        )
         with self.engine.connect() as connection:
             return {
                 (actuator, identity)
@@ -171,8 +173,8 @@ class MonitorStore:
             }
 
     def is_known(self, actuator: str, identity: str) -> bool:
-        """Return whether a block is stored."""
-        return bool(self.known([(actuator, identity)]))
+        """Test whether a block is stored."""
+        return bool(self.select_stored([(actuator, identity)]))
 
     def keep_blocks(self, connection: sa.Connection, blocks: Iterable[tuple[str, str, int]]) -> None:
         """Store blocks: actuator, identity, and number among those of the actuator.
@@ -184,9 +186,9 @@ class MonitorStore:
 
     def keep_rows(self, connection: sa.Connection, rows: StoredRows) -> None:
         """Store rows, each table's at once."""
-        of = bindparam("of", type_=sa.String)
+        actuator = bindparam("of", type_=sa.String)
         if rows.actuators:
-            before = tables.pending.delete().where(tables.pending.c.actuator == of)
+            before = tables.pending.delete().where(tables.pending.c.actuator == actuator)
             connection.execute(before, [{"of": name} for name in rows.actuators])
         if rows.events and self.engine.dialect.name == "postgresql":
             # events become known in the order of their numbers: an output that is past one never looks back
@@ -195,11 +197,11 @@ class MonitorStore:
             if values := getattr(rows, new.name):
                 connection.execute(new.insert(), values)
         for changed in (tables.actuators, tables.summaries, tables.alarms):
-            self.put(connection, changed, [*getattr(rows, changed.name).values()])
+            self.upsert(connection, changed, [*getattr(rows, changed.name).values()])
         for place, table in enumerate((tables.blocks, tables.estimates)):
             old = [{"of": name, "last": numbers[place]} for name, numbers in rows.old.items() if numbers[place] > 0]
             if old:
-                chosen = (table.c.actuator == of) & (table.c.number <= bindparam("last"))
+                chosen = (table.c.actuator == actuator) & (table.c.number <= bindparam("last"))
                 connection.execute(table.delete().where(chosen), old)
 
     def keep(self, rows: StoredRows) -> None:
@@ -207,8 +209,8 @@ class MonitorStore:
         with self.writing() as connection:
             self.keep_rows(connection, rows)
 
-    def put(self, connection: sa.Connection, table: sa.Table, rows: list[dict[str, Any]]) -> None:
-        """Change rows of a table by its primary key, or insert those that are missing."""
+    def upsert(self, connection: sa.Connection, table: sa.Table, rows: list[dict[str, Any]]) -> None:
+        """Change rows of a table by its primary key, or insert the missing ones."""
         if not rows:
             return
         key = table.primary_key.columns.keys()
@@ -219,42 +221,42 @@ class MonitorStore:
                 connection.execute(table.insert(), rows)
             else:
                 for row in rows:
-                    self.put(connection, table, [row])
+                    self.upsert(connection, table, [row])
 
     def keep_refused(self, rows: Sequence[dict[str, Any]]) -> None:
-        """Store what was refused, `KEPT_REFUSED` at most with those before, in a transaction of its own."""
-        table, of = tables.refused, tables.refused.c
+        """Store refused messages in a transaction of their own, and keep the last `KEPT_REFUSED`."""
+        table, columns = tables.refused, tables.refused.c
         with self.writing() as connection:
             connection.execute(table.insert(), rows[-KEPT_REFUSED:])
-            last = int(connection.execute(select(func.max(of.number))).scalar() or 0)
-            connection.execute(table.delete().where(of.number <= last - KEPT_REFUSED))
+            last = int(connection.execute(select(func.max(columns.number))).scalar() or 0)
+            connection.execute(table.delete().where(columns.number <= last - KEPT_REFUSED))
 
     def refused(self, most: int = KEPT_REFUSED) -> list[dict[str, Any]]:
-        """Return what was refused, the last one first."""
+        """Return the refused messages and files, the last one first."""
         rows = self._rows(select(tables.refused).order_by(tables.refused.c.number.desc()).limit(most))
         return [dict(row._mapping) for row in rows]
 
     def begin_decoding(self, reader: str, digest: str) -> int:
-        """Note that a reader begins to decode a message; return how often it began before and did not end."""
-        table, of = tables.decodings, tables.decodings.c
-        before = select(of.attempts).where(of.reader == reader, of.digest == digest)
-        with self._noting() as connection:
+        """Note the start of decoding a message; return the number of earlier starts without an end."""
+        table, columns = tables.decodings, tables.decodings.c
+        before = select(columns.attempts).where(columns.reader == reader, columns.digest == digest)
+        with self._begin_notes() as connection:
             attempts = int(connection.execute(before).scalar() or 0)
-            self.put(connection, table, [{"reader": reader, "digest": digest, "attempts": attempts + 1}])
+            self.upsert(connection, table, [{"reader": reader, "digest": digest, "attempts": attempts + 1}])
         return attempts
 
     def end_decoding(self, reader: str, digest: str) -> None:
         """Forget that a reader began to decode a message."""
-        of = tables.decodings.c
-        with self._noting() as connection:
-            connection.execute(tables.decodings.delete().where(of.reader == reader, of.digest == digest))
+        columns = tables.decodings.c
+        with self._begin_notes() as connection:
+            connection.execute(tables.decodings.delete().where(columns.reader == reader, columns.digest == digest))
 
     def last_number(self, table: sa.Table, actuator: str) -> int:
         """Return the number of an actuator's last row of a table, `tables.blocks` or `tables.estimates`."""
         return self._value(select(func.max(table.c.number)).where(table.c.actuator == actuator))
 
     def checkpoint(self, actuator: str) -> tuple[str, dict[str, Any], list[tuple[Recording, bool]]] | None:
-        """Return settings and state as of the checkpoint, and the samples since then; None where there is none.
+        """Return the settings and state of the checkpoint and the samples since, None without a checkpoint.
 
         Of the samples of each block, whether they follow those before.
         """
@@ -262,7 +264,7 @@ class MonitorStore:
         samples = select(pending.c.samples).where(pending.c.actuator == actuator).order_by(pending.c.number)
         with self.engine.connect() as connection:
             row = connection.execute(select(states).where(states.c.actuator == actuator)).first()
-            blocks = [_unpacked(data) for (data,) in connection.execute(samples)]
+            blocks = [_unpack(data) for (data,) in connection.execute(samples)]
         return None if row is None else (row.settings, json.loads(row.checkpoint), blocks)
 
     def last_samples(self, actuator: str) -> list[Recording]:
@@ -270,30 +272,30 @@ class MonitorStore:
         return [samples for samples, _ in (self.checkpoint(actuator) or ("", {}, []))[2]]
 
     def summaries(self) -> dict[str, dict[str, Any]]:
-        """Return what each actuator showed last."""
+        """Return the last summary of each actuator."""
         return {row.actuator: json.loads(row.summary) for row in self._rows(select(tables.summaries))}
 
     def alarms(self, *, open_only: bool = False, actuator: str | None = None) -> list[dict[str, Any]]:
         """Return alarms as plain values, by actuator, the latest first, whatever its clock said."""
-        of = tables.alarms.c
-        query = select(of.alarm)
+        columns = tables.alarms.c
+        query = select(columns.alarm)
         if open_only:
-            query = query.where(of.state.not_in(("closed", "invalid")))
+            query = query.where(columns.state.not_in(("closed", "invalid")))
         if actuator is not None:
-            query = query.where(of.actuator == actuator)
+            query = query.where(columns.actuator == actuator)
         values = [json.loads(text) for (text,) in self._rows(query)]
         return sorted(values, key=lambda alarm: (alarm["actuator"], -int(alarm["id"].rpartition("-")[2])))
 
     def events_since(self, number: int, most: int = 1000) -> list[tuple[int, dict[str, Any]]]:
         """Return events beyond a number with their own numbers, in their order."""
-        of = tables.events.c
-        rows = self._rows(select(tables.events).where(of.number > number).order_by(of.number).limit(most))
+        columns = tables.events.c
+        rows = self._rows(select(tables.events).where(columns.number > number).order_by(columns.number).limit(most))
         return [(row.number, _event(row)) for row in rows]
 
     def last_events(self, actuator: str, most: int = 200) -> list[dict[str, Any]]:
         """Return the latest events of an actuator, the last one first."""
-        of = tables.events.c
-        query = select(tables.events).where(of.actuator == actuator).order_by(of.number.desc()).limit(most)
+        columns = tables.events.c
+        query = select(tables.events).where(columns.actuator == actuator).order_by(columns.number.desc()).limit(most)
         return [_event(row) for row in self._rows(query)]
 
     def course(self, actuator: str, most: int = 600, seconds: float | None = None) -> list[dict[str, Any]]:
@@ -301,14 +303,14 @@ class MonitorStore:
 
         `seconds`: only the last of them, by the clock of the newest one, which may have been set back.
         """
-        of = tables.estimates.c
-        chosen = of.actuator == actuator
+        columns = tables.estimates.c
+        chosen = columns.actuator == actuator
         if seconds is not None:
-            newest = select(of.t).where(chosen).order_by(of.number.desc()).limit(1).scalar_subquery()
-            chosen &= of.t.between(newest - seconds, newest)
+            newest = select(columns.t).where(chosen).order_by(columns.number.desc()).limit(1).scalar_subquery()
+            chosen &= columns.t.between(newest - seconds, newest)
         every = max(1, -(-self._value(select(func.count()).where(chosen)) // most))
-        group = of.number - of.number % every
-        query = select(*(func.avg(of[name]).label(name) for name in ("t", *tables.FIGURES)))
+        group = columns.number - columns.number % every
+        query = select(*(func.avg(columns[name]).label(name) for name in ("t", *tables.FIGURES)))
         return [dict(row._mapping) for row in self._rows(query.where(chosen).group_by(group).order_by(group))]
 
     def estimates(self) -> Iterator[dict[str, Any]]:
@@ -325,7 +327,7 @@ class MonitorStore:
     def keep_position(self, name: str, number: int) -> None:
         """Store how far an output is."""
         with self.writing() as connection:
-            self.put(connection, tables.facts, [{"name": name, "value": str(number)}])
+            self.upsert(connection, tables.facts, [{"name": name, "value": str(number)}])
 
     def pass_on(self, output: str, send: Callable[[dict[str, Any]], bool]) -> None:
         """Hand events to `send` in their order until it returns False, and store how far the output is after each."""
@@ -335,8 +337,8 @@ class MonitorStore:
             self.keep_position(output, number)
 
 
-def away(error: BaseException) -> str | None:
-    """Return in one line why the database does not answer or does not write, None for an error of another kind.
+def outage_reason(error: BaseException) -> str | None:
+    """Give the reason in one line if the database does not answer or write; None for an error of another kind.
 
     Values that it cannot hold are another kind: they would be refused again.
     """
@@ -347,7 +349,7 @@ def away(error: BaseException) -> str | None:
     return " ".join(str(error.orig).split())[:200]
 
 
-def _packed(samples: Recording, follows: bool) -> bytes:
+def _pack(samples: Recording, follows: bool) -> bytes:
     """Return samples as one line of JSON and their numbers, little endian, the clock first."""
     head = _head(tuple((name, samples.units[name]) for name in samples.channels), samples.rate, follows)
     return head + np.array([samples.t, *samples.channels.values()], dtype="<f8").tobytes()
@@ -358,8 +360,8 @@ def _head(units: tuple[tuple[str, str], ...], rate: float, follows: bool) -> byt
     return json.dumps({"units": dict(units), "rate": rate, "follows": follows}).encode() + b"\n"
 
 
-def _unpacked(data: bytes) -> tuple[Recording, bool]:
-    """Return the samples that `_packed` made bytes of, and whether they follow those before."""
+def _unpack(data: bytes) -> tuple[Recording, bool]:
+    """Unpack samples from the bytes of `_pack`; the flag tells whether they follow the samples before."""
     line, _, numbers = data.partition(b"\n")
     head = json.loads(line)
     t, *channels = np.frombuffer(numbers, dtype="<f8").reshape(1 + len(head["units"]), -1)
@@ -373,6 +375,6 @@ def _event(row: Any) -> dict[str, Any]:
 
 def _prepare_sqlite(connection: Any, record: object) -> None:
     # a page holds a second of samples, and the cache all that a transaction writes
-    own = "page_size=16384", "cache_size=-32000", "busy_timeout=5000", "foreign_keys=ON"
-    for setting in (*own, "journal_mode=WAL", "synchronous=FULL"):
+    settings = "page_size=16384", "cache_size=-32000", "busy_timeout=5000", "foreign_keys=ON"
+    for setting in (*settings, "journal_mode=WAL", "synchronous=FULL"):
         connection.execute(f"PRAGMA {setting}")

@@ -20,13 +20,13 @@ _TYPES: dict[str, TypeEngine[Any]] = {"text": Text(), "int": Integer(), "double"
 
 def _table(name: str, columns: str, *more: Index) -> Table:
     """Return a table of columns: name, type or most letters, and whether it is of the key, indexed or may be null."""
-    made: list[Column[Any]] = []
-    for own, kind, *roles in map(str.split, columns.split(",")):
+    table_columns: list[Column[Any]] = []
+    for column, kind, *roles in map(str.split, columns.split(",")):
         known = _TYPES[kind] if kind in _TYPES else String(int(kind))
         key, null, index = "key" in roles or "counted" in roles, "null" in roles, "indexed" in roles
         counts: Literal["auto"] | bool = "auto" if "counted" in roles else False
-        made.append(Column(own, known, primary_key=key, autoincrement=counts, nullable=null, index=index))
-    return Table(name, metadata, *made, *more)
+        table_columns.append(Column(column, known, primary_key=key, autoincrement=counts, nullable=null, index=index))
+    return Table(name, metadata, *table_columns, *more)
 
 
 facts = _table("facts", "name 40 key, value text")

@@ -21,8 +21,8 @@ logging.getLogger("httpx").setLevel(logging.WARNING)  # which tells each request
 _BY_ITSELF = ("raised", "error", "warning", "returned")
 
 
-def _announced(event: dict[str, Any]) -> bool:
-    """Whether an event goes out: what happens to a shelved alarm by itself does not, what a person does always."""
+def _is_announced(event: dict[str, Any]) -> bool:
+    """Test whether an event is announced: of a shelved alarm only a person's acts are."""
     return event["event"] not in _BY_ITSELF or not event["alarm"]["shelved"]
 
 
@@ -37,15 +37,15 @@ class EventLines:
         self._left, self._number = b"", 0  # of the line under way, and its event
 
     def pass_on(self) -> None:
-        """Write what is new; raises PartAway where the stream takes no more."""
-        self._store.pass_on("lines", self._written)
+        """Write the new events. Raise PartAway if the stream accepts no more."""
+        self._store.pass_on("lines", self._write_line)
 
-    def _written(self, event: dict[str, Any]) -> bool:
+    def _write_line(self, event: dict[str, Any]) -> bool:
         """Write a line to the stream's file, past its buffer: what a full disk refuses must not stay in there."""
         if event["number"] != self._number:
             self._left, self._number = (json.dumps(event) + "\n").encode(), event["number"]
         try:
-            if not _announced(event):
+            if not _is_announced(event):
                 return True
             if self._stream is None:
                 raise OSError("it is closed")
@@ -76,11 +76,11 @@ class Webhook:
             self._headers["Authorization"] = f"Bearer {token}"
 
     def pass_on(self) -> None:
-        """Post what is new; raises PartAway where an event does not arrive."""
+        """Post the new events. Raise PartAway if one does not arrive."""
         self._store.pass_on("webhook", self._posted)
 
     def _posted(self, event: dict[str, Any]) -> bool:
-        if not _announced(event):
+        if not _is_announced(event):
             return True
         try:
             asyncio.run(self._post(event))

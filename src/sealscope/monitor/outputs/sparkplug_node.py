@@ -48,7 +48,7 @@ class SparkplugNode:
         name = f"{broker.client_id}-{settings.group}-{settings.node}"
         self._link = MqttLink(broker, name, password, will=self._death)
         self._client = self._link.client
-        self._client.on_connect = self._connected
+        self._client.on_connect = self._on_connect
         self._client.on_message = self._message
         self._born = self._birth_number = 0  # bdSeq of the last birth, and of this connection
         self._seq = 255
@@ -103,7 +103,7 @@ class SparkplugNode:
         self._birth_number = (self._born + 1) % 256
         return self._topic("NDEATH"), spb.encoded(spb.SparkplugPayload(_clock(None), (self._number(),)))
 
-    def _connected(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
+    def _on_connect(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
         if reason.is_failure:
             _log.error("the broker %s refuses the Sparkplug node: %s", self._broker.host, reason)
             return
@@ -114,19 +114,21 @@ class SparkplugNode:
         if message.qos:
             client.ack(message.mid, message.qos)
         try:
-            asked = spb.decoded_payload(message.payload).named(spb.REBIRTH)
+            request = spb.decoded_payload(message.payload).find_metric(spb.REBIRTH)
         except ValueError as error:
             self._count("Sparkplug commands that are none")
             _log.info("a command that is none: %s", error)
             return
-        if asked is not None and asked.value is True:
+        if request is not None and request.value is True:
             self._due.set()
 
     def _sent_event(self, event: dict[str, Any]) -> bool:
-        alarm, at = event["alarm"], _clock(event["t"])
+        alarm, timestamp = event["alarm"], _clock(event["t"])
         if alarm["actuator"] not in self._shown:  # it is no longer in the settings
             return True
-        metrics = _metrics("alarm", _values("alarm", alarm), at) + _metrics("event", _values("event", event), at)
+        metrics = _metrics("alarm", _values("alarm", alarm), timestamp) + _metrics(
+            "event", _values("event", event), timestamp
+        )
         return self._send("DDATA", metrics, alarm["actuator"])
 
     def _bear(self) -> None:
@@ -166,7 +168,7 @@ def _table(name: str) -> Mapping[str, Mapping[str, str]]:
 
 
 def _clock(t: float | None) -> int:
-    """Return a clock of samples [s] in [ms]; where it does not count from 1970, the present."""
+    """Convert a clock of samples [s] to [ms]; the present if it does not count from 1970."""
     return round(1000.0 * (t if t is not None and counts_from_1970(t) else time.time()))
 
 
@@ -182,10 +184,10 @@ def _values(table: str, values: Mapping[str, Any]) -> dict[str, Any]:
     return known
 
 
-def _metrics(table: str, values: Mapping[str, Any], at: int) -> list[spb.SparkplugMetric]:
-    """Return metrics of a table with their values, of the time `at` [ms]."""
+def _metrics(table: str, values: Mapping[str, Any], timestamp: int) -> list[spb.SparkplugMetric]:
+    """Return metrics of a table with their values, of the time `timestamp` [ms]."""
     rows = {name: _table(table)[name] for name in values}
     return [
-        spb.SparkplugMetric(name, values[name], getattr(spb, row["type"]), timestamp=at, unit=row.get("unit"))
+        spb.SparkplugMetric(name, values[name], getattr(spb, row["type"]), timestamp=timestamp, unit=row.get("unit"))
         for name, row in rows.items()
     ]

@@ -37,21 +37,21 @@ class Admission:
         self.session = hmac.new(token.encode(), b"sealscope session", hashlib.sha256).hexdigest()
 
     def pause_s(self, address: str) -> float:
-        """Return how long an address has to wait until a token of it is looked at [s]."""
+        """Return the time until the next token of an address is checked [s]."""
         count, last = self._wrong.get(_network(address), (0, 0.0))
         if count < _FREE:
             return 0.0
         return max(0.0, last + min(_FIRST_S * 2.0 ** min(count - _FREE, 30), _LONGEST_S) - self._now())
 
-    def admits(self, address: str, given: str, *, session: bool = False) -> bool:
-        """Return whether an address that does not wait gives the token, or the session of a browser."""
-        known, of = self.session if session else self._token, _network(address)
-        if hmac.compare_digest(given.encode("utf-8", "replace"), known.encode()):
-            self._wrong.pop(of, None)
+    def admits(self, address: str, token: str, *, session: bool = False) -> bool:
+        """Test the token, or the browser's session, of an address that need not wait."""
+        known, network = self.session if session else self._token, _network(address)
+        if hmac.compare_digest(token.encode("utf-8", "replace"), known.encode()):
+            self._wrong.pop(network, None)
             return True
         now = self._now()
-        count, last = self._wrong.pop(of, (0, now))
-        self._wrong[of] = (count + 1 if now - last < _FORGOTTEN_S else 1), now
+        count, last = self._wrong.pop(network, (0, now))
+        self._wrong[network] = (count + 1 if now - last < _FORGOTTEN_S else 1), now
         if len(self._wrong) > _ADDRESSES:
             del self._wrong[next(iter(self._wrong))]  # the one that was wrong longest ago
         return False
@@ -66,7 +66,7 @@ def _network(address: str) -> str:
 
 
 def most_connections() -> int:
-    """Return how many connections the page may have: `_MOST`, or fewer where the system allows few descriptors."""
+    """Return the largest number of connections: `_MOST`, or fewer if the system allows few descriptors."""
     with suppress(ImportError, OSError, ValueError):
         import resource
 
@@ -100,11 +100,11 @@ def limited_protocol(most: int, silent_s: float = SILENT_S) -> type[asyncio.Prot
             self.loop.call_later(_LOOK_S, self.look)
 
         def is_answered(self) -> bool:
-            """Return whether it has asked for something that it is being sent."""
+            """Test whether the answer to a request is still being sent."""
             return self.cycle is not None and not self.cycle.response_complete
 
         def look(self) -> None:
-            """Close it where it has been silent for too long, else look again later."""
+            """Close the connection if it has been silent for too long, else check again later."""
             if self.transport.is_closing():
                 return
             now = self.loop.time()

@@ -55,8 +55,8 @@ class _Window:
             return
         if self.t.size and self.t[0] <= t[0] and t[-1] <= self.t[-1]:
             return  # repeated
-        alike = self.t.size > 0 and [*self.channels] == names and same_rate(samples.rate, self.rate)
-        if not (alike and follow(t[0] - self.t[-1], samples.rate)):
+        same_layout = self.t.size > 0 and [*self.channels] == names and same_rate(samples.rate, self.rate)
+        if not (same_layout and follow(t[0] - self.t[-1], samples.rate)):
             self.t, self.channels = np.empty(0), {name: np.empty(0) for name in names}
         self.rate = samples.rate
         self.t = np.concatenate([self.t, t])[-most:]
@@ -106,7 +106,7 @@ class LiveSamples:
                     del self._lookers[name], self._windows[name]
 
     def take(self, name: str, samples: Recording | None) -> None:
-        """Take samples of an actuator as they come; nothing is done where nobody looks."""
+        """Add new samples of an actuator to its window, if anybody views it."""
         if samples is None or name not in self._windows:
             return
         with self._lock:
@@ -120,12 +120,12 @@ class LiveSamples:
         return frozenset(self._windows)
 
     def version(self, name: str) -> int:
-        """Return a number that changes with the samples of an actuator that is looked at, 0 where there are none."""
+        """Return a number that changes with the samples of a viewed actuator, 0 if there are none."""
         window = self._windows.get(name)
         return 0 if window is None else window.version
 
     def picture(self, name: str, pressure: str = "p_A", drawn: str = "rms") -> dict[str, Any]:
-        """Return what the page draws of an actuator that is looked at, as plain values; times end at 0 [s].
+        """Return the curves of a viewed actuator as plain values; times end at 0 [s].
 
         `pressures` [bar]; `details`, d1 to d4 of one `pressure` [kPa]: their RMS over `WINDOW_SIZE` samples, or they
         themselves; `motion`: position [mm], pressures [bar], piston's speed [mm/s] and the pump's [rpm]. A value that
@@ -138,7 +138,7 @@ class LiveSamples:
             return {"name": name, "t": None}
         past = t - t[-1]
         with np.errstate(all="ignore"):  # whatever comes from the wire, what overflows is not drawn
-            shown = {each: channels[each] / _BAR for each in PRESSURES if each in channels}
+            shown = {channel: channels[channel] / _BAR for channel in PRESSURES if channel in channels}
             return {
                 "name": name,
                 "t": float(t[-1]),
@@ -151,7 +151,7 @@ class LiveSamples:
 
 
 def _plain(values: Array, digits: int = 3) -> list[float | None]:
-    """Return numbers of so many decimals, None for what is none."""
+    """Round numbers to so many decimals, with None for those not finite."""
     rounded = np.round(values, digits)
     return [value if math.isfinite(value) else None for value in rounded.tolist()]
 
@@ -181,19 +181,19 @@ def _details_of(t: Array, signal: Array | None, pressure: str, drawn: str) -> di
         return {**shown, "t": [], "has": int(known.size)}
     t = t[-known.size :]
     try:
-        made: Details = details(known)
-        windows = windowed_rms(made, step=_RMS_STEP)
+        measurement: Details = details(known)
+        windows = windowed_rms(measurement, step=_RMS_STEP)
     except InputError:  # beyond floating point
         return {**shown, "t": [], "has": 0}
     if drawn == "details":
-        inside = made.inside()
-        return {**shown, **_envelope(t[inside], {f"d{j + 1}": row[inside] for j, row in enumerate(made.values)})}
+        inside = measurement.inside()
+        return {**shown, **_envelope(t[inside], {f"d{j + 1}": row[inside] for j, row in enumerate(measurement.values)})}
     rows = {f"d{j + 1}": _plain(row, 4) for j, row in enumerate(windows.rms)}
     return {**shown, "t": _plain(t[windows.ends - 1], 4), **rows}
 
 
 def _motion_of(t: Array, channels: dict[str, Array], rate: float) -> dict[str, Any]:
-    """Return means over short times of what moves, and speeds between them."""
+    """Compute short-time means of the position, pressures and pump, and the speeds between them."""
     size = max(1, round(rate / _MOTION_HZ))
     count = min(t.size // size, round(_MOTION_S * rate / size))
     if count < 2:
@@ -202,24 +202,24 @@ def _motion_of(t: Array, channels: dict[str, Array], rate: float) -> dict[str, A
     def means(values: Array) -> Array:
         return np.asarray(values[values.size - count * size :].reshape(count, size).mean(axis=1))
 
-    at = means(t)
+    times = means(t)
     moved = {name: means(channels[name]) for name in channels}
-    shown: dict[str, Any] = {"t": _plain(at, 4)}
+    shown: dict[str, Any] = {"t": _plain(times, 4)}
     for name in ("p_A", "p_B", "p_1", "p_2"):
         if name in moved:
             shown[name] = _plain(moved[name] / _BAR)
     if "x" in moved:
         shown["x"] = _plain(moved["x"] / _MILLIMETRE)
-        shown["v"] = _plain(np.gradient(moved["x"], at) / _MILLIMETRE)
+        shown["v"] = _plain(np.gradient(moved["x"], times) / _MILLIMETRE)
     if "omega" in moved or "theta" in moved:
-        speed = moved["omega"] if "omega" in moved else np.gradient(moved["theta"], at)
+        speed = moved["omega"] if "omega" in moved else np.gradient(moved["theta"], times)
         shown["rpm"] = _plain(speed * 30.0 / np.pi, 1)
     return shown
 
 
 @cache
 def machine_of(rig: str) -> dict[str, Any]:
-    """Return what of a rig is drawn as plain values.
+    """Return the drawn parts of a rig as plain values.
 
     `rods`: the sides that the rod leaves; `stroke` [mm]; `area` [L/min per mm/s] and `displacement` [L/rev] give flows;
     `valve`: whether a servo valve drives it.

@@ -29,7 +29,7 @@ from starlette.routing import Route
 from sealscope.errors import InputError
 from sealscope.monitor.actuators import WatchedActuators
 from sealscope.monitor.alarms import ranked
-from sealscope.monitor.database.store import away
+from sealscope.monitor.database.store import outage_reason
 from sealscope.monitor.outputs.prometheus import CONTENT_TYPE, metrics_text
 from sealscope.monitor.page.guard import BACKLOG, Admission, limited_protocol, most_connections
 from sealscope.monitor.page.live import DRAWN, PRESSURES, LiveSamples, machine_of
@@ -109,17 +109,17 @@ class _Pages:
 
     def file(self, request: Request) -> Response:
         name, kind = _FILES[request.url.path]
-        return Response(str(packaged(name)) if name.startswith("vendor/") else _packaged(name), media_type=kind)
+        return Response(str(packaged(name)) if name.startswith("vendor/") else _read_packaged(name), media_type=kind)
 
-    def _known(self) -> dict[str, Any]:
-        """Return what is known without the database."""
+    def _counters_and_outages(self) -> dict[str, Any]:
+        """Return the counters, waiting blocks and outages, which need no database."""
         counters, outages = self._actuators.counters, self._supervisor.outages()
         return {"counters": counters, "waiting": self._waits()[0], "outages": outages}
 
     def fleet(self, request: Request) -> Response:
         rows = ranked(self._actuators.plain(), self._store.alarms(open_only=True))
         budget = self._actuators.false_alarms_per_1000_h
-        return JSONResponse({"actuators": rows, **self._known(), "false_alarms_per_1000_h": budget})
+        return JSONResponse({"actuators": rows, **self._counters_and_outages(), "false_alarms_per_1000_h": budget})
 
     def actuator(self, request: Request) -> Response:
         name, span = request.query_params.get("name", ""), request.query_params.get("hours", "")
@@ -147,8 +147,8 @@ class _Pages:
             values = parse_json(await _body(request))
             if not isinstance(values, dict) or not all(isinstance(value, str) for value in values.values()):
                 raise InputError("a mark must be a mapping of texts")
-            said = {"by_whom": values.get("by", ""), "text": values.get("text", "")}
-            alarm = await asyncio.to_thread(self._actuators.mark, name, values.get("mark", ""), **said)
+            note = {"by_whom": values.get("by", ""), "text": values.get("text", "")}
+            alarm = await asyncio.to_thread(self._actuators.mark, name, values.get("mark", ""), **note)
         except TimeoutError:
             return _refusal(f"a request must have come within {_BODY_S:g} s", 408)
         except ValueError as error:
@@ -158,16 +158,20 @@ class _Pages:
     async def changes(self, request: Request) -> Response:
         if self._listeners >= self._most_listeners:
             return _refusal("too many listeners", 503)
-        asked = request.query_params
-        name, pressure, drawn = asked.get("actuator", ""), asked.get("pressure", "p_A"), asked.get("drawn", "rms")
+        parameters = request.query_params
+        name, pressure, drawn = (
+            parameters.get("actuator", ""),
+            parameters.get("pressure", "p_A"),
+            parameters.get("drawn", "rms"),
+        )
         if name and name not in self._machines:
             return _refusal("no such actuator", 404)
         if pressure not in PRESSURES or drawn not in DRAWN:
             return _refusal(f"pressure must be one of {PRESSURES}, drawn one of {DRAWN}", 400)
         self._listeners += 1
-        return _Listening(self._lines(request, name, pressure, drawn), self._left)
+        return _Listening(self._lines(request, name, pressure, drawn), self._remove_listener)
 
-    def _left(self) -> None:
+    def _remove_listener(self) -> None:
         self._listeners -= 1
 
     async def _lines(self, request: Request, name: str, pressure: str, drawn: str) -> AsyncIterator[str]:
@@ -189,49 +193,49 @@ class _Pages:
                 silent += _LOOK_S
 
     def metrics(self, request: Request) -> Response:
-        return Response(self._measured(self._actuators.plain()), media_type=CONTENT_TYPE)
+        return Response(self._render_metrics(self._actuators.plain()), media_type=CONTENT_TYPE)
 
-    def _measured(self, summaries: Mapping[str, Mapping[str, Any]]) -> str:
+    def _render_metrics(self, summaries: Mapping[str, Mapping[str, Any]]) -> str:
         return metrics_text(summaries, self._actuators.counters, self._supervisor.totals(), self._waits())
 
     async def not_answering(self, request: Request, error: Exception) -> Response:
-        """Say in the form that was asked for that the database is away, and what is known without it."""
-        reason = away(error)
+        """Answer in the requested form if the database is away, with the values known without it."""
+        reason = outage_reason(error)
         if reason is None:
             raise error
-        self._supervisor.part(DATABASE).lost(reason)
+        self._supervisor.part(DATABASE).begin_outage(reason)
         text = f"the database does not answer: {reason}"
         if request.url.path == "/metrics":
-            return Response(f"# {text}\n{self._measured({})}", 503, {**_LATER, "Content-Type": CONTENT_TYPE})
-        return JSONResponse({"error": text, **self._known()}, 503, _LATER)
+            return Response(f"# {text}\n{self._render_metrics({})}", 503, {**_LATER, "Content-Type": CONTENT_TYPE})
+        return JSONResponse({"error": text, **self._counters_and_outages()}, 503, _LATER)
 
     async def login(self, request: Request) -> Response:
         status, admission, address = 200, self._admission, _address(request)
         if request.method == "POST" and admission is not None:
             if wait := admission.pause_s(address):
                 return _later(wait)
-            given = ""
+            token = ""
             with suppress(InputError, TimeoutError):
-                given = parse_qs((await _body(request)).decode("utf-8", "replace")).get("token", [""])[0]
-            if admission.admits(address, given):
+                token = parse_qs((await _body(request)).decode("utf-8", "replace")).get("token", [""])[0]
+            if admission.admits(address, token):
                 answer = RedirectResponse("/", 303)
                 secure, longest = request.url.scheme == "https", 30 * 86_400
                 answer.set_cookie(_COOKIE, admission.session, longest, secure=secure, httponly=True, samesite="strict")
                 return answer
             status = 401
-        return Response(_packaged("login.html"), status, media_type="text/html")
+        return Response(_read_packaged("login.html"), status, media_type="text/html")
 
-    def _refused(self, request: Request) -> Response | None:
-        """Return the answer to a request without the token, None where it has it."""
+    def _find_refusal(self, request: Request) -> Response | None:
+        """Return the refusal of a request without the token, None if it has the token."""
         admission = self._admission
         if admission is None or request.url.path in ("/login", "/login.css"):
             return None
-        given, session = request.headers.get("authorization"), request.cookies.get(_COOKIE)
-        if given is not None or session is not None:
+        authorization, session = request.headers.get("authorization"), request.cookies.get(_COOKIE)
+        if authorization is not None or session is not None:
             address = _address(request)
             if wait := admission.pause_s(address):
                 return _later(wait)
-            if given is not None and admission.admits(address, given.removeprefix("Bearer ")):
+            if authorization is not None and admission.admits(address, authorization.removeprefix("Bearer ")):
                 return None
             if session is not None and admission.admits(address, session, session=True):
                 return None
@@ -242,7 +246,7 @@ class _Pages:
         return answer
 
     async def guard(self, request: Request, call_next: Callable[[Request], Awaitable[Response]]) -> Response:
-        answer = self._refused(request) or await call_next(request)
+        answer = self._find_refusal(request) or await call_next(request)
         answer.headers.update(_HEADERS)
         return answer
 
@@ -261,7 +265,7 @@ class _Listening(StreamingResponse):
             self._ended()
 
 
-def _packaged(name: str) -> str:
+def _read_packaged(name: str) -> str:
     return (resources.files("sealscope.monitor.page") / name).read_text("utf-8")
 
 
@@ -306,13 +310,13 @@ class PageServer:
         self._actuators, self._host, self.port = actuators, settings.host, settings.port
         self._application = site(actuators, settings, token, waits, live)
         self._proxies = [str(address) for address in settings.proxies]
-        self._socket: socket.socket | None = self._opened()
+        self._socket: socket.socket | None = self._open_socket()
         self.port = int(self._socket.getsockname()[1])
         self.address = f"http://{settings.host}:{self.port}/"
         self._server: uvicorn.Server | None = None
         self._thread = actuators.supervisor.start("page", self._serve)
 
-    def _opened(self) -> socket.socket:
+    def _open_socket(self) -> socket.socket:
         try:
             family = socket.AF_INET6 if ":" in self._host else socket.AF_INET
             return socket.create_server((self._host, self.port), family=family, backlog=BACKLOG)
@@ -322,7 +326,7 @@ class PageServer:
 
     def _serve(self) -> None:
         """Serve the page until `leave`; uvicorn closes the socket."""
-        opened, self._socket = self._socket or self._opened(), None
+        opened, self._socket = self._socket or self._open_socket(), None
         config = uvicorn.Config(
             self._application,
             http=limited_protocol(most_connections()),

@@ -87,10 +87,10 @@ class _Connection:
         self._states: dict[str, str] = {}  # as they were published
         self._states_due = 0.0
         self._arrived: Waiting[Any] = Waiting(_ROOM, _ROOM_BYTES)
-        self._client.on_connect_fail = self._unreached
-        self._client.on_connect = self._connected
+        self._client.on_connect_fail = self._on_connect_fail
+        self._client.on_connect = self._on_connect
         self._client.on_message = self._message
-        self._client.on_disconnect = self._lost
+        self._client.on_disconnect = self._on_disconnect
 
     def run(self) -> None:
         """Hand messages over and pass alarms on until the service stops."""
@@ -115,12 +115,12 @@ class _Connection:
             decoding.join(_END_S)
             self._link.close()
 
-    def _connected(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
+    def _on_connect(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
         self._connection += 1
         if reason.is_failure:
-            self._broker.lost(f"{self._settings.host} refuses the connection: {reason}")
+            self._broker.begin_outage(f"{self._settings.host} refuses the connection: {reason}")
             return
-        self._broker.back()
+        self._broker.end_outage()
         self._states.clear()
         if self._settings.host_id is not None:
             client.publish(*self._state(online=True), qos=1, retain=True)
@@ -138,16 +138,18 @@ class _Connection:
         state = json.dumps({"online": online, "timestamp": self._online})
         return f"{NAMESPACE}/STATE/{self._settings.host_id}", state
 
-    def _lost(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
+    def _on_disconnect(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
         if not self._service.stopping.is_set() and self._refusing != self._connection:
-            self._broker.lost(f"the connection to {self._settings.host} is lost: {reason}")
+            self._broker.begin_outage(f"the connection to {self._settings.host} is lost: {reason}")
 
-    def _unreached(self, client: Any, userdata: Any) -> None:
+    def _on_connect_fail(self, client: Any, userdata: Any) -> None:
         error = sys.exc_info()[1]  # paho calls while it handles the error
         reason = " ".join(str(getattr(error, "strerror", None) or error or "").split())[:120]
         if isinstance(error, ssl.SSLCertVerificationError):
             reason = f"its certificate is not trusted ({error.verify_message})"
-        self._broker.lost(f"no connection to {self._settings.host}:{self._settings.port}: {reason}".removesuffix(": "))
+        self._broker.begin_outage(
+            f"no connection to {self._settings.host}:{self._settings.port}: {reason}".removesuffix(": ")
+        )
 
     def _message(self, client: Any, userdata: Any, message: Any) -> None:
         """Take a message in; must not wait, for the connection would be lost meanwhile."""
@@ -191,7 +193,7 @@ class _Connection:
         try:
             with suppress(UnicodeDecodeError):
                 topic = message.topic
-            with self._noted(message):
+            with self._note_decoding(message):
                 block = self._decoded(topic, message.payload)
         except RefusedMessage as error:  # it would be no better a second time: it is kept, and acknowledged
             self._service.hand(RefusedMessage(error.reason, f"{topic[:100]}: {error}", message.payload, done))
@@ -201,11 +203,11 @@ class _Connection:
     def _decoded(self, topic: str, payload: bytes) -> SourceBlock | None:
         """Return the block of a message, None for one of Sparkplug without; raises RefusedMessage."""
         if self._host is not None and topic.startswith(f"{NAMESPACE}/"):
-            return self._host.taken(topic, payload)
+            return self._host.receive(topic, payload)
         return decoded(payload, self._names.get(topic))
 
     @contextmanager
-    def _noted(self, message: Any) -> Iterator[None]:
+    def _note_decoding(self, message: Any) -> Iterator[None]:
         """Store, while a message is decoded that is large or comes again, that this was begun.
 
         Raises RefusedMessage where it was begun twice before and never ended: the process died meanwhile.
@@ -230,16 +232,16 @@ class _Connection:
         if self._settings.alarms_topic is None or not self._client.is_connected():
             return
         store.pass_on(
-            _NAME, lambda event: self._published(event["alarm"]["actuator"], "alarm", json.dumps(event["alarm"]))
+            _NAME, lambda event: self._publish(event["alarm"]["actuator"], "alarm", json.dumps(event["alarm"]))
         )
         if time.monotonic() >= self._states_due:
             self._states_due = time.monotonic() + _STATES_S
             for name, summary in self._service.plain().items():
                 state = json.dumps(summary["state"])
-                if self._states.get(name) != state and self._published(name, "state", state):
+                if self._states.get(name) != state and self._publish(name, "state", state):
                     self._states[name] = state
 
-    def _published(self, actuator: str, what: str, message: str) -> bool:
+    def _publish(self, actuator: str, what: str, message: str) -> bool:
         """Publish a retained message of an actuator; return whether the broker has it."""
         topic = f"{self._settings.alarms_topic}/{topic_part(actuator)}/{what}"
         return self._link.published(topic, message, qos=1, retain=True)

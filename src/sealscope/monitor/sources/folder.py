@@ -87,7 +87,7 @@ class WatchedFolder:
         self._starts = {identity: start for identity, start in self._starts.items() if identity in self._met}
         whole = [file for file in files if file[2] not in self._handed and self._is_whole(*file)]
         if len(whole) > 1:  # one that was copied last may have been recorded first
-            whole.sort(key=lambda own: self._start_of(*own))
+            whole.sort(key=lambda entry: self._start_of(*entry))
         for written, path, identity in whole:
             samples, reason = self._ahead.pop(identity) if identity in self._ahead else self._read(path)
             if reason and self._is_patient(written, identity):
@@ -102,7 +102,7 @@ class WatchedFolder:
             yield SourceBlock(self.actuator, identity, self._on_the_clock(samples, path), follows=False)
 
     def _is_whole(self, written: float, path: Path, identity: str) -> bool:
-        """Return whether a file has settled, is not stored, and is not to be left alone for a while."""
+        """Test whether a file has settled, is not stored, and is due for another attempt."""
         # of a file that is dated in the future, how long it was not seen to change
         age = max(time.time() - written, time.monotonic() - self._met[identity])
         if age < self.settle_s or (identity in self._tried and self._is_patient(written, identity)):
@@ -113,7 +113,7 @@ class WatchedFolder:
         return True
 
     def _is_patient(self, written: float, identity: str) -> bool:
-        """Return whether a file that cannot be read may be whole later."""
+        """Test whether an unreadable file may be complete later."""
         age = max(time.time() - written, time.monotonic() - self._met[identity])
         return age < _PATIENCE * self.settle_s
 
@@ -121,7 +121,7 @@ class WatchedFolder:
         """Return when the first sample of a file was taken [s since 1970]; of one that cannot be read its change."""
         if identity not in self._starts:
             samples, reason = self._read(path)
-            kept = sum(bytes_of(own) for own, _ in self._ahead.values() if own is not None)
+            kept = sum(bytes_of(recording) for recording, _ in self._ahead.values() if recording is not None)
             if samples is None or kept + bytes_of(samples) < _AHEAD_BYTES:  # others are read once more
                 self._ahead[identity] = samples, reason
             if reason:
@@ -134,21 +134,21 @@ class WatchedFolder:
         try:
             return read_of_machine(path, self._channel_map, self._rate), ""
         except (SealscopeError, OSError, MemoryError) as error:
-            return None, _shown(str(error)) or type(error).__name__
+            return None, _printable(str(error)) or type(error).__name__
         except Exception as error:
-            return None, f"{_shown(path.name)}: {place_of(error)}"
+            return None, f"{_printable(path.name)}: {place_of(error)}"
 
     def _refusal(self, samples: Recording | None, path: Path, written: float) -> str:
-        """Return why a recording is not watched, "" where it is: one of before the newest watched comes too late."""
+        """Return the reason not to watch a recording, "" if none: one before the newest watched is too late."""
         if samples is None:
             return ""
         start, now = file_seconds(samples, path), time.time()
         if max(start, written) > now + _AHEAD_S:
-            _log.warning("%s: %s is dated in the future", self.actuator, _shown(path.name))
+            _log.warning("%s: %s is dated in the future", self.actuator, _printable(path.name))
         if start >= self._newest_s or self._newest_s > now + _AHEAD_S or _is_day(start, self._newest_s):
             return ""
         dates = (datetime.fromtimestamp(clock, UTC).isoformat(" ", "seconds")[:19] for clock in (start, self._newest_s))
-        return "{} must not be older than what was watched, got {} after {}".format(_shown(path.name), *dates)
+        return "{} must not be older than what was watched, got {} after {}".format(_printable(path.name), *dates)
 
     def _on_the_clock(self, samples: Recording | None, path: Path) -> Recording | None:
         """Return a recording at the times at which it was made [s since 1970].
@@ -184,18 +184,18 @@ class WatchedFolder:
             try:
                 if path.is_symlink() and not path.resolve().is_relative_to(root):
                     if path.name not in self._outside:  # said once: what is there is nobody's recording
-                        _log.warning("%s: %s is a link out of the folder", self.actuator, _shown(path.name))
+                        _log.warning("%s: %s is a link out of the folder", self.actuator, _printable(path.name))
                     self._outside.add(path.name)
                     continue
                 status = path.stat()
             except (OSError, RuntimeError):  # gone meanwhile, or links in a circle
                 continue
             if S_ISREG(status.st_mode):
-                yield status.st_mtime, path, f"{_shown(path.name[:60])} {status.st_size} {status.st_mtime_ns}"
+                yield status.st_mtime, path, f"{_printable(path.name[:60])} {status.st_size} {status.st_mtime_ns}"
 
 
 def folders_of(service: BlockReceiver, *, once: bool) -> None:
-    """Hand over what appears in the folders of a service's actuators; `once`: what is there now."""
+    """Hand over new files in the folders of a service's actuators; `once`: only the present ones."""
     settle_s, part = 0.0 if once else service.settings.settle_s, service.supervisor.part
     shown = service.plain()
 
@@ -204,9 +204,11 @@ def folders_of(service: BlockReceiver, *, once: bool) -> None:
         return -math.inf if clock is None else float(clock)
 
     folders = {
-        part(f"folder of {each.name}"): WatchedFolder(each, settle_s, service.store.is_known, newest(each.name))
-        for each in service.settings.actuator
-        if each.folder is not None
+        part(f"folder of {actuator.name}"): WatchedFolder(
+            actuator, settle_s, service.store.is_known, newest(actuator.name)
+        )
+        for actuator in service.settings.actuator
+        if actuator.folder is not None
     }
 
     def hand_over(folder: WatchedFolder) -> None:
@@ -216,17 +218,17 @@ def folders_of(service: BlockReceiver, *, once: bool) -> None:
             service.hand(block)
 
     while not service.stopping.is_set():
-        done = [own.attempt(partial(hand_over, folder)) for own, folder in folders.items()]
+        done = [watcher.attempt(partial(hand_over, folder)) for watcher, folder in folders.items()]
         if once and (all(done) or part(DATABASE).since is None):
             return
         service.stopping.wait(_LOOK_S)
 
 
-def _shown(name: str) -> str:
-    """Return a name as text that a log and a database can hold, whatever its bytes are."""
+def _printable(name: str) -> str:
+    """Escape the unprintable signs of a name, for a log and a database."""
     return "".join(sign if sign.isprintable() else sign.encode("unicode_escape").decode() for sign in name)
 
 
 def _is_day(start: float, newest: float) -> bool:
-    """Return whether a start [s since 1970] is a mere date, that of the day of the newest recording watched."""
+    """Test whether a start [s since 1970] is a mere date, on the day of the newest watched recording."""
     return start % DAY == 0.0 and start <= newest < start + DAY

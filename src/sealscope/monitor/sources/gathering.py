@@ -38,8 +38,8 @@ class _Channel:
     def last(self) -> float | None:
         return self.values[max(self.values)] if self.values else self.held
 
-    def taken(self, first: int, stop: int) -> Array:
-        """Return the values from `first` to `stop`, those that are missing as before them, and forget them."""
+    def pop_values(self, first: int, stop: int) -> Array:
+        """Remove and return the values from `first` to `stop`; a missing one repeats the value before it."""
         known = sorted(k for k in self.values if k < stop)
         places = np.searchsorted(known, np.arange(first, stop), side="right")
         held = math.nan if self.held is None else self.held
@@ -76,32 +76,34 @@ class ValueGatherer:
         if not math.isfinite(t) or abs(t * self.rate) > 2**52 or not 0 < len(values) <= MOST_SAMPLES:
             self._count("values without a clock, or too many")
             return []
-        first, own = round(t * self.rate), self._channels[channel]
-        apart = 0 if self._newest is None else first - self._newest
-        if apart > self._ahead:  # after a pause, with the values as they are
-            held = {name: _Channel(held=each.last(), heard=each.heard) for name, each in self._channels.items()}
+        first, target = round(t * self.rate), self._channels[channel]
+        lead = 0 if self._newest is None else first - self._newest
+        if lead > self._ahead:  # after a pause, with the values as they are
+            held = {
+                name: _Channel(held=gathered.last(), heard=gathered.heard) for name, gathered in self._channels.items()
+            }
             self.interrupted()
             self._channels = held
-        elif apart < -self._ahead:
-            if own.last() is None:  # it has not changed for long
-                own.held, own.heard = values[-1], self._now()
+        elif lead < -self._ahead:
+            if target.last() is None:  # it has not changed for long
+                target.held, target.heard = values[-1], self._now()
                 return self._whole_blocks()
             self.interrupted()  # the clock was set back
-        own = self._channels[channel]
+        target = self._channels[channel]
         for k, value in enumerate(values, first):
             if self._start is not None and k < self._start:
                 self._count(LATE)
             else:
-                own.values[k] = value
-        while self._start is None and len(own.values) > self._ahead:  # another channel has never come
-            own.held = own.values.pop(next(iter(own.values)))
+                target.values[k] = value
+        while self._start is None and len(target.values) > self._ahead:  # another channel has never come
+            target.held = target.values.pop(next(iter(target.values)))
         last = first + len(values) - 1
         self._newest = last if self._newest is None else max(self._newest, last)
-        own.heard, own.newest = self._now(), last if own.newest is None else max(last, own.newest)
+        target.heard, target.newest = self._now(), last if target.newest is None else max(last, target.newest)
         return self._whole_blocks()
 
     def interrupted(self) -> None:
-        """Forget what waits, as after a lost connection: what was sent meanwhile is not known."""
+        """Discard the waiting samples, for example after a lost connection with unknown samples in between."""
         self._channels = {name: _Channel() for name in self._channels}
         self._start = self._newest = None
 
@@ -122,7 +124,7 @@ class ValueGatherer:
         known = min(last for last in newest if last is not None) + 1
         while known - self._start >= self._length:
             clock = np.arange(self._start, self._start + self._length)
-            samples = {name: each.taken(clock[0], clock[-1] + 1) for name, each in self._channels.items()}
+            samples = {name: values.pop_values(clock[0], clock[-1] + 1) for name, values in self._channels.items()}
             units = {name: CHANNEL_UNITS[name] for name in samples}
             blocks.append(Recording(clock / self.rate, samples, units, self.rate))
             self._start += self._length

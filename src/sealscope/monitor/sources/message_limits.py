@@ -48,7 +48,7 @@ class MessageLimit(ValueError):  # noqa: N818 (names what is exceeded)
 
 
 def check_cbor(payload: bytes) -> int:
-    """Return the number of pairs of a message of CBOR; raises MessageLimit where it breaks a rule."""
+    """Count the pairs of a CBOR message. Raise MessageLimit if it breaks a rule."""
     code, place, pairs = _walk(np.frombuffer(payload, dtype=np.uint8))
     if code:
         raise MessageLimit(f"{_RULES[code]} (byte {place})", oversized=code == _TOO_LONG)
@@ -97,7 +97,7 @@ def _pairs(values: Any) -> int:
 
 @kernel
 def _count_marks(data: Any) -> tuple[int, int, int]:
-    """Return how many quotation marks, opening brackets and braces, and colons there are among bytes."""
+    """Count the quotation marks, the opening brackets and braces, and the colons among bytes."""
     quotes, brackets, colons = 0, 0, 0
     for byte in data:
         quotes += byte == 34
@@ -107,39 +107,39 @@ def _count_marks(data: Any) -> tuple[int, int, int]:
 
 
 @law
-def _argument(data: Any, at: int, info: int) -> tuple[int, int]:
-    """Return the argument of the item whose head ends before byte `at`, and the byte after it, -1 where it is cut."""
+def _argument(data: Any, position: int, info: int) -> tuple[int, int]:
+    """Return the argument of an item whose head ends before byte `position`, and the next byte, -1 if it is cut off."""
     if info < 24:
-        return info, at
+        return info, position
     width = 1 << (info - 24)
-    if len(data) - at < width:
+    if len(data) - position < width:
         return 0, -1
     number = 0
-    for k in range(at, at + width):
+    for k in range(position, position + width):
         number = (number << 8) | int(data[k])  # one over 2^63 becomes negative
-    return number, at + width
+    return number, position + width
 
 
 @kernel
 def _walk(data: Any) -> tuple[int, int, int]:
-    """Return the rule that bytes break (0: none), the byte where, and how many pairs their mappings have.
+    """Walk through the items; return the number of the broken rule (0: none), its byte, and the count of pairs.
 
     Each byte is looked at once. Of each container `left` holds how many items it still has, below 0 for an unknown
     number; `turn` is 0 in a list, in a mapping 1 before a key and 2 before its value; `counts`: items so far.
     """
-    size, at, depth = len(data), 0, 0
+    size, position, depth = len(data), 0, 0
     left, turn = np.zeros(DEEPEST + 1, dtype=np.int64), np.zeros(DEEPEST + 1, dtype=np.int64)
     counts = np.zeros(DEEPEST + 1, dtype=np.int64)
     containers, pairs, texts, tagged = 0, 0, 0, False
     while True:
         while depth > 0 and left[depth] == 0:
             depth -= 1
-        if depth == 0 and at > 0 and not tagged:
-            return (0 if at == size else 10), at, pairs
-        if at >= size:
-            return 9, at, pairs
-        place, major, info = at, int(data[at]) >> 5, int(data[at]) & 31
-        at += 1
+        if depth == 0 and position > 0 and not tagged:
+            return (0 if position == size else 10), position, pairs
+        if position >= size:
+            return 9, position, pairs
+        place, major, info = position, int(data[position]) >> 5, int(data[position]) & 31
+        position += 1
         if major == 7 and info == 31:  # the end of a container of unknown length
             if depth == 0 or left[depth] > 0 or turn[depth] == 2 or tagged:
                 return 9, place, pairs
@@ -149,8 +149,8 @@ def _walk(data: Any) -> tuple[int, int, int]:
         if info > 27 and not endless:
             return 9, place, pairs
         if not endless:
-            number, at = _argument(data, at, info)
-            if at < 0 or (2 <= major <= 5 and not 0 <= number <= size - at):  # an item takes a byte or more
+            number, position = _argument(data, position, info)
+            if position < 0 or (2 <= major <= 5 and not 0 <= number <= size - position):  # an item takes a byte or more
                 return 9, place, pairs
         if tagged and major != 2:
             return 7, place, pairs
@@ -174,20 +174,20 @@ def _walk(data: Any) -> tuple[int, int, int]:
         if 2 <= major <= 3:
             texts += 1
             if not endless:
-                at += number
+                position += number
             while endless:  # pieces of the same kind up to an end
                 texts += 1
-                if texts > MOST_TEXTS or at >= size:
+                if texts > MOST_TEXTS or position >= size:
                     return (5 if texts > MOST_TEXTS else 9), place, pairs
-                if data[at] == 255:
-                    at += 1
+                if data[position] == 255:
+                    position += 1
                     break
-                if int(data[at]) >> 5 != major or int(data[at]) & 31 > 27:
-                    return 9, at, pairs
-                number, at = _argument(data, at + 1, int(data[at]) & 31)
-                if at < 0 or not 0 <= number <= size - at:
+                if int(data[position]) >> 5 != major or int(data[position]) & 31 > 27:
+                    return 9, position, pairs
+                number, position = _argument(data, position + 1, int(data[position]) & 31)
+                if position < 0 or not 0 <= number <= size - position:
                     return 9, place, pairs
-                at += number
+                position += number
             if texts > MOST_TEXTS:
                 return 5, place, pairs
         elif 4 <= major <= 5:

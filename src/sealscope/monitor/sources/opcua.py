@@ -74,12 +74,12 @@ class _OpcUaSession:
     async def _connect(self) -> None:
         """Stay connected until the service ends; raises PartAway where the server is not reached any more."""
         try:
-            await self._connected()
+            await self._run_connection()
         except Exception as error:  # whatever the library and the server make of a lost connection
             reason = " ".join(str(error).split()) or type(error).__name__
             raise PartAway(f"{self._settings.url}: {reason}") from None
 
-    async def _connected(self) -> None:
+    async def _run_connection(self) -> None:
         """Connect, subscribe, and stay until the connection is lost, which raises, or the service ends."""
         from asyncua import Client
 
@@ -102,7 +102,7 @@ class _OpcUaSession:
                 for (node, channel), answer in zip(nodes.items(), answers, strict=True):
                     if not isinstance(answer, int):
                         raise ConnectionError(f"{actuator.name}: {channel} is no node, got {node.nodeid} ({answer})")
-            self._server.back()
+            self._server.end_outage()
             while not self._service.stopping.is_set():
                 await client.check_connection()
                 await asyncio.sleep(_LOOK_S)
@@ -111,8 +111,8 @@ class _OpcUaSession:
         """Take a value of a subscription."""
         name, channel = self._channels[node.nodeid]
         stamped = data.monitored_item.Value
-        at = stamped.SourceTimestamp or stamped.ServerTimestamp or datetime.now(UTC)
-        t = (at if at.tzinfo is not None else at.replace(tzinfo=UTC)).timestamp()
+        moment = stamped.SourceTimestamp or stamped.ServerTimestamp or datetime.now(UTC)
+        t = (moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)).timestamp()
         known = stamped.StatusCode is None or stamped.StatusCode.is_good()
         try:
             samples = np.atleast_1d(np.asarray(value if known else math.nan, dtype=np.float64))

@@ -46,7 +46,7 @@ _KNOWN = {"actuator", "t", "rate", "units", "id", *CHANNELS}
 
 
 class BlockReceiver(Protocol):
-    """What a source hands its blocks to, as a service is; `store` is its MonitorStore."""
+    """The receiver of a source's blocks, usually a service; `store` is its MonitorStore."""
 
     stopping: threading.Event
     store: Any
@@ -60,7 +60,7 @@ class BlockReceiver(Protocol):
         """Count something that was dropped."""
 
     def plain(self) -> dict[str, dict[str, Any]]:
-        """Return what each actuator shows."""
+        """Return the present summary of each actuator."""
 
 
 def nothing() -> None:
@@ -81,7 +81,7 @@ class RefusedMessage(InputError):  # noqa: N818 (says what happened)
         self.bytes = len(self.beginning)
 
     def row(self) -> dict[str, Any]:
-        """Return it as a row of the table of what was refused; any database can hold its texts."""
+        """Return the row for the table of refused messages, with texts for any database."""
         message = str(self).encode("utf-8", "backslashreplace").decode().replace("\0", "\\0")
         values = {"reason": self.reason, "message": message, "size": self.size, "beginning": self.beginning}
         return {"at": time.time(), **values}
@@ -139,7 +139,7 @@ class SourceBlock:
 
 @refusing()
 def decoded(payload: bytes, actuator: str | None = None) -> SourceBlock:
-    """Return the block of a message, JSON where it begins with ``{``, else CBOR.
+    """Decode the block of a message: JSON if it begins with ``{``, else CBOR.
 
     Its mapping has ``t``, the clock of the first sample [s], ``rate`` [Hz], and for each channel a list of numbers,
     null where one is missing, or in CBOR a typed array of floats (RFC 8746), NaN where one is missing; a channel that
@@ -186,19 +186,19 @@ def bytes_of(samples: Recording) -> int:
 
 
 def digest_of(payload: bytes) -> str:
-    """Return what tells contents from others: their digest."""
+    """Return the digest that identifies contents."""
     return blake2b(payload, digest_size=16).hexdigest()
 
 
-def _identity(given: Any) -> str:
-    """Return the identity that a message states, "" where it states none; a database must be able to hold it."""
-    if given is None:
+def _identity(value: Any) -> str:
+    """Return the stated identity of a message, "" without one. Refuse one that a database cannot hold."""
+    if value is None:
         return ""
-    if isinstance(given, bool) or not isinstance(given, (str, int)):
-        raise RefusedMessage(NO_CLOCK, f"id must be a text or a whole number, got {type(given).__name__}")
-    if isinstance(given, int) and given.bit_length() > 64:
+    if isinstance(value, bool) or not isinstance(value, (str, int)):
+        raise RefusedMessage(NO_CLOCK, f"id must be a text or a whole number, got {type(value).__name__}")
+    if isinstance(value, int) and value.bit_length() > 64:
         raise RefusedMessage(NO_CLOCK, "a whole number as id must have at most 64 bits")
-    identity = str(given)
+    identity = str(value)
     if len(identity) > 100 or not identity.isprintable():
         raise RefusedMessage(NO_CLOCK, f"id must have at most 100 letters that can be printed, got {identity[:40]!r}")
     return identity

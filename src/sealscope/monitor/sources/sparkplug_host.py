@@ -42,7 +42,7 @@ _BRACKETED = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\]]*)\]")
 
 @dataclass
 class _Birth:
-    """What a birth says of the metrics that are channels, or the rate.
+    """The metrics of a birth that are channels or the rate.
 
     `names`: channel -> name of its metric; `aliases`: alias -> name; `metrics`: name -> metric as it was last.
     """
@@ -54,12 +54,12 @@ class _Birth:
     @classmethod
     def of(cls, metrics: Iterable[spb.SparkplugMetric], actuator: ActuatorSettings) -> _Birth:
         """Return the birth of an actuator: a name counts with a unit in brackets behind it, too."""
-        birth, wanted = cls(), {actuator.map.get(channel, channel): channel for channel in (*CHANNELS, _RATE)}
+        birth, channel_of = cls(), {actuator.map.get(channel, channel): channel for channel in (*CHANNELS, _RATE)}
         for metric in metrics:
             name, unit = metric.name or "", metric.unit
-            channel, bracketed = wanted.get(name), _BRACKETED.fullmatch(name)
+            channel, bracketed = channel_of.get(name), _BRACKETED.fullmatch(name)
             if bracketed is not None:
-                channel, unit = channel or wanted.get(bracketed["name"]), unit or bracketed["unit"]
+                channel, unit = channel or channel_of.get(bracketed["name"]), unit or bracketed["unit"]
             if channel is None:
                 continue
             birth.names[channel], birth.metrics[name] = name, replace(metric, unit=unit)
@@ -67,8 +67,8 @@ class _Birth:
                 birth.aliases[metric.alias] = name
         return birth
 
-    def known(self, metric: spb.SparkplugMetric, *, whole: bool) -> spb.SparkplugMetric | None:
-        """Return a metric with name, type and unit of the birth, None where it is no channel; `whole`: none missed."""
+    def complete_metric(self, metric: spb.SparkplugMetric, *, whole: bool) -> spb.SparkplugMetric | None:
+        """Complete a metric by the name, type and unit of its birth, None if it is no channel; `whole`: none missed."""
         if metric.name is None and not whole:
             raise RefusedMessage(blocks.OUT_OF_SEQUENCE, "after a missing message an alias must wait for a birth")
         name = self.aliases.get(metric.alias) if metric.name is None else metric.name
@@ -142,8 +142,8 @@ class SparkplugHost:
             self._publish(spb.topic_of(group, "NCMD", node), spb.encoded(request))
 
     @refusing()
-    def taken(self, topic: str, data: bytes) -> SourceBlock | None:
-        """Take a message; return the block that it brings, None where it brings none.
+    def receive(self, topic: str, data: bytes) -> SourceBlock | None:
+        """Process a message; return its block, or None if it brings none.
 
         Raises RefusedMessage where it is not what its topic says, or nothing of it can be used.
         """
@@ -164,7 +164,7 @@ class SparkplugHost:
         except ValueError as error:
             raise RefusedMessage(blocks.UNREADABLE, error) from None
         if kind in ("NBIRTH", "NDEATH"):
-            number = getattr(payload.named(spb.BIRTH_SEQUENCE), "value", None)
+            number = getattr(payload.find_metric(spb.BIRTH_SEQUENCE), "value", None)
             number = number if isinstance(number, int) else None
             if kind == "NDEATH" and state.birth_sequence not in (None, number):
                 raise RefusedMessage(blocks.STALE_DEATH, "a death must bear the bdSeq of the last birth")
@@ -194,7 +194,7 @@ class SparkplugHost:
         if birth is None:
             self._ask(group, node)
             raise RefusedMessage(blocks.UNBORN, f"data of {path} must follow its birth")
-        known = [birth.known(metric, whole=state.whole) for metric in payload.metrics]
+        known = [birth.complete_metric(metric, whole=state.whole) for metric in payload.metrics]
         samples = self._samples(actuator, birth, [metric for metric in known if metric is not None], payload.timestamp)
         if samples is None:
             return None
@@ -203,24 +203,24 @@ class SparkplugHost:
     def _samples(
         self, actuator: ActuatorSettings, birth: _Birth, metrics: list[spb.SparkplugMetric], sent: int | None
     ) -> Recording | None:
-        """Return the samples that metrics bring, None where none of them is a channel."""
+        """Return the samples of metrics, None if none of them is a channel."""
         by_name = {name: channel for channel, name in birth.names.items() if channel != _RATE}
         groups: dict[int, dict[str, spb.SparkplugMetric]] = defaultdict(dict)
         for metric in metrics:
-            name, at = str(metric.name), sent if metric.timestamp is None else metric.timestamp
+            name, timestamp = str(metric.name), sent if metric.timestamp is None else metric.timestamp
             if name not in by_name or (by_name[name] in SLOW and not isinstance(metric.value, np.ndarray)):
                 birth.metrics[name] = metric
-            elif at is None:
+            elif timestamp is None:
                 raise RefusedMessage(blocks.NO_CLOCK, f"the metric {name[:40]!r} must have a time, got none")
             else:
-                groups[at][by_name[name]] = metric
+                groups[timestamp][by_name[name]] = metric
         if not groups:
             return None
         rate, pieces = birth.rate(actuator), []
-        for at in sorted(groups):
-            piece = _piece(groups[at], birth, by_name)
+        for timestamp in sorted(groups):
+            piece = _piece(groups[timestamp], birth, by_name)
             size = next(iter(piece.values())).size
-            pieces.append({"t": self._clock(actuator.name, at / 1000.0, size, rate), **piece})
+            pieces.append({"t": self._clock(actuator.name, timestamp / 1000.0, size, rate), **piece})
         if (count := sum(piece["t"].size for piece in pieces)) > MOST_SAMPLES:
             raise RefusedMessage(blocks.OVERSIZED, f"{MOST_SAMPLES} samples are the most, got {count}")
         values = {
@@ -236,18 +236,18 @@ class SparkplugHost:
         converted = {channel: in_si(array, units.get(channel), channel) for channel, array in values.items()}
         return Recording(t, converted, {channel: CHANNEL_UNITS[channel] for channel in converted}, rate)
 
-    def _clock(self, actuator: str, at: float, size: int, rate: float) -> Array:
-        """Return the times of samples that begin at `at` [s], a whole millisecond."""
-        first, expected = at, self._follows.get(actuator, math.nan)
-        if abs(expected - at) < 3.0 * _LATE:
-            beyond = min(max(expected, at - _EARLY), at + _LATE) - expected
-            first = expected + min(max(beyond, -_YIELDS / rate), _YIELDS / rate)
+    def _clock(self, actuator: str, t: float, size: int, rate: float) -> Array:
+        """Return the times of samples that begin at `t` [s], a whole millisecond."""
+        first, expected = t, self._follows.get(actuator, math.nan)
+        if abs(expected - t) < 3.0 * _LATE:
+            excess = min(max(expected, t - _EARLY), t + _LATE) - expected
+            first = expected + min(max(excess, -_YIELDS / rate), _YIELDS / rate)
         self._follows[actuator] = first + size / rate
         return np.asarray(first + np.arange(size) / rate)
 
 
 def _piece(group: Mapping[str, spb.SparkplugMetric], birth: _Birth, by_name: Mapping[str, str]) -> dict[str, Array]:
-    """Return the samples (n,) of the metrics of one time; a single one that is missing is as it was last."""
+    """Return the samples (n,) of the metrics of one time; a missing single value repeats its last one."""
     if any(isinstance(metric.value, np.ndarray) for metric in group.values()):
         piece = {name: np.atleast_1d(metric.value) for name, metric in group.items() if metric.value is not None}
         sizes = {values.size for values in piece.values()}

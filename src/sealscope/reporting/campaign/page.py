@@ -42,7 +42,7 @@ def _area(area: Area) -> str:
 
 
 def sizes_of(judgement: Judgement) -> list[float]:
-    """Return the sizes of leak that get a column each; nan for all of them together where they are many or none."""
+    """Return the leak sizes with a column each; nan stands for all sizes together if they are many or none."""
     sizes = sorted({row.leak_lpm for row in judgement.table if row.leak_lpm > 0})
     return sizes if 0 < len(sizes) <= _MOST_SIZES else [math.nan]
 
@@ -58,25 +58,25 @@ def main_table(result: CampaignResult) -> tuple[list[str], list[list[str]]]:
     pods = {pod.detector: pod for pod in judgement.pods}
     areas = {roc.detector: _area(roc.area) for roc in judgement.rocs if math.isnan(roc.leak_lpm)}
     table = []
-    for name, own in by_detector.items():
-        cells = [percent(own[f"{size}"].alarms) if f"{size}" in own else "–" for size in sizes]
-        given = [_given(result.known.get(name))] if result.known else []
-        alarms = percent(next(iter(own.values())).false_alarm)
-        table.append([name, *given, alarms, *cells, areas.get(name, "–"), *_smallest(pods.get(name))])
+    for name, results in by_detector.items():
+        cells = [percent(results[f"{size}"].alarms) if f"{size}" in results else "–" for size in sizes]
+        knowledge = [_name_knowledge(result.known.get(name))] if result.known else []
+        alarms = percent(next(iter(results.values())).false_alarm)
+        table.append([name, *knowledge, alarms, *cells, areas.get(name, "–"), *_smallest(pods.get(name))])
     of_sizes = ["any leak" if math.isnan(size) else f"{size:g} {result.plan.unit}" for size in sizes]
-    given = ["given"] if result.known else []
-    return ["detector", *given, "false alarms", *of_sizes, "AUC, any leak", "a90", "a90/95"], table
+    knowledge = ["given"] if result.known else []
+    return ["detector", *knowledge, "false alarms", *of_sizes, "AUC, any leak", "a90", "a90/95"], table
 
 
-def _given(known: PriorKnowledge | None) -> str:
-    """Return what a detector was given, in a word or two."""
+def _name_knowledge(known: PriorKnowledge | None) -> str:
+    """Name the prior knowledge of a detector in a word or two."""
     if known is None:
         return "–"
-    return ", ".join(word for word, given in (("true onset", known.onset), ("rig", known.rig)) if given) or "–"
+    return ", ".join(word for word, is_known in (("true onset", known.onset), ("rig", known.rig)) if is_known) or "–"
 
 
 def _smallest(pod: DetectorPod | None) -> tuple[str, str]:
-    """Return a90 and a90/95; beyond the sizes that were tested only that they lie there."""
+    """Format a90 and a90/95, or only that they lie beyond the tested sizes."""
     if pod is None or pod.curve is None:
         return "–", "–"
     largest = max(tested.size for tested in pod.sizes)
@@ -88,9 +88,9 @@ def _smallest(pod: DetectorPod | None) -> tuple[str, str]:
 
 
 def result_text(result: CampaignResult) -> str:
-    """Return what came out in a few sentences: what the best detectors find, at which rate of false alarms."""
+    """Summarize in a few sentences the leaks found by the best detectors and their rates of false alarms."""
     judgement, unit = result.judgement, result.plan.unit
-    said: list[tuple[float, float, str]] = []
+    ranked: list[tuple[float, float, str]] = []
     for pod in judgement.pods:
         rows = [row for row in judgement.table if row.detector == pod.detector and row.leak_lpm > 0]
         if not rows:
@@ -102,10 +102,10 @@ def result_text(result: CampaignResult) -> str:
             a90 = pod.curve.a90
             finding = f"finds 9 in 10 leaks of {a90:.2g} {unit}"
         text = f"{pod.detector} {finding} at {percent(largest.false_alarm)} false alarms."
-        said.append((a90, -largest.alarms.value, text))
-    said.sort(key=lambda item: item[:2])
-    shown = [text for _, _, text in said[:_MOST_SAID]]
-    more = len(said) - len(shown)
+        ranked.append((a90, -largest.alarms.value, text))
+    ranked.sort(key=lambda item: item[:2])
+    shown = [text for _, _, text in ranked[:_MOST_SAID]]
+    more = len(ranked) - len(shown)
     rest = f" {more} more detectors are in the table." if more > 1 else " Another detector is in the table."
     records = f"{judgement.judged} records were judged."
     return " ".join([*shown, records]) + (rest if more else "")
@@ -116,14 +116,14 @@ def campaign_text(result: CampaignResult) -> str:
     heads, rows = main_table(result)
     widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
     lines = []
-    for first, *others in (heads, *rows):
-        right = (text.rjust(width) for text, width in zip(others, widths[1:], strict=True))
+    for first, *cells in (heads, *rows):
+        right = (text.rjust(width) for text, width in zip(cells, widths[1:], strict=True))
         lines.append("  ".join([first.ljust(widths[0]), *right]).rstrip())
     return "\n".join([result.plan.title, *lines, *(paragraph(note) for note in _notes(result))])
 
 
 def _notes(result: CampaignResult) -> list[str]:
-    """Return what stands under the table, in whole sentences."""
+    """Write the notes under the table, in whole sentences."""
     judgement, plan = result.judgement, result.plan
     simulated = isinstance(plan, SimulatedPlan)
     notes = [_say("intervals", share=100 * plan.confidence, unit=plan.unit)]
@@ -136,7 +136,7 @@ def _notes(result: CampaignResult) -> list[str]:
     with_onset = [name for name, known in result.known.items() if known.onset]
     notes += [_say("true_onset", detectors=", ".join(with_onset))] if with_onset else []
     notes += _known_notes(result)
-    notes += [_say("batched", mode=result.mode)] if _batched(result) else []
+    notes += [_say("batched", mode=result.mode)] if _is_batched(result) else []
     notes += [plan.note] if plan.note else []
     notes += [_say("missing", count=result.missing)] if result.missing else []
     notes += [_say("failed", count=len(judgement.failed))] if judgement.failed else []
@@ -148,7 +148,7 @@ def _say(name: str, **values: Any) -> str:
 
 
 def _known_notes(result: CampaignResult) -> list[str]:
-    """Return which channels the detectors were given and which rig they assume."""
+    """Write the notes on the channels and the assumed rig of the detectors."""
     by_channels: dict[str, list[str]] = defaultdict(list)
     by_rig: dict[str, list[str]] = defaultdict(list)
     for name, known in result.known.items():
@@ -159,7 +159,7 @@ def _known_notes(result: CampaignResult) -> list[str]:
     return notes + [_say("rig", rig=rig, detectors=", ".join(names)) for rig, names in by_rig.items() if rig]
 
 
-def _batched(result: CampaignResult) -> bool:
+def _is_batched(result: CampaignResult) -> bool:
     return result.mode not in ("", RUN_BY_RUN)
 
 
@@ -200,7 +200,7 @@ def render_campaign_page(result: CampaignResult, files: Sequence[str] = ()) -> s
 
 
 def _facts(result: CampaignResult) -> list[tuple[str, str]]:
-    """Return what was done, for the page's head."""
+    """List the facts of the campaign for the page's head."""
     plan, judgement = result.plan, result.judgement
     if isinstance(plan, RecordedPlan):
         return [(group.label or group.files, f"{group.use}, size {group.size:g} {plan.unit}") for group in plan.sets]
@@ -210,24 +210,24 @@ def _facts(result: CampaignResult) -> list[tuple[str, str]]:
         ("records", f"{plan.duration_s:g} s at {plan.rig.daq.sample_rate:g} Hz, leaks open at {plan.onset_s:g} s"),
         *((name, ", ".join(str(level) for level in levels)) for name, levels in plan.factors.items()),
         ("base seed", str(plan.seed)),
-        *([("simulated", result.mode)] if _batched(result) else []),
+        *([("simulated", result.mode)] if _is_batched(result) else []),
         *((f"seen by @ {name}" if name else "seen", ", ".join(channels)) for name, channels in plan.views.items()),
     ]
     if any(plan_detector(name).scorer is None for name in plan.detectors):
-        facts.append(("assumed by detectors", _assumed(plan)))
+        facts.append(("assumed by detectors", _describe_assumed_machine(plan)))
     for size, (mean, spread) in judgement.realised.items():
-        about = "" if math.isnan(spread) else f" ± {spread:.2g}"
+        deviation = "" if math.isnan(spread) else f" ± {spread:.2g}"
         facts.append(
             (
                 f"leak of {size:g} L/min",
-                f"really {mean:.3g}{about} L/min (mean and standard deviation over the records)",
+                f"really {mean:.3g}{deviation} L/min (mean and standard deviation over the records)",
             )
         )
     return facts
 
 
-def _assumed(plan: SimulatedPlan) -> str:
-    """Return what the detectors assume of the machine, as text."""
+def _describe_assumed_machine(plan: SimulatedPlan) -> str:
+    """Describe the machine assumed by the detectors."""
     if plan.assumed == plan.rig:
         return f"the rig {plan.rig.name} as it stands, not the machine that was drawn"
     true = {row.name: row.value for row in plan.rig.table()}
@@ -252,11 +252,13 @@ def _section(pod: DetectorPod, judgement: Judgement, unit: str) -> dict[str, Any
             by_levels[tuple(map(str, cell.levels.values()))][cell.leak_lpm] = percent(cell.alarms)
     return {
         "name": name,
-        "about": _about(name),
+        "about": _describe_score(name),
         "plots": [plot for plot in (_pod_plot(pod, unit), _roc_plot(shown, unit)) if plot is not None],
         "areas": [(_size_text(roc, unit), _area(roc.area)) for roc in shown],
         "cell_columns": [*factors, *("no leak" if size == 0 else f"{size:g} {unit}" for size in sizes)],
-        "cells": [(*levels, *(own.get(size, "–") for size in sizes)) for levels, own in by_levels.items()],
+        "cells": [
+            (*levels, *(cells_by_size.get(size, "–") for size in sizes)) for levels, cells_by_size in by_levels.items()
+        ],
     }
 
 
@@ -264,8 +266,8 @@ def _size_text(roc: SizeRoc, unit: str) -> str:
     return "any size" if math.isnan(roc.leak_lpm) else f"{roc.leak_lpm:g} {unit}"
 
 
-def _about(name: str) -> str:
-    """Return what a detector's score is, "" for one that is known here by its name alone."""
+def _describe_score(name: str) -> str:
+    """Describe the score of a detector; "" if only its name is known."""
     detector = plan_detector(name)
     through = f", given the channels of {detector.view} alone" if detector.view else ""
     if detector.scorer is not None:
@@ -290,9 +292,9 @@ def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:
     x_ends = (math.log10(ends[0]) - 0.02, math.log10(ends[1]) + 0.02)
     picture = Picture(WIDTH, HEIGHT, x_ends, (0.0, 1.0), log=True)
     _draw_curves(picture, f"leak [{unit}]", curves)
-    for at in pod.sizes if len(pod.sizes) <= _MOST_POINTS else ():
-        own = at.proportion
-        picture.point("point", at.size, own.value, (own.high, own.low))
+    for point in pod.sizes if len(pod.sizes) <= _MOST_POINTS else ():
+        detection = point.proportion
+        picture.point("point", point.size, detection.value, (detection.high, detection.low))
     for k, (size, label) in enumerate(marks, 1):
         picture.mark("mark", size)
         picture.labels.append(SvgText(float(picture.x(size)) - 4.0, 14.0 * k, label, "end"))
@@ -304,9 +306,9 @@ def _roc_plot(rocs: Sequence[SizeRoc], unit: str) -> dict[str, Any] | None:
     if not rocs:
         return None
     curves = [
-        (_size_text(roc, unit), own.false_alarm, own.detection, (own.low, own.high) if len(rocs) == 1 else None)
+        (_size_text(roc, unit), curve.false_alarm, curve.detection, (curve.low, curve.high) if len(rocs) == 1 else None)
         for roc in rocs
-        for own in [roc.curve]
+        for curve in [roc.curve]
     ]
     picture = Picture(WIDTH, HEIGHT, (0.0, 1.0), (0.0, 1.0))
     _draw_curves(picture, "false alarms", curves)

@@ -38,7 +38,7 @@ class PageTable(NamedTuple):
 
 
 def page_tables(judgement: Judgement, unit: str, part: str = "") -> dict[str, PageTable]:
-    """Return the tables of what detectors state and of faults and families, by name; those that have rows."""
+    """Return the tables of statements, faults and families by name, without the empty ones."""
     tables = {}
     for name, layout in tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")).items():
         columns = layout["columns"]
@@ -51,14 +51,14 @@ def page_tables(judgement: Judgement, unit: str, part: str = "") -> dict[str, Pa
 
 
 def _cell(row: Any, content: str) -> str:
-    """Return what stands in a column of a row, as the layout says it."""
+    """Format one cell of a row by the layout of its column."""
     how, _, path = content.rpartition(" ")
     value = attribute_of(row, path)
     return _FORMATS[how](value) if how in _FORMATS else format(value, how)
 
 
 class CauseTable(NamedTuple):
-    """What one detector names (`columns`) for which cause there is: a name, the records, and the share of each.
+    """The causes named by one detector (`columns`) for each true cause: its name, its records, the share of each.
 
     `right`: records whose cause is named alone; `covered`: alone or with the one that no channel tells from it.
     """
@@ -71,7 +71,7 @@ class CauseTable(NamedTuple):
 
 
 def cause_tables(judgement: Judgement) -> list[CauseTable]:
-    """Return, for each detector that names causes, how often it names which."""
+    """Tabulate the causes named by each detector, for each true cause."""
     tables = []
     for causes in judgement.causes:
         confusion = causes.confusion

@@ -22,7 +22,7 @@ from sealscope.units import DAY
 
 
 class Judged(NamedTuple):
-    """A diagnosis, when its recording began [s since 1970], None where that is not known, and what reads it again."""
+    """A diagnosis, the start of its recording [s since 1970] or None, and a function to read it again."""
 
     diagnosis: Diagnosis
     start_s: float | None
@@ -47,13 +47,15 @@ def render_history_page(judged: Sequence[Judged], title: str, left_out: int = 0)
     """
     if not judged:
         raise InputError("the page of a machine must have at least 1 recording, got 0")
-    ordered = sorted(judged, key=lambda own: (-math.inf if own.start_s is None else own.start_s, own.diagnosis.file))
+    ordered = sorted(
+        judged, key=lambda entry: (-math.inf if entry.start_s is None else entry.start_s, entry.diagnosis.file)
+    )
     newest = ordered[-1].diagnosis
     dates = _dates(ordered)
     shown, drawn, files = _overlay(ordered)
     rows = [
-        {"file": Path(own.diagnosis.file).name, "date": date, "d": own.diagnosis}
-        for own, date in zip(ordered, dates, strict=True)
+        {"file": Path(entry.diagnosis.file).name, "date": date, "d": entry.diagnosis}
+        for entry, date in zip(ordered, dates, strict=True)
     ]
     return template.render(
         "history.html.j2",
@@ -61,7 +63,7 @@ def render_history_page(judged: Sequence[Judged], title: str, left_out: int = 0)
         messages=messages,
         title=title,
         rows=rows[::-1],
-        undated=sum(own.start_s is None for own in ordered),
+        undated=sum(entry.start_s is None for entry in ordered),
         left_out=left_out,
         levels=history_pictures(ordered),
         charts=shown,
@@ -76,12 +78,12 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
 
     Days of their dates, numbers from 1 where a date is not known. None where no recording states a figure or a bound.
     """
-    levels = [_level(own.diagnosis) for own in ordered]
+    levels = [_level(entry.diagnosis) for entry in ordered]
     known = [level for level in levels if level is not None]
     if not known:
         return None
-    dated = all(own.start_s is not None for own in ordered)
-    days = [(own.start_s or 0.0) / DAY if dated else float(k + 1) for k, own in enumerate(ordered)]
+    dated = all(entry.start_s is not None for entry in ordered)
+    days = [(entry.start_s or 0.0) / DAY if dated else float(k + 1) for k, entry in enumerate(ordered)]
     limit = ordered[-1].diagnosis.limit_lpm
     far = 8.0 * float(np.median([lpm for lpm, *_ in known])) or math.inf  # beyond it others would be pressed flat
     near = [value for lpm, _, high in known for value in (lpm, high) if value <= far and value < math.inf]
@@ -92,12 +94,12 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
         return stamp(day * DAY, days[-1] - days[0]) if dated else f"{day:g}" if day.is_integer() else ""
 
     def draw(picture: Picture) -> None:
-        for own, day, level in zip(ordered, days, levels, strict=True):
+        for entry, day, level in zip(ordered, days, levels, strict=True):
             if level is None:
                 picture.symbol("absent", day, picture.height - 4.0)
                 continue
             lpm, low, high = level
-            title = f"{Path(own.diagnosis.file).name}: {messages.flow(own.diagnosis)}"
+            title = f"{Path(entry.diagnosis.file).name}: {messages.flow(entry.diagnosis)}"
             if lpm > top:
                 picture.symbol("beyond", day, 6.0, title)
             elif low is None:
@@ -119,34 +121,34 @@ def _level(diagnosis: Diagnosis) -> _Level | None:
 
 
 def _dates(ordered: Sequence[Judged]) -> list[str]:
-    known = [own.start_s for own in ordered if own.start_s is not None]
+    known = [entry.start_s for entry in ordered if entry.start_s is not None]
     span = (max(known) - min(known)) / DAY if known else 0.0
-    return [messages.ABSENT if own.start_s is None else stamp(own.start_s, span) for own in ordered]
+    return [messages.ABSENT if entry.start_s is None else stamp(entry.start_s, span) for entry in ordered]
 
 
 def _overlay(ordered: Sequence[Judged]) -> tuple[list[charts.Chart], charts.DrawnCharts | None, list[str]]:
-    """Return charts of the newest recording's channels, those of the last one judged `no leak` before it over them.
+    """Draw the newest recording's channels, with those of the last earlier one judged `no leak` over them.
 
     Both begin together. With them the two files; nothing where there is no other recording, or no channel of both.
     """
     *before, newest = ordered
-    healthy = [own for own in before if own.diagnosis.verdict == "no leak"]
+    healthy = [latest for latest in before if latest.diagnosis.verdict == "no leak"]
     if not before:
         return [], None, []
     reference = (healthy or before)[-1]
-    own, other = newest.read(), reference.read()
-    if not all(recording.t.size and np.all(np.diff(recording.t) > 0.0) for recording in (own, other)):
+    latest, other = newest.read(), reference.read()
+    if not all(recording.t.size and np.all(np.diff(recording.t) > 0.0) for recording in (latest, other)):
         return [], None, []
     files = [Path(judged.diagnosis.file).name for judged in (newest, reference)]
-    t = other.t - other.t[0] + own.t[0]
+    t = other.t - other.t[0] + latest.t[0]
     shown = []
-    for name in own.channels:
-        if name not in other or own.units[name] != other.units[name]:
+    for name in latest.channels:
+        if name not in other or latest.units[name] != other.units[name]:
             continue
-        pressure_unit = own.pressure_unit
-        unit, values = charts.shown_values(own, name, pressure_unit)
-        over = replace(own, channels={name: np.interp(own.t, t, other[name], left=np.nan, right=np.nan)})
+        pressure_unit = latest.pressure_unit
+        unit, values = charts.shown_values(latest, name, pressure_unit)
+        over = replace(latest, channels={name: np.interp(latest.t, t, other[name], left=np.nan, right=np.nan)})
         values_over = charts.shown_values(over, name, pressure_unit)[1]
         lines = (charts.ChartLine(files[0], "a", values), charts.ChartLine(files[1], "b", values_over))
         shown.append(charts.Chart(f"over-{name}", "channels", name, unit, lines))
-    return (shown, charts.draw(own, [], shown, newest.diagnosis, []), files) if shown else ([], None, [])
+    return (shown, charts.draw(latest, [], shown, newest.diagnosis, []), files) if shown else ([], None, [])

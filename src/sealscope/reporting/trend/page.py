@@ -82,12 +82,12 @@ def trend_pictures(trend: Trend) -> dict[str, Picture] | None:
 def _draw(trend: Trend, picture: Picture) -> None:
     """Draw the healthy band, the recordings, the course, alarms and repairs."""
     days = [trend.points[row].day for row in trend.rows]
-    for own in trend.episodes:
-        healthy = own.wear.healthy
-        end = text.healthy_end(own.wear)
-        picture.box("healthy", days[own.begin], days[min(own.end, len(days) - 1)], healthy.low, end)
-        if own.alarm is not None:
-            picture.mark("mark", days[own.alarm])
+    for episode in trend.episodes:
+        healthy = episode.wear.healthy
+        end = text.healthy_end(episode.wear)
+        picture.box("healthy", days[episode.begin], days[min(episode.end, len(days) - 1)], healthy.low, end)
+        if episode.alarm is not None:
+            picture.mark("mark", days[episode.alarm])
     for point in trend.repairs:
         picture.mark("mark other", point.day)
     for point in trend.points:
@@ -97,12 +97,12 @@ def _draw(trend: Trend, picture: Picture) -> None:
         style = "point apart" if point.note else "point" if point.group == 0 else "point other"
         title = f"{point.file}: {point.value:.3g} {trend.unit}"
         picture.point(style, point.day, point.value, (point.low or 0.0, point.high or 0.0), title)
-    for own in trend.episodes:
-        picture.line("course", *np.transpose(_course(days, own)))
+    for episode in trend.episodes:
+        picture.line("course", *np.transpose(_course(days, episode)))
 
 
 def _levels(trend: Trend) -> tuple[float, float]:
-    """Return the ends of the axis of levels: a limit is on it where it is near."""
+    """Return the ends of the axis of levels, which includes a nearby limit."""
     ends = [value for point in trend.points for value in (point.low, point.high) if value is not None]
     ends += [end for episode in trend.episodes for end in (episode.wear.healthy.low, episode.wear.healthy.high)]
     low, high = min(ends), max(ends)
@@ -114,10 +114,10 @@ def _levels(trend: Trend) -> tuple[float, float]:
     return low - margin, high + margin
 
 
-def _course(days: list[float], own: Episode) -> list[tuple[float, float]]:
+def _course(days: list[float], episode: Episode) -> list[tuple[float, float]]:
     """Return corners (day, level) of the course that a stretch is described by."""
-    first, last, wear = days[own.begin], days[own.end - 1], own.wear
-    if own.alarm is None or wear.onset is None:
+    first, last, wear = days[episode.begin], days[episode.end - 1], episode.wear
+    if episode.alarm is None or wear.onset is None:
         rise = wear.growth.value if math.isfinite(wear.growth.value) else 0.0
         return [(first, wear.now.value - rise * (last - first) / DAYS_PER_MONTH), (last, wear.now.value)]
     onset = min(max(wear.onset.value, first), last)

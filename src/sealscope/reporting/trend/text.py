@@ -20,7 +20,7 @@ from sealscope.units import BAR, DAY, DAYS_PER_YEAR
 
 
 def level_name(trend: Trend) -> str:
-    """Return what a level is called wherever it is shown: the total of pump and piston, or the ringing of now."""
+    """Return the name of a level: the total of pump and piston, or the ringing of now."""
     return "now" if trend.basis == "ringing" else "total"
 
 
@@ -39,13 +39,13 @@ def stamp(seconds: float, span_days: float) -> str:
 
 
 def recordings(trend: Trend) -> str:
-    """Return how many recordings there are, and from when to when."""
+    """Count the recordings, and give the first and the last day."""
     count, ends = len(trend.points), [moment(trend, trend.points[k].day) for k in (0, -1) if trend.points]
     return ", ".join([counted(count, "recording"), *([" to ".join(ends)] if ends else [])])
 
 
 def headline(trend: Trend) -> str:
-    """Return verdict and what it rests on, in one line."""
+    """Format the verdict and its basis in one line."""
     wear, line, since = trend.wear, "trend", ""
     if trend.verdict == "no leak" and trend.repairs:  # what was before is over
         line, since = "trend_fell", moment(trend, trend.repairs[-1].day)
@@ -75,7 +75,7 @@ def figures(trend: Trend) -> dict[str, str]:
     wear = trend.wear
     if wear is None:
         return dict.fromkeys(("now", "leak", "healthy", "since", "growth", "limit"), "")
-    at = "" if trend.pressure is None else f" at {number(trend.pressure / BAR, 2)} bar"
+    at_pressure = "" if trend.pressure is None else f" at {number(trend.pressure / BAR, 2)} bar"
     of_first = " of the first; no rig was stated" if trend.unit == "%" and trend.basis != "ringing" else ""
     healthy = f"{number(wear.healthy.low, 2)} to {number(healthy_end(wear), 2)} {trend.unit}{of_first}"
     since, growth = "", "not stated: the recordings are too few, or span less than a day"
@@ -88,7 +88,7 @@ def figures(trend: Trend) -> dict[str, str]:
         growth = f"{_figure(wear.growth, trend.unit)} a month"
     rise = wear.step or Interval(*(level - wear.healthy.value for level in wear.now))
     return {
-        "now": f"{_figure(wear.now, trend.unit)}{at}",
+        "now": f"{_figure(wear.now, trend.unit)}{at_pressure}",
         "leak": _figure(rise, trend.unit) if trend.verdict == "leak" else "",
         "healthy": f"{healthy}, 95 of 100 recordings",
         "since": since,
@@ -98,7 +98,7 @@ def figures(trend: Trend) -> dict[str, str]:
 
 
 def healthy_end(wear: Wear) -> float:
-    """Return the upper end of what is called healthy: it ends at the limit, even where recordings scatter further."""
+    """Return the upper end of the healthy range, cut off at the limit despite any wider scatter."""
     high = wear.healthy.high
     return high if wear.limit is None else min(high, max(wear.limit, wear.healthy.value))
 
@@ -128,7 +128,7 @@ def _reach(trend: Trend, limit: float, reach: Interval) -> str:
 
 
 def assumed(trend: Trend) -> str:
-    """Return what the levels rest on."""
+    """Describe the basis of the levels: machine, estimate and oil temperature."""
     machine = ""
     if trend.machine is not None and trend.basis not in (None, "ringing"):
         machine = "No L/min: area and displacement of this machine are not stated (--rig, --area, --displacement). "
@@ -143,7 +143,7 @@ def assumed(trend: Trend) -> str:
 
 
 def limit_note(trend: Trend) -> str:
-    """Return what the limit is."""
+    """Describe the limit."""
     maker = "" if trend.repair.stated else ", what a maker of excavators allows a cylinder in service"
     within = trend.wear is not None and trend.wear.limit is not None and trend.wear.limit < trend.wear.healthy.high
     scatter = "; healthy recordings of this machine scatter as far" if within else ""
