@@ -64,9 +64,9 @@ class Examination:
 
     def through(self, channels: Iterable[str]) -> Examination:
         """Return the same recording with these channels alone."""
-        wanted = set(channels)
+        names_wanted = set(channels)
         recording, *baseline = (
-            healthy.only(name for name in healthy.channels if name in wanted)
+            healthy.only(name for name in healthy.channels if name in names_wanted)
             for healthy in (self.recording, *self.baseline)
             if isinstance(healthy, Recording)
         )
@@ -111,7 +111,7 @@ class Examination:
         judged = dict[str, Evidence]()
         reports = [self.signals, *(self.report(name) for name in names if name not in ORDER)]
         for name in names:
-            if name not in ORDER or not any(is_decided(own) for own in judged.values()):
+            if name not in ORDER or not any(is_decided(observable) for observable in judged.values()):
                 judged[name] = self._decide(name, reports, context)
         failed = next(
             (self.report(name).lack for name in ORDER if name in judged and self.report(name).has_failed), None
@@ -210,7 +210,7 @@ def _checked(recording: object, baseline: Recording | Sequence[Healthy]) -> list
     except TypeError:
         kind = type(baseline).__name__
         raise InputError(f"baseline must be a Recording or a sequence of Recordings, got {kind}") from None
-    named = [("baseline" if single else f"baseline[{k}]", own, Recording | Learnt) for k, own in enumerate(healthy)]
+    named = [("baseline" if single else f"baseline[{k}]", entry, Recording | Learnt) for k, entry in enumerate(healthy)]
     for name, value, kinds in (("recording", recording, Recording), *named):
         if not isinstance(value, kinds):
             hint = "; sealscope.read makes one of a file" if isinstance(value, str | os.PathLike) else ""

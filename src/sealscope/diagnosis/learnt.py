@@ -39,5 +39,8 @@ Healthy = Recording | Learnt
 
 def lessons_of(detector: Any, baseline: Sequence[Healthy]) -> list[Lesson]:
     """Return what a detector has learnt of each healthy recording, from its samples or from what was written down."""
-    known = (own.lessons.get(detector.name) if isinstance(own, Learnt) else detector.learn(own) for own in baseline)
+    known = (
+        recording.lessons.get(detector.name) if isinstance(recording, Learnt) else detector.learn(recording)
+        for recording in baseline
+    )
     return [lesson for lesson in known if lesson is not None]

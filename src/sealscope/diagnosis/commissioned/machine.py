@@ -82,8 +82,8 @@ class Origin(NamedTuple):
 
 def _is_taken_back(word: JudgedAlarm, later: Iterable[JudgedAlarm]) -> bool:
     """Whether a later word calls the alarm invalid; a new alarm of the same name begins after this word."""
-    own = (each for each in later if each.alarm == word.alarm and each.onset_s <= word.date_s)
-    return any(each.mark == "invalid" for each in own)
+    answers = (answer for answer in later if answer.alarm == word.alarm and answer.onset_s <= word.date_s)
+    return any(answer.mark == "invalid" for answer in answers)
 
 
 def _date(moment: float) -> str:
@@ -153,9 +153,9 @@ class CommissionedMachine:
 
         Arguments, result and errors as for `sealscope.diagnose`; rig, baseline and limit are the machine's.
         """
-        own = recording if isinstance(recording, Recording) else self.read(recording)
+        judged = recording if isinstance(recording, Recording) else self.read(recording)
         return diagnose(
-            own,
+            judged,
             self.healthy,
             false_alarm_probability=false_alarm_probability,
             rig=self.rig,
@@ -180,17 +180,17 @@ class CommissionedMachine:
     def _with(self, recording: Recording, file: str, checksum: str) -> CommissionedMachine:
         """Return the machine with one more recording, whether it leaks or not."""
         learnt = learn(recording, assumed_rig(self.rig, recording)[0], file, checksum)
-        if twin := next((own for own in self.healthy if own.digest == learnt.digest), None):
+        if twin := next((earlier for earlier in self.healthy if earlier.digest == learnt.digest), None):
             raise InputError(f"a healthy recording must be new, got the samples of {twin.file} ({file})")
-        healthy = sorted((*self.healthy, learnt), key=lambda own: (own.start_s or 0.0, own.file))
+        healthy = sorted((*self.healthy, learnt), key=lambda lesson: (lesson.start_s or 0.0, lesson.file))
         return replace(self, healthy=tuple(healthy))
 
     def _leak_in(self, start_s: float, end_s: float) -> JudgedAlarm | None:
         """Return the alarm of a leak that a person found, and that was not repaired, in a time [s since 1970]."""
         repairs = [alarm.date_s for alarm in self.alarms if alarm.mark == "repaired"]
         words = enumerate(self.alarms, 1)
-        found = (own for k, own in words if own.mark != "invalid" and not _is_taken_back(own, self.alarms[k:]))
-        leaks = (own for own in found if own.onset_s <= end_s)
+        found = (word for k, word in words if word.mark != "invalid" and not _is_taken_back(word, self.alarms[k:]))
+        leaks = (word for word in found if word.onset_s <= end_s)
         return next((leak for leak in leaks if not any(leak.onset_s <= repair <= start_s for repair in repairs)), None)
 
     def since(self, start_s: float) -> CommissionedMachine:
@@ -198,7 +198,9 @@ class CommissionedMachine:
 
         Raises InputError where none is left.
         """
-        left = tuple(own for own in self.healthy if own.start_s is not None and own.start_s >= start_s)
+        left = tuple(
+            recording for recording in self.healthy if recording.start_s is not None and recording.start_s >= start_s
+        )
         if not left:
             raise InputError(f"a machine must keep a healthy recording, got none of {_date(start_s)} or later")
         alarms = tuple(alarm for alarm in self.alarms if alarm.onset_s >= start_s)
@@ -235,14 +237,14 @@ def recordings_in(paths: Iterable[str | os.PathLike[str]] | str | os.PathLike[st
     """
     try:
         named = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
-        given = [Path(path) for path in named]
+        entries = [Path(path) for path in named]
     except TypeError:
         raise InputError(f"recordings must be a folder's path or paths of files, got {paths!r:.60}") from None
     files: list[Path] = []
-    for path in given:
+    for path in entries:
         if path.is_dir():
-            inside = inner_files(path, sorted(each for each in path.iterdir() if not each.name.startswith(".")))
-            files += [own for own in inside if own.suffix.lower() not in NO_RECORDINGS and not _is_written(own)]
+            inside = inner_files(path, sorted(item for item in path.iterdir() if not item.name.startswith(".")))
+            files += [file for file in inside if file.suffix.lower() not in NO_RECORDINGS and not _is_written(file)]
         else:
             files.append(path)
     if not files:
@@ -286,10 +288,10 @@ def learn(recording: Recording, rig: Rig, file: str, checksum: str = "") -> Lear
     if not lessons:
         raise InputError(f"a healthy recording must hold channels that a method reads, got none such ({file})")
     units = {name: part.units[name] for name in part.channels}
-    about = {"sha256": checksum, **about_recording(recording, inspection)}
+    description = {"sha256": checksum, **about_recording(recording, inspection)}
     start = start_seconds(recording, file)
     rarities = dict(rarities_of(part, rig))
-    return Learnt(file, inspection.digest, units, part.rate, recording.duration, start, lessons, about, rarities)
+    return Learnt(file, inspection.digest, units, part.rate, recording.duration, start, lessons, description, rarities)
 
 
 @checked_call
@@ -363,9 +365,9 @@ def commission(
         raise InputError(f"a machine must have a healthy recording that can be used, got none: {problems[0]}")
     machine = replace(machine, left_out=tuple(problems))
 
-    def judge(learnt: Learnt, others: tuple[Learnt, ...]) -> Diagnosis:
+    def judge(learnt: Learnt, rest: tuple[Learnt, ...]) -> Diagnosis:
         recording = recordings.get(learnt.file) or machine.read(places[learnt.file])
-        return replace(machine, healthy=others).diagnose(recording)
+        return replace(machine, healthy=rest).diagnose(recording)
 
     outliers = find_outliers(machine.healthy, judge)
     healthy, leaking = (machine.healthy, ()) if keep else without_leaks(machine.healthy, outliers)

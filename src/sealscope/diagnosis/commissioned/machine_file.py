@@ -244,14 +244,14 @@ def _parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
     return parts | {hash_of(row): f"another mark of {row['alarm']}" for row in tree.get("alarms", ())}
 
 
-def _change_since(origin: Origin, present: Mapping[bytes, str], own: Mapping[bytes, str]) -> str | None:
+def _change_since(origin: Origin, present: Mapping[bytes, str], written: Mapping[bytes, str]) -> str | None:
     """Name something that was added to, or taken from, a machine's file and that writing would undo; None for nothing.
 
-    `present`: parts of the file; `own`: parts of the machine to be written, which was read with those of `origin`.
+    `present`: parts of the file; `written`: parts of the machine to be written, which was read with those of `origin`.
     """
-    added = [name for part, name in present.items() if part not in origin.parts and part not in own]
-    taken = [name for part, name in own.items() if part in origin.parts and part not in present]
-    return next(iter((*added, *taken)), None)
+    added = [name for part, name in present.items() if part not in origin.parts and part not in written]
+    removed = [name for part, name in written.items() if part in origin.parts and part not in present]
+    return next(iter((*added, *removed)), None)
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -278,11 +278,11 @@ def _lessons_named(tree: Mapping[str, Any]) -> list[str]:
 
 def _lessons_path(path: Path, tree: Mapping[str, Any]) -> Path:
     """Return the file of lessons of a text: that of its name, or where there is none that which it states."""
-    beside, head = path.with_suffix(SUFFIX), tree.get("machine")
+    usual, head = path.with_suffix(SUFFIX), tree.get("machine")
     stated = head.get("lessons") if isinstance(head, dict) else None
-    if beside.exists() or not isinstance(stated, str) or _FILE_NAME.fullmatch(stated) is None:
-        return beside
-    return path.with_name(stated) if path.with_name(stated).exists() else beside
+    if usual.exists() or not isinstance(stated, str) or _FILE_NAME.fullmatch(stated) is None:
+        return usual
+    return path.with_name(stated) if path.with_name(stated).exists() else usual
 
 
 def _tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
@@ -325,7 +325,7 @@ def _lines(tree: Mapping[str, Any], path: str = "", head: str = "") -> list[str]
     for name, value in tree.items():
         place = f"{path}.{_key(name)}" if path else _key(name)
         figures = isinstance(value, Mapping) and all(
-            isinstance(own, str | float | int | None) for own in value.values()
+            isinstance(item, str | float | int | None) for item in value.values()
         )
         if isinstance(value, Mapping) and not (path and value and figures):
             within += _lines(value, place, f"[{place}]")
@@ -345,7 +345,7 @@ def _value(value: Any) -> str:
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if isinstance(value, Mapping):
-        stated = (f"{_key(name)} = {_value(own)}" for name, own in value.items() if own is not None)
+        stated = (f"{_key(name)} = {_value(item)}" for name, item in value.items() if item is not None)
         return "{ " + ", ".join(stated) + " }"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(_value, value)) + "]"
@@ -385,7 +385,7 @@ def read_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
     place, target = os.fspath(path), _follow(path)
     tree = read_toml(target, "a machine's file", place)
     stated = _stated_in(tree, place)
-    head, rig = stated["machine"], {name: of for name, of in tree.items() if name not in (*OF_MACHINES, "map")}
+    head, rig = stated["machine"], {name: table for name, table in tree.items() if name not in (*OF_MACHINES, "map")}
     lessons = _lessons_path(target, tree)
     if not lessons.exists():
         rule = (

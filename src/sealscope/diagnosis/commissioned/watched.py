@@ -56,17 +56,17 @@ def load_watched(rig: str) -> WatchedMachine:
 
 def is_remeasured(rig: Rig, before: Rig) -> bool:
     """Return whether a rig is that of before, its displacement measured anew from more healthy recordings."""
-    values, others = rig.model_dump(), before.model_dump()
-    for own in (values, others):
-        own.get("pump", {}).pop("q_b", None)
-    return values == others and bool(np.isclose(rig.pump.q_b, before.pump.q_b, rtol=0.05))
+    values, values_before = rig.model_dump(), before.model_dump()
+    for tree in (values, values_before):
+        tree.get("pump", {}).pop("q_b", None)
+    return values == values_before and bool(np.isclose(rig.pump.q_b, before.pump.q_b, rtol=0.05))
 
 
 def _with_measured_displacement(rig: Rig, healthy: tuple[Learnt, ...]) -> Rig:
     """Return a rig of stated areas with the displacement that healthy recordings measured beside them."""
     if rig.states(_DISPLACEMENT) or not rig.states(*_AREAS):
         return rig
-    lessons = (own.lessons.get(_BALANCE) for own in healthy)
+    lessons = (recording.lessons.get(_BALANCE) for recording in healthy)
     scales = [float(lesson["scale"]) for lesson in lessons if isinstance(lesson, Mapping) and "scale" in lesson]
     measured = [scale for scale in scales if np.isfinite(scale) and scale > 0.0]
     if not measured:

@@ -116,14 +116,16 @@ class Case:
     @cached_property
     def other_event(self) -> OtherEvent | None:
         """The event that is no leak and surely explains the rarest change it can; None where none does."""
-        allowed = self.context.false_alarm_probability / max(len({own.data for own in self.observables}), 1)
-        chances = {id(own): self.null.chance(own) for own in self.observables}
-        for observable in sorted(self.observables, key=lambda own: chances[id(own)]):
+        allowed = self.context.false_alarm_probability / max(
+            len({observable.data for observable in self.observables}), 1
+        )
+        chances = {id(observable): self.null.chance(observable) for observable in self.observables}
+        for observable in sorted(self.observables, key=lambda candidate: chances[id(candidate)]):
             if chances[id(observable)] >= allowed:
                 return None
             moving = [event for event in load_events() if event.does_move(observable)]
             causes = dict.fromkeys(event.cause for event in moving if event.name not in LEAK_EVENTS)
-            for cause in (own for own in causes if own is not None):
+            for cause in (named for named in causes if named is not None):
                 sure = probability_of(self.explanations, cause=cause, data=observable.data)
                 if sure > _PRIORS["explanation"]["named"]:
                     words = max((e for e in moving if e.cause == cause), key=lambda e: e.probability).words
@@ -160,7 +162,7 @@ def _change_questions(case: Case) -> tuple[Question, ...]:
     """Return the question of a provider that measures no leak: whether what a leak moves changed as it does."""
     leak = next(event for event in load_events() if event.name == LEAK_EVENTS[0])
     moved = [observable for observable in case.judge.observables if leak.does_move(observable)]
-    rarest = min(moved, key=lambda own: own.chance, default=None)
+    rarest = min(moved, key=lambda observable: observable.chance, default=None)
     if rarest is None:
         return ()
     allowed, chance = case.context.false_alarm_probability, case.null.chance(rarest)

@@ -37,11 +37,11 @@ def combine(decisions: Sequence[Evidence], context: DecisionContext) -> Evidence
     A recording that cannot be compared with the healthy ones it was given, or of which a part is missing, is not
     without a leak.
     """
-    ranked = sorted(decisions, key=lambda own: rank(own.detector))
-    usable = [own for own in ranked if own.usable]
-    measuring = any(own.detector in ORDER for own in usable)
-    judging = [own for own in usable if not (measuring and own.detector == RMS_CHANGE)]
-    judge = next((own for own in judging if not own.abstains), None)
+    ranked = sorted(decisions, key=lambda decision: rank(decision.detector))
+    usable = [decision for decision in ranked if decision.usable]
+    measuring = any(decision.detector in ORDER for decision in usable)
+    judging = [decision for decision in usable if not (measuring and decision.detector == RMS_CHANGE)]
+    judge = next((decision for decision in judging if not decision.abstains), None)
     if judge is None:
         return _undecided(ranked, usable)
     reasons, doubts = [judge.reason], []
@@ -53,8 +53,8 @@ def combine(decisions: Sequence[Evidence], context: DecisionContext) -> Evidence
         if judge.share < WHOLE:
             doubts.append(text_of("doubt", "rest"))
     verdict = CANNOT_TELL if doubts else judge.verdict
-    others = [own for own in ranked if own is not judge]
-    stated = replace(judge, verdict=verdict, reason="".join([*reasons, *doubts]), parts=(judge, *others))
+    other_parts = [decision for decision in ranked if decision is not judge]
+    stated = replace(judge, verdict=verdict, reason="".join([*reasons, *doubts]), parts=(judge, *other_parts))
     return stated if verdict == LEAK else replace(stated, onset_s=None, onset_interval_s=None)
 
 
@@ -63,6 +63,6 @@ def _undecided(ranked: Sequence[Evidence], usable: Sequence[Evidence]) -> Eviden
     if usable:
         stated = usable[0]
     else:
-        built_in = [own for own in ranked if own.detector in (*ORDER, RMS_CHANGE)] or list(ranked)
+        built_in = [decision for decision in ranked if decision.detector in (*ORDER, RMS_CHANGE)] or list(ranked)
         stated = Evidence(CANNOT_TELL, built_in[-1].reason if built_in else "there is no detector")
     return replace(stated, detector="", parts=tuple(ranked), usable=True)

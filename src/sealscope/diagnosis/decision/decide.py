@@ -46,10 +46,10 @@ def decide(judge: Observed, reports: Sequence[Observed], null: HealthyNull, cont
     """
     if judge.lack:
         return Evidence(CANNOT_TELL, judge.lack, detector=judge.provider, usable=False)
-    others = [
+    other_reports = [
         report for report in reports if report is not judge and context.is_weighed and _describes_else(report, judge)
     ]
-    observables = [*judge.observables, *(observable for own in others for observable in own.observables)]
+    observables = [*judge.observables, *(observable for report in other_reports for observable in report.observables)]
     case = Case(judge, observables, null, context)
     least: float = _PRIORS["explanation"]["leak"]
     shown = next((alarm for alarm in case.alarms if case.leak_probability(alarm) > least), None)
@@ -84,7 +84,7 @@ def _leak_evidence(case: Case, alarm: Question) -> Evidence:
     leak, onset = case.leak, None
     cause: Cause = "piston leak"
     if leak is None:
-        shown = min(case.judge.observables, key=lambda own: own.chance)
+        shown = min(case.judge.observables, key=lambda observable: observable.chance)
         onset, flow = shown.onset, None
     else:
         pump = probability_of(case.explanations, "pump leak")

@@ -80,12 +80,12 @@ def explain(
         The most probable first; their probabilities add up to one.
     """
     events = load_events()
-    factors = [(own, log_bayes_factor(chance(own))) for own in observables]
+    factors = [(quantity, log_bayes_factor(chance(quantity))) for quantity in observables]
     misfit: float = 2.0 * priors("decision")["explanation"]["misfit"]
     largest: dict[str, float] = {}
     for observable, factor in factors:
         largest[observable.data] = max(factor, largest.get(observable.data, 0.0))
-    weighted = [(own, factor / (1.0 + misfit * largest[own.data])) for own, factor in factors]
+    weighted = [(quantity, factor / (1.0 + misfit * largest[quantity.data])) for quantity, factor in factors]
     ways = {event.name: _ways_of(event, weighted, rise) for event in events}
     telling = [event for event in events if max(sum(gains.values()) for gains in ways[event.name]) > LEAST]
     groups: list[tuple[Event, ...]] = [(event,) for event in events]
@@ -118,17 +118,17 @@ def _logarithm(group: Sequence[Event], ways: Mapping[str, Sequence[_Gains]]) -> 
 
 def _ways_of(event: Event, weighted: Sequence[tuple[Observable, float]], rise: LeakRise | None) -> Sequence[_Gains]:
     """Return the ways in which an event happens: at the onset that explains most, and for a leak from the start."""
-    moved = [(own, gain) for own, gain in weighted if event.does_move(own)]
+    moved = [(observable, gain) for observable, gain in weighted if event.does_move(observable)]
     gains: dict[str, float] = {}
     if moved:
         anchor = max(moved, key=lambda pair: pair[1])[0]
         # an event explains what it disturbs only once other data show it
         shown = {observable.data for observable, gain in moved if gain > LEAST}
         disturbed = [pair for pair in weighted if shown and pair[0].data not in shown and event.does_disturb(pair[0])]
-        for own, gain in moved + disturbed:
-            if _coincide(own, anchor):
-                sized = gain + (0.5 * own.advantage if event.is_sized else 0.0)
-                gains[own.data] = max(sized, gains.get(own.data, 0.0))
+        for observable, gain in moved + disturbed:
+            if _coincide(observable, anchor):
+                sized = gain + (0.5 * observable.advantage if event.is_sized else 0.0)
+                gains[observable.data] = max(sized, gains.get(observable.data, 0.0))
     ways: list[_Gains] = [gains]
     if rise is not None and event.name in LEAK_EVENTS:
         if gains.get("volumes", 0.0) > 0.0:
@@ -160,11 +160,11 @@ def probability_of(
 
     `data`: given that something happened that moves this kind of data; the chance under the null says whether it did.
     """
-    asked = [explanation for explanation in explanations if data is None or data in explanation.data]
-    total = sum(own.probability for own in asked)
+    relevant = [explanation for explanation in explanations if data is None or data in explanation.data]
+    total = sum(explanation.probability for explanation in relevant)
     held = sum(
-        own.probability
-        for own in asked
-        if own.has(*names) or (cause is not None and any(event.cause == cause for event in own.events))
+        explanation.probability
+        for explanation in relevant
+        if explanation.has(*names) or (cause is not None and any(event.cause == cause for event in explanation.events))
     )
     return float(held / total) if total > 0.0 else 0.0

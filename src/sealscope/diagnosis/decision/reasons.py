@@ -39,7 +39,7 @@ def _leak_text(case: Case, evidence: Evidence, alarm: Question | None) -> str:
     )
     total = evidence.total_leakage
     if case.leak is None:
-        shown = min(case.judge.observables, key=lambda own: own.chance)
+        shown = min(case.judge.observables, key=lambda observable: observable.chance)
         if shown.data == "plug-in":
             return text_of("leak", "plug_in", provider=case.judge.provider)
         percent = 100.0 * abs(np.expm1(shown.size))
@@ -88,7 +88,7 @@ def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) ->
 
 def _changed_ringing_text(case: Case, ringing: Ringing) -> str:
     """Return how the ringing changed, and how probable a leak is that changed it."""
-    shown = min(case.judge.observables, key=lambda own: own.chance)
+    shown = min(case.judge.observables, key=lambda observable: observable.chance)
     percent = 100.0 * abs(np.expm1(shown.size))
     where = _onset_text(shown) or _against_text(ringing)
     leak = 100.0 * case.leak_probability(case.alarms[0])
@@ -114,7 +114,7 @@ def _rivals_text(case: Case, alarm: Question) -> str:
         return "" if onset is None else text_of("doubt", "regime", seconds=onset.value)
     shown = max(
         (observable for observable in case.observables if event.does_move(observable)),
-        key=lambda own: own.score,
+        key=lambda observable: observable.score,
         default=None,
     )
     separates = text_of("separates", event.cause if has_text("separates", event.cause) else "default")

@@ -109,9 +109,9 @@ def failure(name: str, distribution: str | None, error: Exception) -> str:
     if distribution is None and isinstance(error, ArithmeticError | np.linalg.LinAlgError):
         _log.debug("%s cannot be computed", name, exc_info=True)
         return f"{name} cannot be computed on this recording: {' '.join(str(error).split()).lower()}"
-    of = f" of {distribution}" if distribution else ""
+    source = f" of {distribution}" if distribution else ""
     what = " ".join(f"{type(error).__name__}: {error}".split()).rstrip(": ")
-    line = f"detector {name!r}{of} is left out: {what}"
+    line = f"detector {name!r}{source} is left out: {what}"
     _log_once(line)
     return line
 

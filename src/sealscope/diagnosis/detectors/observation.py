@@ -134,6 +134,10 @@ def compare_healthy(baseline: Sequence[Healthy]) -> Iterator[Sequence[Observable
     """Yield what each healthy recording's ringing shows against all others."""
     detector = RmsChange()
     lessons = lessons_of(detector, [healthy for healthy in baseline if _unusable(detector, healthy) is None])
-    alike = [own for own in lessons if own["chambers"] == lessons[0]["chambers"] and own["rate"] == lessons[0]["rate"]]
-    for k, lesson in enumerate(alike if len(alike) > FEWEST else ()):
-        yield compare_lessons(lesson, alike[:k] + alike[k + 1 :], lesson["chambers"])[0]
+    comparable = [
+        lesson
+        for lesson in lessons
+        if lesson["chambers"] == lessons[0]["chambers"] and lesson["rate"] == lessons[0]["rate"]
+    ]
+    for k, lesson in enumerate(comparable if len(comparable) > FEWEST else ()):
+        yield compare_lessons(lesson, comparable[:k] + comparable[k + 1 :], lesson["chambers"])[0]

@@ -71,10 +71,10 @@ def detectors() -> Mapping[str, Factory]:
 
 
 @cache
-def plug_ins(taken: frozenset[str]) -> Mapping[str, PlugIn]:
+def plug_ins(used: frozenset[str]) -> Mapping[str, PlugIn]:
     """Return the detectors of installed distributions, in the order of their names.
 
-    One that cannot be loaded, or whose name is `taken` by a built-in detector, by another plug-in or by a reserved
+    One that cannot be loaded, or whose name is `used` by a built-in detector, by another plug-in or by a reserved
     word, is left out with one line that names its distribution. Looked for once in a process.
     """
     known: dict[str, PlugIn] = {}
@@ -83,7 +83,7 @@ def plug_ins(taken: frozenset[str]) -> Mapping[str, PlugIn]:
         try:
             if point.name in known:
                 raise ValueError(f"its name is that of a detector of {known[point.name].distribution}")
-            if point.name in taken or point.name in _RESERVED:
+            if point.name in used or point.name in _RESERVED:
                 raise ValueError("its name is taken by Sealscope itself")
             if any(mark in point.name for mark in (" @ ", ",", "\n")) or not point.name.strip():
                 raise ValueError("its name must be plain words without ',' and '@'")

@@ -116,9 +116,9 @@ class LiveBalance:
         self.litres = self.states_flow(rig) if litres is None else litres
         self._places, self._known = [], []
         for columns in map(Columns, self._balances):
-            others = [k for k in columns.nuisance if k != columns.leak]
-            self._places.append(np.array([*others, columns.leak, columns.left]))
-            self._known.append(Known(*(np.zeros(shape) for shape in known_shapes(len(others)))))
+            nuisances = [k for k in columns.nuisance if k != columns.leak]
+            self._places.append(np.array([*nuisances, columns.leak, columns.left]))
+            self._known.append(Known(*(np.zeros(shape) for shape in known_shapes(len(nuisances)))))
         self._precision, self._woken = 0.0, 0  # of the usual block; blocks that moved as never before
         self._waiting: Blocks | None = None
         self._stream: BlockStream | None = None
@@ -180,9 +180,9 @@ class LiveBalance:
 
     def _says(self, block: Blocks, adds: bool = True) -> tuple[float, ...]:
         """Return what a block says by all equations (`says`); with `adds` it is one of those known from now on."""
-        rows, each = float(block.rows[0]), zip(self._known, block.gram[0], self._places, strict=True)
-        said = [_says(known, gram, place, rows, adds) for known, gram, place in each]
-        return tuple(sum(values) for values in zip(*said, strict=True))
+        rows, equation_parts = float(block.rows[0]), zip(self._known, block.gram[0], self._places, strict=True)
+        answers = [_says(known, gram, place, rows, adds) for known, gram, place in equation_parts]
+        return tuple(sum(values) for values in zip(*answers, strict=True))
 
     def _shown(self, block: Blocks, adds: bool = True) -> BlockConductance | NotJudged:
         half = 0.5 * stride_samples(self._rate) / self._rate
@@ -193,7 +193,7 @@ class LiveBalance:
             return NotJudged(end, "at standstill", "blocks: at standstill")
         total = lead / precision
         offset = math.hypot(math.sqrt(leaning) / precision, self.size_error * lead / precision)
-        pressure, rate = (max(float(of[0]), TINY) for of in (block.driving(), block.flow))
+        pressure, rate = (max(float(size[0]), TINY) for size in (block.driving(), block.flow))
         duty = math.log(pressure), math.log(rate)
         g, sd = total - shift / precision, precision**-0.5
         return BlockConductance(begin, end, g, sd, total, offset, pressure / LITRE_PER_MINUTE, duty)
@@ -255,4 +255,4 @@ def live_equations(rig: Rig, names: Sequence[str]) -> list[Equation]:
     nuisances = [
         tuple(term for term in balance.terms if term.nuisance and term.name != "pump leak") for balance in balances
     ]
-    return [own._replace(terms=terms) for own, terms in zip(balances, nuisances, strict=True)]
+    return [balance._replace(terms=terms) for balance, terms in zip(balances, nuisances, strict=True)]

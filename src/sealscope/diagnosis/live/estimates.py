@@ -99,7 +99,7 @@ class WatchBaseline:
     duty_low: Duty
     duty_high: Duty
 
-    def rise(self, at: float, g: float, deviation: float, probability: float) -> StepEstimate | None:
+    def rise(self, now: float, g: float, deviation: float, probability: float) -> StepEstimate | None:
         """Return the rise where a mean conductance is over what warm oil makes of the baseline's least; None where not.
 
         `deviation`: of `g`; `probability`: of a look at a healthy machine as warm as that.
@@ -119,7 +119,7 @@ class WatchBaseline:
         healthy = max(self.level - self.low, ceiling - self.level, 0.0) / WITHIN_95
         size = g - max(self.level, 0.0)
         return StepEstimate(
-            score, (at, self.learned_s, at), size, math.hypot(deviation, healthy), "level", threshold, reason
+            score, (now, self.learned_s, now), size, math.hypot(deviation, healthy), "level", threshold, reason
         )
 
 
@@ -128,7 +128,7 @@ def within(duty: Duty, low: Duty, high: Duty) -> bool:
     believed = priors("live")["watch"]
     margin = believed["margin"]
     below = (low[0] - believed["damped"], low[1] - margin)
-    return all(least <= own <= most + margin for own, least, most in zip(duty, below, high, strict=True))
+    return all(least <= value <= most + margin for value, least, most in zip(duty, below, high, strict=True))
 
 
 @dataclass
@@ -158,11 +158,11 @@ class BaselineLearning:
             self.low = mean if self.low is None else min(self.low, mean)
             self.high, self.group = mean if self.high is None else max(self.high, mean), []
 
-    def frozen(self, version: int, at: float, hours: float, litres: bool) -> WatchBaseline:
+    def frozen(self, version: int, end: float, hours: float, litres: bool) -> WatchBaseline:
         """Return the baseline of one block or more."""
         assert self.duty_low is not None and self.duty_high is not None
         level = self.total / self.blocks
         low = min(self.group) if self.low is None else self.low  # shorter than one group
         high = max(self.group) if self.high is None else self.high
         lpm = level * self.flow / self.blocks if litres else None
-        return WatchBaseline(version, at, hours, level, low, high, lpm, self.duty_low, self.duty_high)
+        return WatchBaseline(version, end, hours, level, low, high, lpm, self.duty_low, self.duty_high)

@@ -117,8 +117,8 @@ class SampleJoiner:
             reason = f"samples without {in_words(self.ways)}"
         elif wrong:
             missing = [name for name in wrong if name not in samples]
-            of = f" of {wrong[0]} not in {CHANNEL_UNITS[wrong[0]]}"
-            reason = f"samples without {missing[0]}" if missing else f"samples{of}"
+            wrong_unit = f" of {wrong[0]} not in {CHANNEL_UNITS[wrong[0]]}"
+            reason = f"samples without {missing[0]}" if missing else f"samples{wrong_unit}"
         elif not 10.0 <= samples.rate <= 1e5:  # a reversal is not resolved, or a block holds too many samples
             reason = "samples at a rate outside 10 to 100000 Hz"
         else:

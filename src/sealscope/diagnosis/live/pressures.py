@@ -98,11 +98,11 @@ class PressureEstimator:
             return _passed_over(end, f"sampled at less than {_SLOWEST:g} Hz")
         if not all(np.isfinite(block[name]).all() for name in _READ):
             return _passed_over(end, "missing values")
-        apart = self._resume(begin - self._end, block.rate)
+        interrupted = self._resume(begin - self._end, block.rate)
         follower = self._follower
         self._end = end
-        own = follower.take(block)
-        variance = float(own.gram[0, 0]) / max(own.samples, 1.0)
+        sums = follower.take(block)
+        variance = float(sums.gram[0, 0]) / max(sums.samples, 1.0)
         settling, self._settling = self._settling > 0, max(self._settling - 1, 0)
         described = bool(np.isfinite(follower.theta).all()) and follower.excess < _PRIORS["described"]
         ratio = float(np.clip(max(variance, 1.0) / follower.variance, 0.1, 10.0)) if math.isfinite(variance) else 1.0
@@ -111,7 +111,7 @@ class PressureEstimator:
             self._lost += 1
             if self._lost < _PRIORS["lost"] and np.isfinite(follower.theta).all():
                 self._settling = self._settling if settling else _RESUMING
-                return _passed_over(end, "settling" if settling else "not described by the model", apart)
+                return _passed_over(end, "settling" if settling else "not described by the model", interrupted)
             follower.interrupt(math.inf)
             self._lost, self._settling = 0, _SETTLING
             return _passed_over(end, "not described by the model", True)
@@ -119,9 +119,9 @@ class PressureEstimator:
         width = PRIORS["response"]["G"][1]
         g, sd = float(follower.theta[G]), math.sqrt(follower.covariance[G, G]) * float(follower.priors.unit[G])
         if settling:
-            return _passed_over(end, "settling", apart)
+            return _passed_over(end, "settling", interrupted)
         if sd > width:
-            return _passed_over(end, "conductance not resolved" if moves(block["u"]) else "at standstill", apart)
+            return _passed_over(end, "conductance not resolved" if moves(block["u"]) else "at standstill", interrupted)
         dp = float(np.mean(np.abs(block["p_A"] - block["p_B"])))
         sizes = np.log(np.maximum([dp, np.sqrt(np.mean(block["u"] ** 2))], np.finfo(float).tiny))
         duty = float(sizes[0]), float(sizes[1])
@@ -151,10 +151,10 @@ class PressureEstimator:
     def state(self) -> dict[str, Any]:
         """Return all of it but the rig as plain values."""
         state = saved(self, _SAVED)
-        if (own := self._follower) is None:
+        if (follower := self._follower) is None:
             return state | {"follower": None}
-        machine = {"rate": own.machine.rate, "law": own.machine.law, "sense": own.sense}
-        return state | {"follower": saved(own, _FOLLOWED) | machine}
+        machine = {"rate": follower.machine.rate, "law": follower.machine.law, "sense": follower.sense}
+        return state | {"follower": saved(follower, _FOLLOWED) | machine}
 
     def recall(self, state: Mapping[str, Any]) -> None:
         """Continue from a `state` with the same bits; raises InputError where it does not fit."""
@@ -179,5 +179,5 @@ def _recording(rows: Array, rate: float) -> Recording:
     return Recording(t, dict(zip(_READ, channels, strict=True)), {name: CHANNEL_UNITS[name] for name in _READ}, rate)
 
 
-def _passed_over(end: float, status: str, apart: bool = False) -> NotJudged:
-    return NotJudged(end, status, f"blocks: {status}", apart)
+def _passed_over(end: float, status: str, interrupted: bool = False) -> NotJudged:
+    return NotJudged(end, status, f"blocks: {status}", interrupted)

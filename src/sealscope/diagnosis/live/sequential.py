@@ -99,24 +99,24 @@ class StepDetector:
             return
         spread = self._spread + WALKS * max(elapsed, 1.0)
         sigma, error = spread + variance, g - self._level
-        own, gain = error**2 / sigma, spread / sigma
+        square, gain = error**2 / sigma, spread / sigma
         begins = self._known >= 4
         if begins:
             self._begin_onset(begin, end)
         _follow(self._onsets, self._places, error, sigma, gain, PARTS if begins else PARTS[:0])
-        self._learn(sigma, own)
+        self._learn(sigma, square)
         self._level = self._level + gain * error
         self._spread = gain * variance
 
-    def _learn(self, sigma: Array, own: Array) -> None:
-        """Learn noise and walk from an innovation of square `own` over `sigma`."""
-        own = np.maximum(own, _LEAST_SQUARE)
+    def _learn(self, sigma: Array, square: Array) -> None:
+        """Learn noise and walk from `square`, that of an innovation over its variance `sigma`."""
+        square = np.maximum(square, _LEAST_SQUARE)
         if self._known >= 4:
-            own = np.minimum(own, JUMP**2 * self._total / self._known)
+            square = np.minimum(square, JUMP**2 * self._total / self._known)
             weight = MEMORY * self._weight - 0.5 * np.log(sigma * self._total)
-            weight -= 0.5 * (self._known + 1.0) * np.log1p(own / self._total)
+            weight -= 0.5 * (self._known + 1.0) * np.log1p(square / self._total)
             self._weight = weight - np.logaddexp.reduce(weight, axis=0)
-        self._total = MEMORY * self._total + own
+        self._total = MEMORY * self._total + square
         self._known = MEMORY * self._known + 1.0
         self._widths = self._widths + np.log(sigma)
 
@@ -146,22 +146,22 @@ class StepDetector:
 
     def _terms(self) -> Array:
         """Return log of each part of M, by size, walk and onset, shape (v, q, j)."""
-        _, along, square, total, _ = self._onsets
+        _, weighted, square, total, _ = self._onsets
         number, widest, healthy = self._places[:, 0], SIZES[:, None, None], self._healthy()
-        rising = np.maximum(along, 0.0) ** 2 / ((square + 1.0 / widest) * total)
+        rising = np.maximum(weighted, 0.0) ** 2 / ((square + 1.0 / widest) * total)
         ratio = -0.5 * (np.log1p(widest * square) + number * np.log1p(-rising))
         prior = np.logaddexp.reduce(healthy, axis=0) + np.log(len(SIZES) * len(PARTS))
-        return np.asarray(np.where(along > 0.0, ratio, -np.inf) + healthy - prior)
+        return np.asarray(np.where(weighted > 0.0, ratio, -np.inf) + healthy - prior)
 
     def rise(self) -> StepEstimate:
         """Return the step that the blocks show: its onset and size, averaged over all that may be."""
         terms = self._terms()
         log_e = float(np.logaddexp.reduce(terms.ravel()))
         weights = np.exp(terms - log_e)
-        _, along, square, total, _ = self._onsets
+        _, weighted, square, total, _ = self._onsets
         precision = square + 1.0 / SIZES[:, None, None]
-        mean, freedom = along / precision, np.maximum(self._places[:, 0] - 2.0, 1.0)
-        variance = np.maximum(total - along * mean, 0.0) / freedom / precision
+        mean, freedom = weighted / precision, np.maximum(self._places[:, 0] - 2.0, 1.0)
+        variance = np.maximum(total - weighted * mean, 0.0) / freedom / precision
         value = float((weights * mean).sum())
         deviation = float(np.sqrt((weights * (variance + (mean - value) ** 2)).sum()))
         shares = weights.sum(axis=(0, 1))  # probability of each onset
@@ -169,8 +169,8 @@ class StepDetector:
         order = np.argsort(onset, kind="stable")
         low, high = np.searchsorted(np.cumsum(shares[order]), [0.025, 0.975])
         last = order[min(high, len(order) - 1)]
-        apart = float((onset - begin)[-len(PARTS)]) / len(PARTS)  # a part of a block, about
-        since = float(shares @ onset), float(onset[order[low]]) - apart, float(onset[last]) + apart
+        part = float((onset - begin)[-len(PARTS)]) / len(PARTS)  # a part of a block, about
+        since = float(shares @ onset), float(onset[order[low]]) - part, float(onset[last]) + part
         return StepEstimate(2.0 * log_e, since, self._unit * value, self._unit * deviation)
 
     def bound(self, probability: float = 0.95) -> float:
@@ -179,17 +179,17 @@ class StepDetector:
 
         if not len(self._places):
             return np.inf
-        _, along, square, total, _ = self._onsets
-        healthy, size = self._healthy(), along / square
+        _, weighted, square, total, _ = self._onsets
+        healthy, size = self._healthy(), weighted / square
         least = np.finfo(float).tiny
-        deviation = np.sqrt(np.maximum(total - along * size, least) / self._places[:, 0] / square)
+        deviation = np.sqrt(np.maximum(total - weighted * size, least) / self._places[:, 0] / square)
         positive = np.maximum(ndtr(size / deviation), 1e-300)
         above = np.exp(healthy - np.logaddexp.reduce(healthy, axis=0)) * positive
         low, high = 0.0, float(np.max(size + 8.0 * deviation))
         for _ in range(50):
             middle = 0.5 * (low + high)
-            beyond = float((above * ndtr((size - middle) / deviation) / positive).sum())
-            low, high = (middle, high) if beyond > (1.0 - probability) * above.sum() else (low, middle)
+            chance = float((above * ndtr((size - middle) / deviation) / positive).sum())
+            low, high = (middle, high) if chance > (1.0 - probability) * above.sum() else (low, middle)
         return self._unit * high
 
     @property
@@ -211,12 +211,12 @@ class StepDetector:
 @kernel
 def _follow(onsets: Any, places: Any, error: Any, sigma: Any, gain: Any, fresh: Any) -> None:
     """Take innovations (q, 1) and their variances into the sums of all onsets, of which the last begin with a part."""
-    answer, along, square, total, _ = onsets
+    answer, weighted, square, total, _ = onsets
     count, begun = len(places), len(places) - len(fresh)
     for q in range(len(sigma)):
         for j in range(count):
             part = fresh[j - begun] if j >= begun else 1.0 - answer[q, j]
-            along[q, j] += part / sigma[q, 0] * error[q, 0]
+            weighted[q, j] += part / sigma[q, 0] * error[q, 0]
             square[q, j] += part / sigma[q, 0] * part
             total[q, j] += error[q, 0] ** 2 / sigma[q, 0]
             answer[q, j] += gain[q, 0] * part
@@ -227,12 +227,12 @@ def _follow(onsets: Any, places: Any, error: Any, sigma: Any, gain: Any, fresh: 
 @kernel
 def _most(onsets: Any, places: Any) -> float:
     """Return the most that the logarithm of a ratio of likelihoods can be, for any size of a step."""
-    _, along, square, total, _ = onsets
+    _, weighted, square, total, _ = onsets
     most = 0.0
-    for q in range(len(along)):
+    for q in range(len(weighted)):
         for j in range(len(places)):
-            if along[q, j] > 0.0:
-                rising = min(along[q, j] ** 2 / (square[q, j] * total[q, j]), 1.0 - 1e-15)
+            if weighted[q, j] > 0.0:
+                rising = min(weighted[q, j] ** 2 / (square[q, j] * total[q, j]), 1.0 - 1e-15)
                 most = max(most, -0.5 * places[j, 0] * math.log1p(-rising))
     return most
 

@@ -103,7 +103,7 @@ def _columns(recording: Recording, transformed: list[Details], bounds: IntArray)
         priors("rms_change")["blocks"]["standstill"] ** 2 * squares.mean(axis=1, keepdims=True), np.finfo(float).tiny
     )
     with np.errstate(divide="ignore", over="ignore"):
-        energies = np.concatenate([mean_squares(own, bounds) for own in transformed], axis=1)
+        energies = np.concatenate([mean_squares(signal, bounds) for signal in transformed], axis=1)
         log_rms, duty = 0.5 * np.log(energies), 0.5 * np.log(segment_means(squares, bounds) + rest)
     return log_rms, np.vstack([duty, segment_means(load[None], bounds) / np.exp(duty[-1:])]).T
 
@@ -113,9 +113,9 @@ def cut(recording: Recording) -> RmsBlocks:
     chambers, rate, believed = judged_chambers(recording), recording.rate, priors("rms_change")["blocks"]
     transformed = [details(recording[chamber]) for chamber in chambers]
     inside, cycle = transformed[0].inside(), find_cycle(recording)
-    wanted = max(believed["seconds"], believed["samples"] / rate)
-    phases = 1 if cycle is None else max(1, round(cycle / wanted))
-    length = wanted if cycle is None else cycle / phases * max(1, round(wanted / (cycle / phases)))
+    target = max(believed["seconds"], believed["samples"] / rate)
+    phases = 1 if cycle is None else max(1, round(cycle / target))
+    length = target if cycle is None else cycle / phases * max(1, round(target / (cycle / phases)))
     samples = inside.stop - inside.start
     if samples > believed["most"] * length * rate:
         length *= phases * math.ceil(samples / (believed["most"] * phases * length * rate))

@@ -177,7 +177,7 @@ def _sides(judged: Lesson, lessons: Sequence[Lesson], chambers: Sequence[str]) -
         return float(np.mean([levels[first] - levels[second] for first, second in rows]))
 
     error: float = priors("rms_change")["recordings"]["error"]
-    observable = difference("p_A beside p_B", "sides", beside(judged), [beside(own) for own in lessons], error)
+    observable = difference("p_A beside p_B", "sides", beside(judged), [beside(lesson) for lesson in lessons], error)
     if observable is not None:
         filtered = priors("rms_change")["filtered"]
         away = np.log(max(abs(observable.size), error) / filtered["size"]) / filtered["spread"]

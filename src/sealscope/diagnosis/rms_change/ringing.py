@@ -30,9 +30,9 @@ def beyond_noise(log_rms: Array, known: Array) -> tuple[Array, Array]:
         noise = np.exp(2.0 * log_rms[:, first])
         for column in range(first + 1, first + QUANTITIES.index("d3d4")):
             energy = np.exp(2.0 * known[:, [first, column]]).mean(axis=0)
-            own = max(energy[1] - energy[0], least * energy[1])
-            left[:, column] -= 0.5 * np.log(own + noise)
-            weight[:, column] = own / (own + noise)
+            signal = max(energy[1] - energy[0], least * energy[1])
+            left[:, column] -= 0.5 * np.log(signal + noise)
+            weight[:, column] = signal / (signal + noise)
         d3, d4, product = (first + QUANTITIES.index(name) for name in ("d3", "d4", "d3d4"))
         left[:, product] += left[:, d3] - log_rms[:, d3] + left[:, d4] - log_rms[:, d4]
     return left, weight
@@ -52,9 +52,9 @@ def information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
     for name, y, w, variance in zip(blocks.names, left.T, weight.T, error, strict=True):
         drift = walks["noise" if name.startswith("d1 ") else machine] * over_all
         precision, vector = w**2 / variance, w * y / variance
-        along = precision[:, None] * duty
-        gain = along @ np.linalg.inv(duty.T @ along + np.diag(believed**-2))
-        precision, vector = np.diag(precision) - gain @ along.T, vector - gain @ (duty.T @ vector)
+        weighted = precision[:, None] * duty
+        gain = weighted @ np.linalg.inv(duty.T @ weighted + np.diag(believed**-2))
+        precision, vector = np.diag(precision) - gain @ weighted.T, vector - gain @ (duty.T @ vector)
         stated.append(Information(time, precision, vector, slope=drift, walk=drift))
     return stated, weight.mean(axis=0)
 
@@ -71,20 +71,20 @@ def rises(
     """
     prior, walk, n = priors("rms_change")["recordings"], priors("rms_change")["walk"], len(known)
     exponents = np.array([float(priors("rms_change")["duty"][name]) for name in DUTY])
-    apart = (np.vstack([known_duty, duty]) - duty) * exponents
+    effects = (np.vstack([known_duty, duty]) - duty) * exponents
     quantiles = (np.arange(walk["tried"]) + 0.5) / walk["tried"]
     gained = walk["machine"] * np.tan(0.5 * np.pi * quantiles)
     rates = (gained / prior["session"]) ** 2 / (2.0 * walk["time"])
-    since, alike = np.zeros((n + 1, n + 1)), np.ones((n + 1, n + 1))
+    since, same_session = np.zeros((n + 1, n + 1)), np.ones((n + 1, n + 1))
     if times is not None:
         sessions = sessions_of(list(times), prior["pause"])
-        since, alike = np.abs(np.subtract.outer(times, times)), np.equal.outer(sessions, sessions).astype(float)
-    fading = prior["session"] ** 2 * np.exp(-rates[:, None, None] * since) * alike
-    population = Population(fading + apart @ apart.T, np.zeros(len(rates)))
+        since, same_session = np.abs(np.subtract.outer(times, times)), np.equal.outer(sessions, sessions).astype(float)
+    fading = prior["session"] ** 2 * np.exp(-rates[:, None, None] * since) * same_session
+    population = Population(fading + effects @ effects.T, np.zeros(len(rates)))
     values, weights = beyond_noise(np.vstack([log_rms, known]), known)
     weight = weights[1:].mean(axis=0)
     stated = []
-    for own, others, w in zip(values[0] / weight, values[1:].T / weight[:, None], weight, strict=True):
+    for change, healthy, w in zip(values[0] / weight, values[1:].T / weight[:, None], weight, strict=True):
         scatter = float(np.hypot(prior["scatter"], prior["error"] / w))
-        stated.append(population.rise(own[None], others[None], scatter, prior["freedom"]))
+        stated.append(population.rise(change[None], healthy[None], scatter, prior["freedom"]))
     return stated, weight

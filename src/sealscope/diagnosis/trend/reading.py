@@ -95,10 +95,10 @@ def _stated(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[str, Any
     """Return the most specific level that a recording without a defect allows, or the problem."""
     balance, response = VolumeBalance(rig), PressureResponse(rig)
     lack, lacks = unusable(balance, part), unusable(response, part)
-    own = balance.balance(part) if lack is None else None
-    if own is not None and len(own.columns) == 1:
-        size, total = own.size, own.level
-        area = machine.area if size.stated or ("x", "m") in own.units else None
+    solution = balance.balance(part) if lack is None else None
+    if solution is not None and len(solution.columns) == 1:
+        size, total = solution.size, solution.level
+        area = machine.area if size.stated or ("x", "m") in solution.units else None
         return {
             "basis": BASES[0],
             "level": total.value * size.scale,
@@ -171,35 +171,35 @@ def timeline(readings: Sequence[LeakReading], every: float | None = None) -> tup
     for reading, problem in zip(ordered, notes, strict=True):
         other = "" if reading.basis == basis else f"its channels allow the {reading.basis}, not the {basis}"
         note = problem or other
-        alike = (n for n, scale in enumerate(scales) if abs(_change(reading.scale, scale)) <= most)
-        group = -1 if note else next(alike, len(scales))
+        matching = (n for n, scale in enumerate(scales) if abs(_change(reading.scale, scale)) <= most)
+        group = -1 if note else next(matching, len(scales))
         if group == len(scales):
             scales.append(reading.scale)
         start = reading.start or 0.0
         day = (start - (ordered[0].start or 0.0)) / DAY
         points.append(TrendPoint(**vars(reading) | {"start": start}, day=day, group=group, note=note))
-    apart = [
+    differences = [
         f"position or angle is scaled by {100.0 * _change(scale, scales[0]):+.2g} %: a sensor exchanged, or another "
         "machine"
         for scale in scales
     ]
-    return points, ("", *apart[1:]) if scales else ()
+    return points, ("", *differences[1:]) if scales else ()
 
 
-def findings_of(points: Sequence[TrendPoint], apart: Sequence[str]) -> list[Finding]:
+def findings_of(points: Sequence[TrendPoint], differences: Sequence[str]) -> list[Finding]:
     """Return findings on the clock, on what is left out, one for each reason, and on what is compared apart."""
     findings, count = _clock(points), len(points)
     reasons: dict[str, list[TrendPoint]] = {}
     for point in points:
         if point.note:
             reasons.setdefault(re.sub(r"\d[\d.]*", "#", point.note), []).append(point)  # alike but for its numbers
-    for own in reasons.values():
-        text = f"{len(own)} of {count} left out: {own[0].note} ({_names(own)})"
-        findings.append(Finding("left_out", "warning", None, len(own), None, text))
-    for number, difference in enumerate(apart[1:], 1):
-        own = [point for point in points if point.group == number]
-        text = f"{len(own)} of {count} compared among themselves only: {difference} ({_names(own)})"
-        findings.append(Finding("not_comparable", "note", None, len(own), None, text))
+    for left_out in reasons.values():
+        text = f"{len(left_out)} of {count} left out: {left_out[0].note} ({_names(left_out)})"
+        findings.append(Finding("left_out", "warning", None, len(left_out), None, text))
+    for number, difference in enumerate(differences[1:], 1):
+        members = [point for point in points if point.group == number]
+        text = f"{len(members)} of {count} compared among themselves only: {difference} ({_names(members)})"
+        findings.append(Finding("not_comparable", "note", None, len(members), None, text))
     return findings
 
 
@@ -226,7 +226,7 @@ def _clock(ordered: Sequence[TrendPoint]) -> list[Finding]:
         for early, late in pairwise(sorted(ordered, key=lambda reading: by_numbers(reading.file)))
         if late.start < early.start
     ]
-    alike = len({re.split(r"[\d\W_]", reading.file, maxsplit=1)[0].lower() for reading in ordered}) == 1
+    same_stem = len({re.split(r"[\d\W_]", reading.file, maxsplit=1)[0].lower() for reading in ordered}) == 1
     # numbers that fall more often are no order
-    texts = overlaps or (back if alike and len(back) <= max(2, len(ordered) // 10) else [])
+    texts = overlaps or (back if same_stem and len(back) <= max(2, len(ordered) // 10) else [])
     return [Finding("clock", "warning", None, len(texts), None, texts[0])] if texts else []

@@ -157,10 +157,15 @@ class Trend:
         names = ("now", "healthy", "scatter", "growth", "step", "onset", "reach")
         now, healthy, scatter, growth, step, onset, reach = (self.wear and getattr(self.wear, name) for name in names)
         points = [
-            {"file": own.file, "time": self._moment(own.day), "day": own.day}
-            | {"value": own.value, "low": own.low, "high": own.high, "group": None if own.group < 0 else own.group}
-            | {"temperature_C": own.temperature, "note": own.note}
-            for own in self.points
+            {"file": point.file, "time": self._moment(point.day), "day": point.day}
+            | {
+                "value": point.value,
+                "low": point.low,
+                "high": point.high,
+                "group": None if point.group < 0 else point.group,
+            }
+            | {"temperature_C": point.temperature, "note": point.note}
+            for point in self.points
         ]
         return plain(  # type: ignore[no-any-return]
             {
@@ -266,27 +271,27 @@ def trend(
     readings = [
         recording if isinstance(recording, LeakReading) else reading_of(recording, rig) for recording in recordings
     ]
-    points, apart = timeline(readings, every)
-    return _judged(points, apart, repair=RepairLimit.of(limit), years=years, healthy=healthy, dated=every is None)
+    points, differences = timeline(readings, every)
+    return _judged(points, differences, repair=RepairLimit.of(limit), years=years, healthy=healthy, dated=every is None)
 
 
-def _judged(points: Sequence[TrendPoint], apart: tuple[str, ...], **stated: Any) -> Trend:
+def _judged(points: Sequence[TrendPoint], differences: tuple[str, ...], **stated: Any) -> Trend:
     """Return the trend of readings in the order of their times; `stated`: what the caller states of it."""
     rows = tuple(k for k, point in enumerate(points) if point.group >= 0)
     kept = [points[k] for k in rows]
-    flows = bool(kept) and all(own.states_flow for own in kept)
+    flows = bool(kept) and all(point.states_flow for point in kept)
     trend = Trend(
         verdict=decide_verdict(False, math.inf, 0.0),
         reason="",
         basis=kept[0].basis if kept else None,
         unit="L/min" if flows else "%",
-        pressure=float(np.median([own.pressure for own in kept])) if flows else None,
+        pressure=float(np.median([point.pressure for point in kept])) if flows else None,
         points=tuple(points),
-        groups=apart,
+        groups=differences,
         episodes=(),
         rows=rows,
         machine=points[0].machine if points else None,
-        findings=tuple(findings_of(points, apart)),
+        findings=tuple(findings_of(points, differences)),
         **stated,
     )
     if kept:
@@ -300,15 +305,15 @@ def _with_levels(trend: Trend) -> Trend:
     levels, allowed = _levels(trend)
     few, points, rows = levels.merged(), [*trend.points], trend.rows
     alone = np.flatnonzero(beyond(levels)[1])
-    apart = "apart from the recordings before and after: it counts as if it were near"
+    remark = "apart from the recordings before and after: it counts as if it were near"
     findings = [*trend.findings]
     if alone.size:
         files = listed((points[rows[k]].file for k in alone), 3)
-        text = f"{alone.size} of {len(points)} {apart} ({files})"
+        text = f"{alone.size} of {len(points)} {remark} ({files})"
         findings.append(Finding("outlier", "warning", None, alone.size, None, text))
     for k, row in enumerate(rows):
         value, half = float(levels.value[k]), WITHIN_95 * float(levels.error[k])
-        note = apart if k in alone else ""
+        note = remark if k in alone else ""
         points[row] = replace(points[row], value=value, low=value - half, high=value + half, note=note)
     known = max(1, _known(trend) * len(few) // len(levels))
     return replace(
@@ -331,16 +336,16 @@ def _levels(trend: Trend) -> tuple[Levels, float | None]:
     """Return the levels in the trend's unit, and the rise at which a repair is due, None where unknown."""
     kept = [trend.points[k] for k in trend.rows]
     t, group, value, error = (
-        np.array([getattr(own, name) for own in kept]) for name in ("day", "group", "level", "error")
+        np.array([getattr(point, name) for point in kept]) for name in ("day", "group", "level", "error")
     )
-    usual, pressure = float(np.mean(value[: _known(trend)])), float(np.median([own.pressure for own in kept]))
+    usual, pressure = float(np.mean(value[: _known(trend)])), float(np.median([point.pressure for point in kept]))
     prior = scatter_of(trend.basis or "ringing", usual)
     warmer, slope_sd = np.zeros(t.size), 0.0
-    temperatures = [own.temperature for own in kept if own.temperature is not None]
+    temperatures = [point.temperature for point in kept if point.temperature is not None]
     if trend.basis != "ringing" and len(temperatures) == t.size:
         slope, deviation = (priors("inference")["oil"][name] for name in ("per_kelvin", "per_kelvin_deviation"))
         warmer, slope_sd = np.array(temperatures) - temperatures[0], deviation * abs(usual)
-        value, error = (own * np.exp(-slope * warmer) for own in (value, error))
+        value, error = (values * np.exp(-slope * warmer) for values in (value, error))
     flows = trend.pressure is not None
     unit = pressure / LITRE_PER_MINUTE if flows else 100.0 / max(abs(usual), float(np.finfo(float).tiny))
     if trend.basis == "ringing":

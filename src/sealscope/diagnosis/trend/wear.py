@@ -73,7 +73,7 @@ class Levels:
 
     def part(self, rows: slice) -> Levels:
         """Return some of the recordings."""
-        t, value, error, covariate = (own[rows] for own in (self.t, self.value, self.error, self.covariate))
+        t, value, error, covariate = (values[rows] for values in (self.t, self.value, self.error, self.covariate))
         return Levels(t, value, error, self.group[rows], covariate, self.prior, self.slope_sd)
 
     @property
@@ -88,17 +88,19 @@ class Levels:
         prior = self.prior
         steps = np.abs(np.diff(self.value))[np.diff(self.group) == 0] / math.sqrt(2.0)
         known = prior.scale**2 + (float(np.mean(self.error**2)) if len(self) else 0.0)
-        own = (1.4826 * float(np.median(steps))) ** 2 if steps.size else 0.0
-        return math.sqrt((prior.freedom * known + steps.size * own) / (prior.freedom + steps.size))
+        measured = (1.4826 * float(np.median(steps))) ** 2 if steps.size else 0.0
+        return math.sqrt((prior.freedom * known + steps.size * measured) / (prior.freedom + steps.size))
 
     def merged(self, most: int = 240) -> Levels:
         """Return about so many levels at most: neighbours of a group are averaged where there are more."""
-        each = -(-len(self) // most)
-        if each <= 1:
+        size = -(-len(self) // most)
+        if size <= 1:
             return self
         runs = np.split(np.arange(len(self)), np.flatnonzero(np.diff(self.group)) + 1)
-        rows = [run[k : k + each] for run in runs for k in range(0, run.size, each)]
-        t, value, covariate = (np.array([own[r].mean() for r in rows]) for own in (self.t, self.value, self.covariate))
+        rows = [run[k : k + size] for run in runs for k in range(0, run.size, size)]
+        t, value, covariate = (
+            np.array([values[r].mean() for r in rows]) for values in (self.t, self.value, self.covariate)
+        )
         error = np.array([math.sqrt(np.sum(self.error[r] ** 2)) / r.size for r in rows])
         return Levels(t, value, error, self.group[[r[0] for r in rows]], covariate, self.prior, self.slope_sd)
 
@@ -115,9 +117,9 @@ def beyond(levels: Levels) -> tuple[Array, Array]:
         before, after = levels.value[same[max(place - 3, 0) : place]], levels.value[same[place + 1 : place + 2]]
         if before.size:
             reach, middle = outlier * levels.part(slice(0, k)).scatter, float(np.median(before))
-            apart = levels.value[k] - middle
-            agree = [np.sign(apart) * (other - middle) > reach for other in (before[-1], *after)]
-            last[k] = 0.0 if agree[0] else np.sign(apart) * max(abs(apart) - reach, 0.0)
+            distance = levels.value[k] - middle
+            agree = [np.sign(distance) * (other - middle) > reach for other in (before[-1], *after)]
+            last[k] = 0.0 if agree[0] else np.sign(distance) * max(abs(distance) - reach, 0.0)
             later[k] = 0.0 if any(agree) or not after.size else last[k]
     return last, later
 
@@ -153,7 +155,7 @@ class _Changes(NamedTuple):
             log_weight = np.log(np.clip(levels.t[begin] - levels.t[begin - 1], 0.0, believed["wait"]) / share)
         column = np.arange(begin.size) + begin.size * grows
         spread = np.broadcast_arrays(column, scale, begin, grows, log_weight)
-        return cls(np.hstack([step, growth]), *(own.ravel() for own in spread))  # type: ignore[call-arg]
+        return cls(np.hstack([step, growth]), *(values.ravel() for values in spread))  # type: ignore[call-arg]
 
     @classmethod
     def single(cls, shape: Array, scale: float) -> _Changes:
@@ -199,9 +201,9 @@ def _nodes(levels: Levels, shapes: Array, *, sloping: bool = False) -> list[_Nod
     for tau in np.geomspace(0.1 * prior.scale, 10.0 * reach, believed["nodes"]):
         log_prior = -prior.freedom * (math.log(tau) + 0.5 * (prior.scale / tau) ** 2)
         for share in believed["lasts"]:
-            own = shared + tau**2 * share * lasting
-            own[np.diag_indices(len(levels))] += tau**2 * (1.0 - share + _TINY) + levels.error**2
-            L = np.linalg.cholesky(own)
+            covariance = shared + tau**2 * share * lasting
+            covariance[np.diag_indices(len(levels))] += tau**2 * (1.0 - share + _TINY) + levels.error**2
+            L = np.linalg.cholesky(covariance)
             z, u, g = np.split(solve_triangular(L, right, lower=True, check_finite=False), [1, 2], axis=1)
             held = z - ((last - later) / L.diagonal())[:, None]  # the value counts so while it is the last
             square = np.cumsum(z**2) - (z**2 - held**2)[:, 0]
@@ -283,8 +285,8 @@ class _Draws(NamedTuple):
         mean, deviation = (b * v)[node, change], np.sqrt(v)[node, change]
         low = np.zeros(count) if signed else ndtr(-mean / deviation)  # of a normal number that is known to be positive
         size = mean + deviation * ndtri(np.clip(low + (1.0 - low) * random.random(count), 1e-300, 1.0 - 1e-16))
-        tau, base, variance = np.array([(own.tau, own.mean, own.variance) for own in nodes])[node].T
-        yields = np.stack([own.yields[changes.column] for own in nodes])[node, change]
+        tau, base, variance = np.array([(node_of.tau, node_of.mean, node_of.variance) for node_of in nodes])[node].T
+        yields = np.stack([node_of.yields[changes.column] for node_of in nodes])[node, change]
         spread = np.sqrt(np.maximum(variance, 0.0)) * random.standard_normal(count)
         return cls(tau, change, size, base - yields * size + spread)
 

@@ -149,9 +149,9 @@ class Diagnosis(Evidence):
     @property
     def measured_ratio(self) -> tuple[float, tuple[float, float]] | None:
         """Displacement over area as measured, over the assumed one, and its interval; None where not measured."""
-        for own in (self, *self.parts):
-            if own.ratio is not None and own.ratio_interval is not None:
-                return own.ratio, own.ratio_interval
+        for decision in (self, *self.parts):
+            if decision.ratio is not None and decision.ratio_interval is not None:
+                return decision.ratio, decision.ratio_interval
         return None
 
     @property
@@ -220,7 +220,7 @@ class Diagnosis(Evidence):
     def _question(self, name: str) -> Evidence | None:
         """Return what the judging detector answers to one of its questions; None where it was not asked."""
         judge = self.parts[0].parts if self.parts else ()
-        return next((own for own in judge if own.detector == name), None)
+        return next((part for part in judge if part.detector == name), None)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the diagnosis as plain JSON values, keys in the order of the output contract.
@@ -240,7 +240,7 @@ class Diagnosis(Evidence):
             {
                 **{name: getattr(self, name) for name in _FIRST},
                 "methods": methods,
-                "quality": [{name: getattr(own, name) for name in names} for own in self.quality],
+                "quality": [{name: getattr(warning, name) for name in names} for warning in self.quality],
                 "cause": self.cause,
                 "next_check": self.next_check,
                 "total_leakage": total,
@@ -356,7 +356,7 @@ def _is_usual(question: Evidence) -> bool:
     return question.chance is None or question.chance >= 0.05
 
 
-def machine_name_of(about: Mapping[str, str]) -> str | None:
+def machine_name_of(preamble: Mapping[str, str]) -> str | None:
     """Return what the preamble of a file calls the machine; None where it does not say."""
-    names = {name.lower(): text for name, text in about.items()}
+    names = {name.lower(): text for name, text in preamble.items()}
     return next((names[name] for name in _MACHINES if name in names), None)

@@ -102,8 +102,8 @@ def healthy_leakage(rig: Rig) -> float:
     """
     healthy, pump = rig.entry("pump.G_healthy"), rig.entry("pump.q_b")
     assumed_of_it = states_rig(rig) and rig.states("pump.q_b") and healthy.place == pump.place
-    own = rig.states("pump.G_healthy") or assumed_of_it
-    return rig.pump.G_healthy if own else 0.0
+    is_known = rig.states("pump.G_healthy") or assumed_of_it
+    return rig.pump.G_healthy if is_known else 0.0
 
 
 def unstated() -> Rig:
@@ -119,5 +119,5 @@ def _made_with(provenance: Mapping[str, Any], rig: Rig) -> bool:
     name, overrides = experiment.get("rig"), experiment.get("overrides")
     if name not in rig_names() or not isinstance(overrides, Mapping) or set(_GEOMETRY) & set(overrides):
         return False
-    own = load_rig(name)
-    return all(own[parameter] == rig[parameter] for parameter in _GEOMETRY)
+    stated_rig = load_rig(name)
+    return all(stated_rig[parameter] == rig[parameter] for parameter in _GEOMETRY)
