@@ -73,7 +73,7 @@ class Examination:
         return replace(self, recording=recording, baseline=baseline, _reports={})
 
     def report(self, name: str) -> Observed:
-        """Return what a detector observes, and why it observes nothing where it cannot.
+        """Return a detector's observations, or the reason why it has none.
 
         Raises KeyError for a detector that is not registered.
         """
@@ -83,12 +83,12 @@ class Examination:
 
     @cached_property
     def signals(self) -> Observed:
-        """What no detector of leaks observes: duty, noise, hum and levels."""
+        """Observations of duty, noise, hum and levels, which no detector of leaks makes."""
         return Observed(SIGNALS, lack=self.distrust) if self.distrust else observe_signals(self.recording)
 
     @cached_property
     def null(self) -> HealthyNull:
-        """What the healthy recordings show of every observable."""
+        """Distribution of every observable over the healthy recordings."""
         leak = self.report(ORDER[0]).leak if ORDER[0] in detectors() else None
         return null_of(self.baseline, self.rig, shut=isinstance(leak, BalanceLeak) and leak.balance.shut)
 

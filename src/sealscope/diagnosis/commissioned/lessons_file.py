@@ -207,7 +207,7 @@ def _pack(value: Any) -> Any:
 
 
 def check_lesson(method: str, lesson: Mapping[str, Any]) -> None:
-    """Raise ArithmeticError where what a method has learnt could not be read again, as with infinite numbers."""
+    """Raise ArithmeticError if a method's lesson could not be read again, for example with infinite numbers."""
     try:
         packed = _pack(lesson)
         json.dumps(packed, allow_nan=False)

@@ -54,7 +54,7 @@ JUDGEMENTS: tuple[Judgement, ...] = get_args(Judgement)
 
 
 class JudgedAlarm(NamedTuple):
-    """What a person said of an alarm of the monitor.
+    """A person's judgement of an alarm of the monitor.
 
     `alarm`: its name, "" for a repair without one; `mark`, said at `date_s`; of a leak since `onset_s` [s since 1970];
     `leak_lpm` [L/min] and `reason`, where they are known.
@@ -81,7 +81,7 @@ class Origin(NamedTuple):
 
 
 def _is_taken_back(word: JudgedAlarm, later: Iterable[JudgedAlarm]) -> bool:
-    """Whether a later word calls the alarm invalid; a new alarm of the same name begins after this word."""
+    """Test whether a later word calls the alarm invalid; a new alarm of the same name begins after this word."""
     answers = (answer for answer in later if answer.alarm == word.alarm and answer.onset_s <= word.date_s)
     return any(answer.mark == "invalid" for answer in answers)
 
@@ -134,7 +134,7 @@ class CommissionedMachine:
 
     @cached_property
     def summary(self) -> Summary:
-        """What the healthy recordings say of the machine, of its sensors and of the smallest leak."""
+        """Summary of the machine, its sensors and the smallest leak, from the healthy recordings."""
         from sealscope.diagnosis.commissioned.summary import summarised
 
         return summarised(self.healthy, self.rig, self.left_out)
@@ -261,7 +261,7 @@ def _is_written(file: Path) -> bool:
 
 
 def learn(recording: Recording, rig: Rig, file: str, checksum: str = "") -> Learnt:
-    """Return what a healthy recording teaches every detector.
+    """Return the lessons of a healthy recording for every detector.
 
     Raises InputError where it cannot be trusted, or teaches nothing.
     """

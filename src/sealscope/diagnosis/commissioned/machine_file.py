@@ -232,7 +232,7 @@ def _read_alarms(rows: Any) -> tuple[JudgedAlarm, ...]:
 
 
 def _parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
-    """Return what a machine's text holds that another process may add or take away: hash and name of each."""
+    """Return the hash and name of each part of a machine's text that another process may add or remove."""
 
     def hash_of(value: Any) -> bytes:
         return sha256(json.dumps(value, sort_keys=True, default=str).encode()).digest()[:16]
@@ -277,7 +277,7 @@ def _lessons_named(tree: Mapping[str, Any]) -> list[str]:
 
 
 def _lessons_path(path: Path, tree: Mapping[str, Any]) -> Path:
-    """Return the file of lessons of a text: that of its name, or where there is none that which it states."""
+    """Return a machine's file of lessons: the one of the same name if it exists, else the one its text states."""
     usual, head = path.with_suffix(SUFFIX), tree.get("machine")
     stated = head.get("lessons") if isinstance(head, dict) else None
     if usual.exists() or not isinstance(stated, str) or _FILE_NAME.fullmatch(stated) is None:

@@ -56,7 +56,7 @@ class Smallest(NamedTuple):
 
 @dataclass(frozen=True)
 class Summary:
-    """What is stated of a machine by its healthy recordings.
+    """Figures of a machine from its healthy recordings.
 
     `terms` by name; `noise` of each channel in its unit; `smallest` leak, None where no balance states one; `problems`:
     what looks wrong, a line each.
@@ -68,7 +68,7 @@ class Summary:
     problems: list[str] = field(default_factory=list)
 
     def text(self, healthy: Sequence[Learnt], rig: Rig | None) -> str:
-        """Return it in some ten lines."""
+        """Format the summary in some ten lines."""
         units = healthy[0].units if healthy else {}
         starts = [recording.start_s for recording in healthy if recording.start_s is not None]
         dates = sorted(datetime.fromtimestamp(start, UTC).date().isoformat() for start in starts)
@@ -109,7 +109,7 @@ class Summary:
 
 
 def _stated(rig: Rig | None) -> str:
-    """Return what is stated of the machine, in words."""
+    """Describe the stated sizes of the machine in words."""
     rig = rig or unstated()
     if rig.states("cylinder.M_eq"):
         return rig.title or rig.name
@@ -142,7 +142,7 @@ def _duty(healthy: Sequence[Learnt]) -> str:
 
 
 def about_recording(recording: Recording, inspection: Inspection) -> dict[str, Any]:
-    """Return what people read of a healthy recording, and what looks wrong with it."""
+    """Describe a healthy recording for people, with its problems."""
     part, description = inspection.part, dict[str, Any]()
     if {"p_A", "p_B"} <= set(part.channels) and part.units["p_A"] == "Pa":
         description["pressure_bar"] = _rounded(float(np.mean(np.abs(part["p_A"] - part["p_B"]))) / BAR)
@@ -223,7 +223,7 @@ def _smallest(balance: VolumeBalance, lessons: Sequence[Mapping[str, Any]], chan
 
 
 def _collected(healthy: Sequence[Learnt]) -> list[str]:
-    """Return what looks wrong, each kind of it once, with the file or the number of files."""
+    """Return the problems, each kind once, with the file or the number of files."""
     kinds: dict[str, list[tuple[str, str]]] = {}
     for recording in healthy:
         for text in recording.about.get("wrong", ()):
@@ -248,7 +248,7 @@ def _below_vacuum(part: Recording, name: str) -> str:
 
 
 def _glitches(part: Recording, name: str) -> str:
-    """Return how many samples jump away and back by far more than all others."""
+    """Report the number of samples that jump away and back by far more than all others."""
     values = part[name]
     if len(values) < 3:
         return ""

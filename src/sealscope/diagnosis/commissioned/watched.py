@@ -24,7 +24,7 @@ _AREAS, _DISPLACEMENT = ("cylinder.A_A", "cylinder.A_B"), "pump.q_b"
 
 @dataclass(frozen=True)
 class WatchedMachine:
-    """What a rig's or a machine's file states of an actuator to be watched.
+    """An actuator to be watched, from a rig's or a machine's file.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def load_watched(rig: str) -> WatchedMachine:
 
 
 def is_remeasured(rig: Rig, before: Rig) -> bool:
-    """Return whether a rig is that of before, its displacement measured anew from more healthy recordings."""
+    """Test whether two rigs differ only in the displacement, measured anew from more healthy recordings."""
     values, values_before = rig.model_dump(), before.model_dump()
     for tree in (values, values_before):
         tree.get("pump", {}).pop("q_b", None)

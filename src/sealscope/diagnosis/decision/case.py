@@ -50,7 +50,7 @@ class OtherEvent(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DecisionContext:
-    """What a decision is made under.
+    """Conditions of a decision.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ class Case:
 
     @property
     def leak(self) -> LeakMeasure | None:
-        """What the judging provider measures of the leak."""
+        """Leak as measured by the judging provider."""
         return self.judge.leak
 
     @cached_property
@@ -159,7 +159,7 @@ def step_key(provider: str) -> str:
 
 
 def _change_questions(case: Case) -> tuple[Question, ...]:
-    """Return the question of a provider that measures no leak: whether what a leak moves changed as it does."""
+    """Return the question of a provider that measures no leak: did a leak's observables change?"""
     leak = next(event for event in load_events() if event.name == LEAK_EVENTS[0])
     moved = [observable for observable in case.judge.observables if leak.does_move(observable)]
     rarest = min(moved, key=lambda observable: observable.chance, default=None)

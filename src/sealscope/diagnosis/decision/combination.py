@@ -27,7 +27,7 @@ def rank(detector: str) -> int:
 
 
 def is_decided(evidence: Evidence) -> bool:
-    """Return whether evidence stands: a verdict, or a change that is seen and not explained."""
+    """Test whether evidence stands: a verdict, or an unexplained change."""
     return evidence.usable and not evidence.abstains
 
 
@@ -59,7 +59,7 @@ def combine(decisions: Sequence[Evidence], context: DecisionContext) -> Evidence
 
 
 def _undecided(ranked: Sequence[Evidence], usable: Sequence[Evidence]) -> Evidence:
-    """Say why no detector has a verdict: by the first that could be used, else by the one that needs least."""
+    """State why no detector has a verdict: by the first usable one, else by the one that needs least."""
     if usable:
         stated = usable[0]
     else:

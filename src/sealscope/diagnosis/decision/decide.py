@@ -75,7 +75,7 @@ def decide(judge: Observed, reports: Sequence[Observed], null: HealthyNull, cont
 
 
 def _describes_else(report: Observed, judge: Observed) -> bool:
-    """Return whether a report is of other data than those of the judge: two leak measures share their samples."""
+    """Test whether a report rests on other data than the judge's: two leak measures share their samples."""
     return report.leak is None or judge.leak is None
 
 

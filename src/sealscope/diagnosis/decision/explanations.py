@@ -51,7 +51,7 @@ class Explanation:
     data: frozenset[str] = frozenset()
 
     def has(self, *names: str) -> bool:
-        """Return whether one of the events has one of the names."""
+        """Test whether one of the events has one of the names."""
         return any(event.name in names for event in self.events)
 
 
@@ -146,7 +146,7 @@ def log_bayes_factor(chance: float) -> float:
 
 
 def _coincide(observable: Observable, anchor: Observable) -> bool:
-    """Return whether two observables may have changed at the same time."""
+    """Test whether two observables may have changed at the same time."""
     if observable.onset is None or anchor.onset is None:
         return True
     reach = 0.5 * (observable.onset.high - observable.onset.low + anchor.onset.high - anchor.onset.low)

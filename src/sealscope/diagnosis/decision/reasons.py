@@ -87,7 +87,7 @@ def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) ->
 
 
 def _changed_ringing_text(case: Case, ringing: Ringing) -> str:
-    """Return how the ringing changed, and how probable a leak is that changed it."""
+    """Describe the change of the ringing, and the probability of a leak behind it."""
     shown = min(case.judge.observables, key=lambda observable: observable.chance)
     percent = 100.0 * abs(np.expm1(shown.size))
     where = _onset_text(shown) or _against_text(ringing)
@@ -103,7 +103,7 @@ def _against_text(ringing: Ringing | None) -> str:
 
 
 def _rivals_text(case: Case, alarm: Question) -> str:
-    """Return which explanation competes with a leak, and the recording that would separate them."""
+    """Name the explanation that competes with a leak, and the recording that would separate them."""
     leak = case.leak_probability(alarm)
     best = next((explanation for explanation in case.explanations if not explanation.has(*LEAK_EVENTS)), None)
     if best is None:
@@ -130,7 +130,7 @@ def _onset_text(observable: Observable) -> str:
 
 
 def _shown_text(other: OtherEvent) -> str:
-    """Return what shows an event, where its words do not."""
+    """Name the observable of an event, unless its words do."""
     name = other.observable.name
     return "" if name in other.words else text_of("doubt", "shown", name=name)
 

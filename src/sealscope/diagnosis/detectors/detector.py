@@ -39,7 +39,7 @@ class Detector(Protocol):
         ...
 
     def observe(self, recording: Recording, baseline: Sequence[Any] = ()) -> Observed:
-        """Return what the detector observes of a recording that is `usable`: numbers, no verdict.
+        """Return the detector's observations of a `usable` recording: numbers, no verdict.
 
         `baseline`: leak-free recordings of the same machine, at any duty, no two of them copies; where
         there is none, changes within the recording are looked for.
@@ -52,7 +52,7 @@ Factory = Callable[["Rig"], Detector]
 
 
 def unusable(detector: Detector, recording: Recording) -> str | None:
-    """Return in one line why a detector cannot use a recording, None where it can."""
+    """Return the reason, in one line, why a detector cannot use a recording, None where it can."""
     reason: Any = detector.usable(recording)
     if reason is None:
         return None
@@ -83,7 +83,7 @@ def make_observable(
 
 
 def checked(report: Any, name: str) -> Observed:
-    """Return what a detector's `observe` gave, or raise TypeError or ValueError where it is no valid report."""
+    """Return the report of a detector's `observe`; raise TypeError or ValueError where it is not valid."""
     if isinstance(report, Observable):
         report = Observed(name, (report,))
     if not isinstance(report, Observed):

@@ -41,7 +41,7 @@ WAKES: int = _PRIORS["wakes"]
 
 @dataclass(frozen=True)
 class BlockConductance:
-    """What a block shows of the machine.
+    """State of the machine in one block.
 
     `begin`, `end`: of its samples [s]; `g`, `sd`: conductance of what passes pump and piston, and its deviation
     [m^3/(s Pa)], of a series that does not move as the other coefficients become known; `total`: as these are known
@@ -126,11 +126,11 @@ class LiveBalance:
 
     @staticmethod
     def states_flow(rig: Rig) -> bool:
-        """Return whether a rig states what turns the balance into L/min."""
+        """Test whether a rig states the sizes needed for a leak in L/min."""
         return rig.states(*(("cylinder.A_A", "cylinder.A_B") if _valved(rig) else ("pump.q_b",)))
 
     def take(self, run: SampleRun) -> list[Shown]:
-        """Take the next samples; return what each block says that they complete.
+        """Take the next samples; return the result of each block they complete.
 
         The first blocks say nothing until there are `LEARNED`; the last of these says what all of them do. After a gap
         the balance goes on with what it knew; what lay before the gap and fills no block is dropped.
@@ -179,7 +179,10 @@ class LiveBalance:
         return motion(float(block.gram[0, 0, -1, -1]), float(block.rows[0]), self._known[0].numbers)
 
     def _says(self, block: Blocks, adds: bool = True) -> tuple[float, ...]:
-        """Return what a block says by all equations (`says`); with `adds` it is one of those known from now on."""
+        """Sum the answers of all equations on a block (`says`).
+
+        With `adds` the block is one of those known from now on.
+        """
         rows, equation_parts = float(block.rows[0]), zip(self._known, block.gram[0], self._places, strict=True)
         answers = [_says(known, gram, place, rows, adds) for known, gram, place in equation_parts]
         return tuple(sum(values) for values in zip(*answers, strict=True))
@@ -206,7 +209,7 @@ class LiveBalance:
         self._precision, self._woken, self._waiting = 0.0, 0, None
 
     def state(self) -> dict[str, Any]:
-        """Return all of it as plain values that JSON holds."""
+        """Return the state as plain values for JSON."""
         waiting, stream = self._waiting, self._stream
         return {
             **saved(self, _SAVED),
@@ -245,7 +248,7 @@ def _valved(rig: Rig) -> bool:
 
 
 def size_error(rig: Rig) -> float:
-    """Return how far a flow by the rig's size is known, relative."""
+    """Return the relative error of a flow computed from the rig's size."""
     return float(priors("inference")["size"]["area" if _valved(rig) else "displacement"])
 
 

@@ -18,7 +18,7 @@ Duty = tuple[float, float]
 
 @dataclass(frozen=True)
 class BlockEstimate:
-    """What one block shows.
+    """Estimate of one block.
 
     `number`: blocks so far, with this one; `t`: its end [s]; `status`: "learning", "watched", "alarm", or why it is not
     judged ("at standstill", "missing values", ...); `total_lpm`: flow past pump and piston together, `leak_lpm`: beyond
@@ -36,7 +36,7 @@ class BlockEstimate:
 
     @property
     def judged(self) -> bool:
-        """Whether the block was compared with the machine before it."""
+        """True if the block was compared with the machine before it."""
         return self.status in ("learning", "watched", "alarm")
 
 
@@ -65,7 +65,7 @@ class WatchedLeak:
 
     @property
     def rarity(self) -> float:
-        """How much rarer than at the stated rate a healthy machine shows such a score, as a share of 1e-9 to 1.
+        """Share of the stated false-alarm rate at which a healthy machine shows such a score, from 1e-9 to 1.
 
         For a level by the normal tail; for a step half the score is the logarithm of an e-value (`sequential`).
         """
@@ -100,7 +100,9 @@ class WatchBaseline:
     duty_high: Duty
 
     def rise(self, now: float, g: float, deviation: float, probability: float) -> StepEstimate | None:
-        """Return the rise where a mean conductance is over what warm oil makes of the baseline's least; None where not.
+        """Estimate the rise of a mean conductance that warm oil cannot explain; None where there is none.
+
+        The ceiling is the least conductance of the baseline with the warmest oil.
 
         `deviation`: of `g`; `probability`: of a look at a healthy machine as warm as that.
         """
@@ -124,7 +126,7 @@ class WatchBaseline:
 
 
 def within(duty: Duty, low: Duty, high: Duty) -> bool:
-    """Return whether a duty lies between two others, give or take; a leak may take more of the pressure."""
+    """Test whether a duty lies between two others, within a margin; a leak may take more of the pressure."""
     believed = priors("live")["watch"]
     margin = believed["margin"]
     below = (low[0] - believed["damped"], low[1] - margin)

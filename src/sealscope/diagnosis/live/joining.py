@@ -40,17 +40,17 @@ def ways_to_watch(rig: Rig) -> tuple[tuple[str, ...], ...]:
 
 
 def in_words(ways: Sequence[Sequence[str]]) -> str:
-    """Return what `ways_to_watch` gives, as a line names it."""
+    """Format the sets of channels of `ways_to_watch` for a message."""
     return ", or ".join(f"{', '.join(way[:-1])} and {way[-1]}" for way in ways)
 
 
 def follow(steps: Any, rate: float) -> Any:
-    """Return whether samples that are `steps` [s] apart follow each other: nearer ones are copies."""
+    """Test whether samples `steps` [s] apart follow each other; nearer ones are copies."""
     return (steps * rate > _NEAREST) & (steps * rate < _FARTHEST)
 
 
 def same_rate(rate: float, before: float) -> bool:
-    """Return whether two sampling rates [Hz] are the same, as far as clocks tell."""
+    """Test whether two sampling rates [Hz] agree within the error of clocks."""
     return abs(rate / before - 1.0) < _CLOCKS
 
 
@@ -108,7 +108,7 @@ class SampleJoiner:
             self.changed = False
 
     def _fits(self, samples: Recording) -> bool:
-        """Return whether the samples have the stream's channels and SI units; count them where they do not."""
+        """Test whether the samples have the stream's channels and SI units; count them otherwise."""
         names, offered = self.names, next((way for way in self.ways if samples.channels.keys() >= {*way}), ())
         if not names or ("x" in offered and "x" not in names and not self.settled):
             names = offered
@@ -155,7 +155,7 @@ class SampleJoiner:
             known = known[run:]
 
     def state(self) -> dict[str, Any]:
-        """Return all of it as plain values."""
+        """Return the state as plain values."""
         return saved(self, _SAVED)
 
     def recall(self, state: Any) -> None:
@@ -169,5 +169,5 @@ _SAVED = ("settled", "names", "rate", "newest", "changed", "counters")
 
 
 def _length(true: NDArray[np.bool_]) -> int:
-    """Return how many of the first values are true."""
+    """Count the values before the first false one."""
     return int(np.argmin(true)) if not true.all() else true.size

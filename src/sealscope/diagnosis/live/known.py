@@ -131,7 +131,7 @@ def begin(known: Any) -> None:
 
 @large_law
 def says(known: Any, rows: float, adds: bool) -> tuple[float, float, float, float]:
-    """Return what the block `known.own` says, beside those before it; with `adds` it is one of them then.
+    """Estimate the leak's coefficient from the block `known.own` and those before it; with `adds`, keep the block.
 
     The precision of the leak's coefficient; that times its estimate, and times what is to be taken from it so that the
     series does not move with the other coefficients; the variance that these leave, times the precision squared.

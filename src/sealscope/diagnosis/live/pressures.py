@@ -61,11 +61,11 @@ class PressureEstimator:
 
     @property
     def begun(self) -> bool:
-        """Whether the machine moved for so long that its response was fitted."""
+        """True once the machine moved long enough for its response to be fitted."""
         return self._follower is not None
 
     def take(self, run: SampleRun) -> list[Shown]:
-        """Take the next samples; return what each block shows that they complete."""
+        """Take the next samples; return the result of each block they complete."""
         before = self._kept if run.follows else self._kept[:, :0]
         if not run.follows:
             self._held[:] = math.nan
@@ -92,7 +92,7 @@ class PressureEstimator:
         return shown
 
     def _shown(self, block: Recording) -> Shown:
-        """Return what a block shows."""
+        """Return the conductance of a block, or the reason why it is not judged."""
         begin, end = float(block.t[0]), float(block.t[-1]) + 1.0 / block.rate
         if self._follower is None or block.rate < _SLOWEST:
             return _passed_over(end, f"sampled at less than {_SLOWEST:g} Hz")
@@ -149,7 +149,7 @@ class PressureEstimator:
             self._follower.interrupt(math.inf)
 
     def state(self) -> dict[str, Any]:
-        """Return all of it but the rig as plain values."""
+        """Return the state without the rig as plain values."""
         state = saved(self, _SAVED)
         if (follower := self._follower) is None:
             return state | {"follower": None}

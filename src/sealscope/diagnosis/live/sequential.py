@@ -84,7 +84,7 @@ class StepDetector:
         self._places = np.zeros((0, len(_PLACES)))
 
     def resolves(self, g: float, deviation: float) -> bool:
-        """Return whether a block's numbers, in the unit of the first one, have squares that floats hold."""
+        """Test whether the squares of a block's numbers, in the unit of the first block, fit into floats."""
         unit = self._unit or deviation
         return unit > 0.0 and abs(g) < _FARTHEST * unit and unit / _FARTHEST < deviation < _FARTHEST * unit
 
@@ -198,7 +198,7 @@ class StepDetector:
         return float((self._total[3, 0] + _PRIORS["stated"]) / (self._known + _PRIORS["stated"]))
 
     def state(self) -> dict[str, Any]:
-        """Return all of it as plain values."""
+        """Return the state as plain values."""
         return saved(self, _SAVED)
 
     def recall(self, state: Any) -> None:
@@ -238,7 +238,7 @@ def _most(onsets: Any, places: Any) -> float:
 
 
 def _kept(now: int, places: Array) -> NDArray[np.bool_]:
-    """Return which onsets are kept of those that are old: of fewer and fewer blocks, and at their beginning only."""
+    """Select the onsets to keep: of older blocks fewer and fewer, and at their beginning only."""
     _, born, onset, begin = places.T
     age = now - born
     step = 2.0 ** np.ceil(np.log2(np.maximum(age / RECENT, 1.0))) * 2.0

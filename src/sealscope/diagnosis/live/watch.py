@@ -131,7 +131,7 @@ class Watch:
 
     @property
     def counters(self) -> dict[str, int]:
-        """What was dropped, passed over or interrupted, by reason, in samples, blocks or events."""
+        """Counts of dropped samples, skipped blocks and interruptions, by reason."""
         return dict(self._samples.counters)
 
     @property
@@ -191,7 +191,10 @@ class Watch:
         return [estimate for estimate, _ in self.each(samples, follows=follows)]
 
     def each(self, samples: Recording, *, follows: bool = True) -> Iterator[tuple[BlockEstimate, WatchedLeak | None]]:
-        """Yield what `update` returns, each estimate with the leak as of that block; to be gone through to the end."""
+        """Yield the estimates of `update`, each with the leak at that block.
+
+        Iterate to the end: samples are taken on the way.
+        """
         if not follows:
             self._samples.restart("restart")
         for run in self._samples.runs(remove_dropouts(samples)):
@@ -234,7 +237,7 @@ class Watch:
         self._last, self._group = self._last[:0], self._group[:0]
 
     def judged(self, shown: Shown) -> BlockEstimate:
-        """Return the estimate of a block, from what is shown of it."""
+        """Return the estimate of a block from its conductance, or from the reason why there is none."""
         self.blocks += 1
         if isinstance(shown, NotJudged):
             if shown.apart:
@@ -299,7 +302,7 @@ class Watch:
         self._raise(estimator, rise._replace(threshold=2.0 * threshold, reason=reason), block)
 
     def _other_duty(self, estimator: Estimator, rise: StepEstimate) -> bool:
-        """Return whether the duty changed with a rise, beyond what it was before and what a leak makes of it."""
+        """Test whether the duty changed with a rise, beyond its range before and the effect of a leak."""
         pressure, motion = self._last["pressure"], self._last["motion"]
         after = self._last["end"] > rise.onset[0]
         if np.count_nonzero(~after) < _OF_NOW or not after.any():
@@ -430,12 +433,12 @@ class Watch:
 
     @staticmethod
     def _warmed(leak: WatchedLeak, t: float) -> float:
-        """Return by how much warmer oil may have raised the conductance since the onset of a leak."""
+        """Return the factor by which warmer oil may have raised the conductance since the onset of a leak."""
         oil, hours = priors("inference")["oil"], max(0.0, t - leak.onset_s) / 3600.0
         return float(oil["warmest"] ** min(1.0, hours / oil["shift"]))
 
     def state(self) -> dict[str, Any]:
-        """Return all that the watch knows as plain values that JSON holds, its ``"version"`` that of the format."""
+        """Return the state of the watch as plain values for JSON; its ``"version"`` is the format's."""
         estimator = self._estimator if self._estimator is not None and self._estimator.method == self.method else None
         return {
             "version": STATE_VERSION,

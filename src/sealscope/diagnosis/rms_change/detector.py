@@ -51,7 +51,7 @@ class RmsChange:
         return None if still is None else f"{still} is constant"
 
     def learn(self, recording: Recording) -> Lesson:
-        """Return what a healthy recording teaches: its log RMS and duty, whose they are, and when."""
+        """Return the lesson of a healthy recording: log RMS and duty, their chambers, and the start."""
         levels, duty = whole(recording)
         chambers, start = list(judged_chambers(recording)), start_seconds(recording)
         known = {"chambers": chambers, "recorded": list(chambers_of(recording)), "rate": recording.rate}

@@ -39,7 +39,7 @@ def beyond_noise(log_rms: Array, known: Array) -> tuple[Array, Array]:
 
 
 def information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
-    """Return what the blocks say of the change g of each quantity, duty eliminated, and the mean of w of each."""
+    """Compute the information on the change g of each quantity, duty eliminated, and the mean of each w."""
     left, weight = beyond_noise(blocks.log_rms, blocks.log_rms)
     error = np.mean(np.diff(left, axis=0) ** 2, axis=0) / 2.0
     explaining = DUTY[:-1]  # the direction is that of the phase

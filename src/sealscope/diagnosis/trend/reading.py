@@ -40,7 +40,7 @@ BASES: tuple[Basis, ...] = ("volume balance", "pressure response", "ringing")
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LeakReading:
-    """What a recording states of the leakage.
+    """Level of leakage of one recording.
 
     `start`: of its first sample [s since 1970], None where not known, and `duration` [s]; `basis`, None where nothing
     can be stated, and `problem`: why; `level`: conductance of pump and piston together [m^3/(s Pa)], or a relative
@@ -67,7 +67,7 @@ class LeakReading:
 
 
 def reading_of(recording: Recording, rig: Rig | str | os.PathLike[str] | None = None, file: str = "") -> LeakReading:
-    """Return what a recording states of the leakage.
+    """Estimate the level of leakage of a recording.
 
     `rig`: what may be assumed of the machine; None: as for `diagnose`, L/min only where the machine is known.
     """
@@ -212,7 +212,7 @@ def _change(scale: float | None, other: float | None) -> float:
 
 
 def _clock(ordered: Sequence[TrendPoint]) -> list[Finding]:
-    """Return what shows that a clock was set back: recordings that overlap, or numbered names against the times.
+    """Find signs of a clock set back: overlapping recordings, or numbered names against the times.
 
     Recordings of one date without times of day have the same start.
     """

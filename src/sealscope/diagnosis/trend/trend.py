@@ -46,7 +46,7 @@ FEWEST = 3
 
 @dataclass(frozen=True)
 class Trend:
-    """What the recordings of a single machine say of its leakage over time.
+    """Leakage of a single machine over time, from its recordings.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ class Trend:
 
     @property
     def wear(self) -> Wear | None:
-        """What the last stretch says, None where there is no level."""
+        """Wear of the last stretch, None where there is no level."""
         return self.episodes[-1].wear if self.episodes else None
 
     @property
@@ -134,7 +134,7 @@ class Trend:
 
     @property
     def next_check(self) -> str:
-        """What to check next on the machine."""
+        """Next check on the machine."""
         if self.verdict == NO_LEAK:
             return "Nothing needs a check; go on recording under the same duty."
         if self.verdict == LEAK:
@@ -224,7 +224,7 @@ def trend(
     years: float = 10.0,
     every: float | None = None,
 ) -> Trend:
-    """Return how the leakage of a single machine went over its recordings.
+    """Estimate the trend of a single machine's leakage over its recordings.
 
     Parameters
     ----------
@@ -326,7 +326,7 @@ def _with_levels(trend: Trend) -> Trend:
 
 
 def _known(trend: Trend) -> int:
-    """Return how many of the compared recordings are among the first ones, known to be healthy; at least the first."""
+    """Count the compared recordings among the first ones, known to be healthy; at least the first."""
     first = dict.fromkeys(point.digest for point in trend.points)  # a copy counts once
     known = {*islice(first, trend.healthy)}
     return max(1, sum(trend.points[row].digest in known for row in trend.rows))

@@ -106,7 +106,7 @@ class Levels:
 
 
 def beyond(levels: Levels) -> tuple[Array, Array]:
-    """Return what of each value does not count while it is the last one, and what not once the next one is known.
+    """Return the excess of each value not counted while it is the last one, and not once the next one is known.
 
     That is what lies beyond some deviations of the three before it, unless its neighbour lies as far out.
     """
@@ -292,7 +292,7 @@ class _Draws(NamedTuple):
 
 
 class Wear(NamedTuple):
-    """What the recordings of a segment say of its course.
+    """Course of a segment of recordings.
 
     `now`: level after the last recording, without the day's own scatter; `growth`: by a month; `step`: size of a step,
     None where a growth is likelier, or nothing changed; `onset`: time of the change [days], None where there is none;

@@ -117,7 +117,7 @@ class Diagnosis(Evidence):
 
     @property
     def severity(self) -> Severity | None:
-        """How bad the leak is; None where there is none, or nothing is known of its size."""
+        """Severity of the leak; None where there is none, or nothing is known of its size."""
         return severity(self, self.limit)
 
     @property
@@ -156,7 +156,7 @@ class Diagnosis(Evidence):
 
     @property
     def machine_name(self) -> str | None:
-        """What the file calls the machine; None where it does not say."""
+        """The machine's name in the file; None where there is none."""
         return machine_name_of(self.about)
 
     @property
@@ -180,7 +180,7 @@ class Diagnosis(Evidence):
 
     @property
     def next_check(self) -> str:
-        """What to check next on the machine, in one or two sentences."""
+        """Next check on the machine, in one or two sentences."""
         with_bypass = self.machine is not None and self.machine.bypass
         return action_of(self._condition, self.named_cause, ("bypass",) if with_bypass else ())
 
@@ -196,13 +196,13 @@ class Diagnosis(Evidence):
 
     @property
     def known_healthy(self) -> bool:
-        """Whether leak-free recordings or the rig show that the level is that of a healthy machine."""
+        """True if leak-free recordings or the rig show that the level is that of a healthy machine."""
         by_rig = self.total_leakage is not None and self.total_leakage.healthy
         return self.verdict == NO_LEAK and (self.baselines > 0 or by_rig)
 
     @property
     def is_baseline(self) -> bool:
-        """Whether it may serve as a baseline: its total is shown to be like that of the healthy recordings."""
+        """True if the recording may serve as a baseline: its total is shown to be like the healthy recordings'."""
         against = self._question(AGAINST)
         if self.verdict != NO_LEAK or self.cause is not None or against is None or not _is_usual(against):
             return False
@@ -213,12 +213,12 @@ class Diagnosis(Evidence):
 
     @property
     def rises_within(self) -> bool:
-        """Whether the leakage probably rose within the recording, of which no onset is stated."""
+        """True if the leakage probably rose within the recording, though no onset is stated."""
         within = self._question(WITHIN)
         return self.onset_s is None and within is not None and not _is_usual(within)
 
     def _question(self, name: str) -> Evidence | None:
-        """Return what the judging detector answers to one of its questions; None where it was not asked."""
+        """Return the judging detector's answer to one of its questions; None where it was not asked."""
         judge = self.parts[0].parts if self.parts else ()
         return next((part for part in judge if part.detector == name), None)
 
@@ -352,11 +352,11 @@ class Diagnosis(Evidence):
 
 
 def _is_usual(question: Evidence) -> bool:
-    """Return whether a question's chance is that of 19 of 20 healthy recordings."""
+    """Test whether a question's chance is that of 19 of 20 healthy recordings."""
     return question.chance is None or question.chance >= 0.05
 
 
 def machine_name_of(preamble: Mapping[str, str]) -> str | None:
-    """Return what the preamble of a file calls the machine; None where it does not say."""
+    """Return the machine's name in the preamble of a file; None where there is none."""
     names = {name.lower(): text for name, text in preamble.items()}
     return next((names[name] for name in _MACHINES if name in names), None)

@@ -21,7 +21,7 @@ _DEFAULT, _REASON = "thesis", "no rig was stated"
 
 @dataclass(frozen=True)
 class AssumedMachine:
-    """What a diagnosis assumes of the machine.
+    """Assumptions of a diagnosis about the machine.
 
     `rig`: its name; `stated_by` the call (`--rig` or a Rig), the provenance of a recording of our own, or nobody;
     `area` of the piston, the mean of both sides [m^2], and `displacement` of the pump [m^3/rev]; `area_stated`,
@@ -42,7 +42,7 @@ class AssumedMachine:
 
     @property
     def stated(self) -> bool:
-        """Whether area and displacement are both stated."""
+        """True if area and displacement are both stated."""
         return self.area_stated and self.displacement_stated
 
     def as_dict(self) -> dict[str, Any]:
@@ -86,17 +86,17 @@ def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) 
 
 
 def states_rig(rig: Rig) -> bool:
-    """Whether a rig is somebody's, and not the default one of which area or displacement alone is stated."""
+    """Test whether a rig is somebody's, not the default one with only area or displacement stated."""
     return rig.entry("cylinder.M_eq").source != f"{ASSUMED} {_REASON}"
 
 
 def measures_flow(units: Mapping[str, str]) -> bool:
-    """Whether the flow to the cylinder is read by a meter in its unit, and neither angle nor speed of a pump is."""
+    """Test whether a meter reads the flow to the cylinder in its unit, and no angle or speed of a pump is read."""
     return flow_source(units) == "q_pump" and units["q_pump"] == "m^3/s"
 
 
 def healthy_leakage(rig: Rig) -> float:
-    """Return the most that a healthy pump leaks, `pump.G_healthy` [m^3/(s Pa)]; 0 where it is not that of this pump.
+    """Return the largest leakage of a healthy pump, `pump.G_healthy` [m^3/(s Pa)]; 0 if stated for another pump.
 
     What a file assumes of its own pump counts; not what is left of another rig's where only the displacement is stated.
     """
@@ -112,7 +112,7 @@ def unstated() -> Rig:
 
 
 def _made_with(provenance: Mapping[str, Any], rig: Rig) -> bool:
-    """Return whether a simulated recording's own rig has the area and displacement of this one."""
+    """Test whether the rig of a simulated recording has the area and displacement of this one."""
     experiment = provenance.get("experiment")
     if provenance.get("origin") != "simulation" or not isinstance(experiment, Mapping):
         return False

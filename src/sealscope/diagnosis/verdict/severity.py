@@ -37,7 +37,7 @@ class RepairLimit:
 
     @classmethod
     def of(cls, text: str | None) -> RepairLimit:
-        """Return the limit that a text states as a flow or a speed with its unit, the default one for None."""
+        """Parse a repair limit, a flow or a speed with its unit; the default one for None."""
         if text is None:
             return cls(priors("verdict")["repair"]["creep"] * MM_PER_MINUTE, "creep", stated=False)
         for kind, unit in (("flow", "m^3/s"), ("creep", "m/s")):
@@ -66,7 +66,7 @@ class RepairLimit:
 
 @dataclass(frozen=True)
 class Severity:
-    """How bad a leak is, as far as the recording and what is known of the machine tell.
+    """Severity of a leak, as far as recording and machine tell.
 
     Each figure is None, where it is not known, or the figure and its 95 % interval: `mL_per_min`, mean flow while the
     leak is open; `pump_share`, that flow over the pump's mean flow; `creep_mm_per_min`, the speed at which the piston
@@ -100,7 +100,7 @@ class Severity:
 
 
 def severity(evidence: Evidence, limit: RepairLimit) -> Severity | None:
-    """Return how bad the leak is that the evidence states; None where it states none, or nothing of its size."""
+    """Compute the severity of the leak in the evidence; None without a leak, or without its size."""
     if evidence.verdict != LEAK or (evidence.leak_lpm is None and evidence.relative is None):
         return None
     relative = evidence.relative or RelativeLeak()

@@ -68,7 +68,7 @@ def state_of(
 
 
 def action_of(condition: str, cause: str | None = None, parts: Sequence[str] = ()) -> str:
-    """Return what is to be done under a condition, or for the cause of a change; KeyError as for `state_of`.
+    """Return the action for a condition, or for the cause of a change; KeyError as for `state_of`.
 
     `parts`: what the machine has that leaks like a worn seal, and is looked at before its leak.
     """
