@@ -84,7 +84,7 @@ class Summary:
                 f"{len(healthy)} healthy, {sum(recording.seconds for recording in healthy):.4g} s in all{span}",
             ),
             ("channels", ", ".join(f"{name} [{unit}]" for name, unit in units.items())),
-            ("machine", _stated(rig)),
+            ("machine", _describe_rig(rig)),
             ("duty", _duty(healthy)),
             ("noise", ", ".join(noise)),
         ]
@@ -108,7 +108,7 @@ class Summary:
         return "\n".join(paragraphs(rows, 16))
 
 
-def _stated(rig: Rig | None) -> str:
+def _describe_rig(rig: Rig | None) -> str:
     """Describe the stated sizes of the machine in words."""
     rig = rig or unstated()
     if rig.states("cylinder.M_eq"):

@@ -159,7 +159,7 @@ def step_key(provider: str) -> str:
 
 
 def _change_questions(case: Case) -> tuple[Question, ...]:
-    """Return the question of a provider that measures no leak: did a leak's observables change?"""
+    """Return the question of a provider that measures no leak: the change of the observables that a leak moves."""
     leak = next(event for event in load_events() if event.name == LEAK_EVENTS[0])
     moved = [observable for observable in case.judge.observables if leak.does_move(observable)]
     rarest = min(moved, key=lambda observable: observable.chance, default=None)

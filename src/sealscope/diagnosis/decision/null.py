@@ -54,12 +54,12 @@ class HealthyNull:
         return float(np.exp(-brentq(lambda u: self.inflate(key, np.exp(-u)) - chance, 0.0, low)))
 
     def _inflation(self, key: str) -> tuple[Array, Array]:
-        if key not in self._known:
-            self._known[key] = _posterior(self.rarities.get(key, ()))
-        return self._known[key]
+        if key not in self._posteriors:
+            self._posteriors[key] = _posterior(self.rarities.get(key, ()))
+        return self._posteriors[key]
 
     @cached_property
-    def _known(self) -> dict[str, tuple[Array, Array]]:
+    def _posteriors(self) -> dict[str, tuple[Array, Array]]:
         return {}
 
 

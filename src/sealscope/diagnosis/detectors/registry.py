@@ -52,16 +52,16 @@ class PlugIn:
             return "unknown"
 
 
-def _made(module: str, name: str, rig: Rig) -> Detector:
+def _make_detector(module: str, name: str, rig: Rig) -> Detector:
     detector: Detector = getattr(import_module(f"sealscope.diagnosis.{module}"), name)(rig)
     return detector
 
 
 #: The built-in detectors by name, loaded when first made; one contract test runs them all.
 DETECTORS: dict[str, Factory] = {
-    "volume balance": partial(_made, "inference.volumes.detector", "VolumeBalance"),
-    "pressure response": partial(_made, "inference.pressures.detector", "PressureResponse"),
-    "rms change": partial(_made, "rms_change.detector", "RmsChange"),
+    "volume balance": partial(_make_detector, "inference.volumes.detector", "VolumeBalance"),
+    "pressure response": partial(_make_detector, "inference.pressures.detector", "PressureResponse"),
+    "rms change": partial(_make_detector, "rms_change.detector", "RmsChange"),
 }
 
 

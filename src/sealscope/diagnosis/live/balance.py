@@ -76,7 +76,7 @@ Shown = Sequence[BlockConductance] | NotJudged
 
 
 @kernel
-def _learns(known: Known, grams: Any, place: Any, rows: Any) -> None:
+def _learn_blocks(known: Known, grams: Any, place: Any, rows: Any) -> None:
     for k in range(len(grams)):
         take(known, grams[k], place)
         add(known, rows[k], 1.0, False)
@@ -84,7 +84,7 @@ def _learns(known: Known, grams: Any, place: Any, rows: Any) -> None:
 
 
 @kernel
-def _says(known: Known, gram: Any, place: Any, rows: float, adds: bool) -> tuple[float, float, float, float]:
+def _solve_block(known: Known, gram: Any, place: Any, rows: float, adds: bool) -> tuple[float, float, float, float]:
     take(known, gram, place)
     return says(known, rows, adds)  # type: ignore[no-any-return]
 
@@ -139,19 +139,19 @@ class LiveBalance:
         stream = self._stream
         if stream is None or not run.follows:
             if stream is not None:
-                shown += self._said(stream.push({}, last=True))
+                shown += self._take_blocks(stream.push({}, last=True))
             if stream is None or run.rate != self._rate:
                 fresh, self._rate = BlockStream(self._balances, run.rate, BLOCK_SECONDS), run.rate
                 if stream is not None:
                     fresh.recall({**stream.state(), "samples": {}, "first": 0, "done": 0})
                 self._stream = stream = fresh
             stream.restart(float(run.t[0]))
-        return shown + self._said(stream.push({name: run.channels[name] for name in self.names}))
+        return shown + self._take_blocks(stream.push({name: run.channels[name] for name in self.names}))
 
-    def _said(self, blocks: Blocks | None) -> list[Shown]:
-        return [] if blocks is None else [self._taken(block) for block in _parts(blocks)]
+    def _take_blocks(self, blocks: Blocks | None) -> list[Shown]:
+        return [] if blocks is None else [self._take_block(block) for block in _parts(blocks)]
 
-    def _taken(self, block: Blocks) -> Shown:
+    def _take_block(self, block: Blocks) -> Shown:
         end, rows = float(block.end[0]) + 0.5 * stride_samples(self._rate) / self._rate, float(block.rows[0])
         if not rows:
             return NotJudged(end, "missing values", "blocks: missing values")
@@ -160,7 +160,7 @@ class LiveBalance:
             if self._woken >= WAKES:
                 self.relearn()
                 return NotJudged(end, "learning", "blocks: moves as never before", True)
-            shown = self._shown(block)
+            shown = self._estimate_block(block)
             return shown if isinstance(shown, NotJudged) else [shown]
         if not block.gram[0, 0, -1, -1] > 0.0 and self._waiting is None:
             return NotJudged(end, "at standstill", "blocks: at standstill")
@@ -169,29 +169,29 @@ class LiveBalance:
             return NotJudged(end, "learning")
         waiting, self._waiting = self._waiting, None
         for e, (known, place) in enumerate(zip(self._known, self._places, strict=True)):
-            _learns(known, np.ascontiguousarray(waiting.gram[:, e]), place, waiting.rows)
-        self._precision = float(np.median([self._says(part, adds=False)[0] for part in _parts(waiting)]))
-        parts = [self._shown(part, adds=False) for part in _parts(waiting)]
+            _learn_blocks(known, np.ascontiguousarray(waiting.gram[:, e]), place, waiting.rows)
+        self._precision = float(np.median([self._solve_block(part, adds=False)[0] for part in _parts(waiting)]))
+        parts = [self._estimate_block(part, adds=False) for part in _parts(waiting)]
         return [part for part in parts if not isinstance(part, NotJudged)] or NotJudged(end, "at standstill")
 
     def _moves(self, block: Blocks) -> float:
         """Return the motion of a block over the usual one."""
         return motion(float(block.gram[0, 0, -1, -1]), float(block.rows[0]), self._known[0].numbers)
 
-    def _says(self, block: Blocks, adds: bool = True) -> tuple[float, ...]:
+    def _solve_block(self, block: Blocks, adds: bool = True) -> tuple[float, ...]:
         """Sum the answers of all equations on a block (`says`).
 
         With `adds` the block is one of those known from now on.
         """
         rows, equation_parts = float(block.rows[0]), zip(self._known, block.gram[0], self._places, strict=True)
-        answers = [_says(known, gram, place, rows, adds) for known, gram, place in equation_parts]
+        answers = [_solve_block(known, gram, place, rows, adds) for known, gram, place in equation_parts]
         return tuple(sum(values) for values in zip(*answers, strict=True))
 
-    def _shown(self, block: Blocks, adds: bool = True) -> BlockConductance | NotJudged:
+    def _estimate_block(self, block: Blocks, adds: bool = True) -> BlockConductance | NotJudged:
         half = 0.5 * stride_samples(self._rate) / self._rate
         begin, end = float(block.start[0]) - half, float(block.end[0]) + half
         at_standstill = self._moves(block) < STANDSTILL
-        precision, lead, shift, leaning = self._says(block, adds)
+        precision, lead, shift, leaning = self._solve_block(block, adds)
         if not precision > (TELLS * self._precision if at_standstill else 0.0):
             return NotJudged(end, "at standstill", "blocks: at standstill")
         total = lead / precision

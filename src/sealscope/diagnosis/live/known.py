@@ -100,7 +100,7 @@ def _solve(known: Any) -> None:
 
 
 @large_law
-def _left(sums: Any, right: Any) -> float:
+def _sum_residual_squares(sums: Any, right: Any) -> float:
     """Return the sum of squares that the coefficients right[:, 0] leave, whatever the leak is."""
     n, square, direction = len(right), 0.0, 0.0
     for i in range(n + 2):
@@ -125,7 +125,7 @@ def begin(known: Any) -> None:
     _solve(known)
     for i in range(n):
         known.coefficients[i] = right[i, 0]
-    left = _left(known.sums, right)
+    left = _sum_residual_squares(known.sums, right)
     known.numbers[NOISE] = max(left, 1e-14 * known.sums[n + 1, n + 1], TINY) / known.numbers[ROWS]
 
 
@@ -152,7 +152,7 @@ def says(known: Any, rows: float, adds: bool) -> tuple[float, float, float, floa
         known.coefficients[i] = right[i, 0]
     g, weight = lead / energy, 1.0
     if adds:
-        left = max(_left(gram, right), 0.0) / rows
+        left = max(_sum_residual_squares(gram, right), 0.0) / rows
         numbers[MISFIT] = left / numbers[NOISE]
         weight = min(1.0, JUMP**2 * numbers[NOISE] / max(left, TINY))
         before, information = known.sums[n, n + 1], max(known.sums[n, n], TINY)

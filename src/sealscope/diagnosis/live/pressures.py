@@ -87,11 +87,11 @@ class PressureEstimator:
                 self._held[k - 1] = kept[k, length - 1] if hold.flags[length - 1] else math.nan
                 kept[k, :length][hold.flags[:length]] = math.nan
             block, kept = _recording(kept[:, :length], run.rate), kept[:, length:]
-            shown.append(self._shown(block))
+            shown.append(self._estimate_block(block))
         self._kept = kept.copy()
         return shown
 
-    def _shown(self, block: Recording) -> Shown:
+    def _estimate_block(self, block: Recording) -> Shown:
         """Return the conductance of a block, or the reason why it is not judged."""
         begin, end = float(block.t[0]), float(block.t[-1]) + 1.0 / block.rate
         if self._follower is None or block.rate < _SLOWEST:

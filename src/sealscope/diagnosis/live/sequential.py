@@ -129,7 +129,7 @@ class StepDetector:
         self._onsets = np.concatenate([self._onsets, fresh], axis=2)
         self._places = np.concatenate([self._places, places])
         if self._blocks % 8 == 0:
-            kept = _kept(self._blocks, self._places)
+            kept = _select_onsets(self._blocks, self._places)
             self._onsets, self._places = self._onsets[:, :, kept], self._places[kept]
 
     def log_e(self, least: float = -np.inf) -> float:
@@ -237,7 +237,7 @@ def _most(onsets: Any, places: Any) -> float:
     return most
 
 
-def _kept(now: int, places: Array) -> NDArray[np.bool_]:
+def _select_onsets(now: int, places: Array) -> NDArray[np.bool_]:
     """Select the onsets to keep: of older blocks fewer and fewer, and at their beginning only."""
     _, born, onset, begin = places.T
     age = now - born

@@ -63,7 +63,7 @@ class RmsBlocks:
         """Length of a block [s]."""
         return float(np.diff(self.edges).min()) if len(self.log_rms) else 0.0
 
-    def settled(self) -> RmsBlocks:
+    def without_start(self) -> RmsBlocks:
         """Return the blocks after the machine's start: without 10 s or three cycles, at most an eighth of them."""
         n, believed = len(self.log_rms), priors("rms_change")["blocks"]
         start = max(believed["settling"], believed["settling_cycles"] * (self.cycle or 0.0))
@@ -82,7 +82,7 @@ def judged_chambers(recording: Recording) -> tuple[str, ...]:
     return tuple(name for name in chambers if not mostly_clipped(recording[name])) or chambers
 
 
-def whole(recording: Recording) -> tuple[Array, Array]:
+def whole_levels(recording: Recording) -> tuple[Array, Array]:
     """Return the log RMS (5 per judged chamber,) and the duty (4,) of the whole recording but its edges."""
     transformed = [details(recording[chamber]) for chamber in judged_chambers(recording)]
     inside = transformed[0].inside()
@@ -108,7 +108,7 @@ def _columns(recording: Recording, transformed: list[Details], bounds: IntArray)
     return log_rms, np.vstack([duty, segment_means(load[None], bounds) / np.exp(duty[-1:])]).T
 
 
-def cut(recording: Recording) -> RmsBlocks:
+def cut_blocks(recording: Recording) -> RmsBlocks:
     """Cut a uniformly sampled recording without missing samples into blocks, edges of the transform dropped."""
     chambers, rate, believed = judged_chambers(recording), recording.rate, priors("rms_change")["blocks"]
     transformed = [details(recording[chamber]) for chamber in chambers]

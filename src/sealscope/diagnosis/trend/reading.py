@@ -17,7 +17,7 @@ from sealscope.diagnosis.inference.pressures.detector import PressureResponse
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.inspection import inspected
 from sealscope.diagnosis.priors import priors
-from sealscope.diagnosis.rms_change.blocks import JUDGED, whole
+from sealscope.diagnosis.rms_change.blocks import JUDGED, whole_levels
 from sealscope.diagnosis.trend.wear import DayToDay
 from sealscope.diagnosis.verdict.machine import AssumedMachine, assumed_rig
 from sealscope.errors import InputError
@@ -88,10 +88,10 @@ def reading_of(recording: Recording, rig: Rig | str | os.PathLike[str] | None = 
     if reading.problem:
         return reading
     with np.errstate(all="ignore"):
-        return replace(reading, **_stated(part, known, machine))
+        return replace(reading, **_estimate_level(part, known, machine))
 
 
-def _stated(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[str, Any]:
+def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[str, Any]:
     """Return the most specific level that a recording without a defect allows, or the problem."""
     balance, response = VolumeBalance(rig), PressureResponse(rig)
     lack, lacks = unusable(balance, part), unusable(response, part)
@@ -111,7 +111,7 @@ def _stated(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[str, Any
         area = machine.area if reading.stated else None
         level, error = reading.level
         return {"basis": BASES[1], "level": level, "error": error, "states_flow": reading.stated, "area": area}
-    log_rms = whole(part)[0].reshape(-1, len(QUANTITIES))
+    log_rms = whole_levels(part)[0].reshape(-1, len(QUANTITIES))
     ringing = float(-np.mean(log_rms[:, [QUANTITIES.index(name) for name in JUDGED]]))
     if np.isfinite(ringing):
         return {"basis": BASES[2], "level": ringing, "error": priors("trend")["own"]["ringing"]}

@@ -24,7 +24,7 @@ from sealscope.diagnosis.trend.reading import (
     scatter_of,
     timeline,
 )
-from sealscope.diagnosis.trend.wear import Episode, Levels, Wear, beyond, episodes
+from sealscope.diagnosis.trend.wear import Episode, Levels, Wear, episodes, outlier_excess
 from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, LEAK, NO_LEAK, Verdict
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.severity import RepairLimit
@@ -272,10 +272,12 @@ def trend(
         recording if isinstance(recording, LeakReading) else reading_of(recording, rig) for recording in recordings
     ]
     points, differences = timeline(readings, every)
-    return _judged(points, differences, repair=RepairLimit.of(limit), years=years, healthy=healthy, dated=every is None)
+    return _make_trend(
+        points, differences, repair=RepairLimit.of(limit), years=years, healthy=healthy, dated=every is None
+    )
 
 
-def _judged(points: Sequence[TrendPoint], differences: tuple[str, ...], **stated: Any) -> Trend:
+def _make_trend(points: Sequence[TrendPoint], differences: tuple[str, ...], **stated: Any) -> Trend:
     """Return the trend of readings in the order of their times; `stated`: what the caller states of it."""
     rows = tuple(k for k, point in enumerate(points) if point.group >= 0)
     kept = [points[k] for k in rows]
@@ -304,7 +306,7 @@ def _with_levels(trend: Trend) -> Trend:
     """Return the trend with its levels and what they say, of one recording or more that can be compared."""
     levels, allowed = _levels(trend)
     few, points, rows = levels.merged(), [*trend.points], trend.rows
-    alone = np.flatnonzero(beyond(levels)[1])
+    alone = np.flatnonzero(outlier_excess(levels)[1])
     remark = "apart from the recordings before and after: it counts as if it were near"
     findings = [*trend.findings]
     if alone.size:
@@ -315,7 +317,7 @@ def _with_levels(trend: Trend) -> Trend:
         value, half = float(levels.value[k]), WITHIN_95 * float(levels.error[k])
         note = remark if k in alone else ""
         points[row] = replace(points[row], value=value, low=value - half, high=value + half, note=note)
-    known = max(1, _known(trend) * len(few) // len(levels))
+    known = max(1, _count_healthy(trend) * len(few) // len(levels))
     return replace(
         trend,
         points=tuple(points),
@@ -325,7 +327,7 @@ def _with_levels(trend: Trend) -> Trend:
     )
 
 
-def _known(trend: Trend) -> int:
+def _count_healthy(trend: Trend) -> int:
     """Count the compared recordings among the first ones, known to be healthy; at least the first."""
     first = dict.fromkeys(point.digest for point in trend.points)  # a copy counts once
     known = {*islice(first, trend.healthy)}
@@ -338,7 +340,10 @@ def _levels(trend: Trend) -> tuple[Levels, float | None]:
     t, group, value, error = (
         np.array([getattr(point, name) for point in kept]) for name in ("day", "group", "level", "error")
     )
-    usual, pressure = float(np.mean(value[: _known(trend)])), float(np.median([point.pressure for point in kept]))
+    usual, pressure = (
+        float(np.mean(value[: _count_healthy(trend)])),
+        float(np.median([point.pressure for point in kept])),
+    )
     prior = scatter_of(trend.basis or "ringing", usual)
     warmer, slope_sd = np.zeros(t.size), 0.0
     temperatures = [point.temperature for point in kept if point.temperature is not None]

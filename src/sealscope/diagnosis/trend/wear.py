@@ -105,7 +105,7 @@ class Levels:
         return Levels(t, value, error, self.group[[r[0] for r in rows]], covariate, self.prior, self.slope_sd)
 
 
-def beyond(levels: Levels) -> tuple[Array, Array]:
+def outlier_excess(levels: Levels) -> tuple[Array, Array]:
     """Return the excess of each value not counted while it is the last one, and not once the next one is known.
 
     That is what lies beyond some deviations of the three before it, unless its neighbour lies as far out.
@@ -185,7 +185,7 @@ def _nodes(levels: Levels, shapes: Array, *, sloping: bool = False) -> list[_Nod
     from scipy.linalg import solve_triangular
 
     believed, prior = priors("trend")["between"], levels.prior
-    last, later = beyond(levels)
+    last, later = outlier_excess(levels)
     values = levels.value - levels.value[0] - later
     reach = max(prior.scale, 0.3 * float(np.ptp(levels.value)))
     wide = (_WIDE * reach) ** 2
@@ -268,7 +268,7 @@ class _Draws(NamedTuple):
     base: Array
 
     @classmethod
-    def of(cls, levels: Levels, changes: _Changes, *, signed: bool = False) -> _Draws:
+    def sample(cls, levels: Levels, changes: _Changes, *, signed: bool = False) -> _Draws:
         """Return draws; `signed`: the size may be of either sign, its prior flat."""
         from scipy.special import ndtr, ndtri
 
@@ -327,12 +327,12 @@ def describe(levels: Levels, allowed: float | None, alarmed: int | None) -> Wear
     spans, rises = levels.t[-1] - levels.t[0] >= 1.0, alarmed is not None
     even = (levels.t - levels.t[0]) / DAYS_PER_MONTH if spans else np.zeros(len(levels))
     changes = _Changes.after(levels, 1) if rises else _Changes.single(even, _WIDE * DAYS_PER_MONTH / levels.interval)
-    draws = _Draws.of(levels, changes, signed=not rises)
+    draws = _Draws.sample(levels, changes, signed=not rises)
     grows = changes.grows[draws.change]
     now = draws.base + draws.size * changes.shape[-1, changes.column[draws.change]]
     slope, growing = np.where(grows, draws.size, 0.0), float(np.mean(grows)) >= 0.5
     before = levels.part(slice(0, alarmed))
-    usual = _Draws.of(before, _Changes.single(np.zeros(len(before)), 1.0))
+    usual = _Draws.sample(before, _Changes.single(np.zeros(len(before)), 1.0))
     error = float(np.mean(before.error[before.group == before.group[-1]] ** 2))
     noise = np.random.default_rng(21).standard_normal(usual.tau.size)
     healthy = _interval(usual.base + np.sqrt(usual.tau**2 + error) * noise)._replace(value=float(usual.base.mean()))

@@ -330,17 +330,17 @@ class Diagnosis(Evidence):
     def _repr_html_(self) -> str:
         """Return the diagnosis as a table for notebooks."""
 
-        def shown(value: float | None, interval: tuple[float, float] | None = None) -> str:
+        def format_figure(value: float | None, interval: tuple[float, float] | None = None) -> str:
             ends = "" if interval is None else f" ({interval[0]:.4g} to {interval[1]:.4g})"
             return "" if value is None else f"{value:.4g}{ends}"
 
         rows = [
             ("reason", self.reason),
-            ("onset [s]", shown(self.onset_s, self.onset_interval_s)),
-            ("leak [L/min]", shown(self.leak_lpm, self.leak_interval_lpm)),
+            ("onset [s]", format_figure(self.onset_s, self.onset_interval_s)),
+            ("leak [L/min]", format_figure(self.leak_lpm, self.leak_interval_lpm)),
             ("cause", self.cause),
-            ("score", shown(self.score)),
-            ("threshold", shown(self.threshold)),
+            ("score", format_figure(self.score)),
+            ("threshold", format_figure(self.threshold)),
             ("odds", self.odds),
             ("false-alarm probability", f"{self.false_alarm_probability:g}"),
             *((finding.severity, finding.text) for finding in self.quality),
