@@ -45,7 +45,7 @@ def check_probability(probability: float) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Examination:
-    """One recording, its gaps bridged, without missing samples, and what detectors are given beside it.
+    """One recording, gaps bridged and without missing samples, and the other inputs of detectors.
 
     `baseline`: leak-free recordings of the machine; `rig`: what detectors may assume of it; `distrust`: why the
     pressures cannot be judged, None where they can: then no detector is run; `refusal`: why none of the baselines that
@@ -136,7 +136,7 @@ def diagnose(
     limit: str | None = None,
     file: str | os.PathLike[str] | None = None,
 ) -> Diagnosis:
-    """Say whether oil bypasses the piston in a recording.
+    """Decide whether oil bypasses the piston in a recording.
 
     The balance of volumes judges; where the channels allow none, the response of the pressures does, then plug-ins,
     last the change of RMS. What plug-ins and the change of RMS say is stated beside the verdict.

@@ -74,7 +74,7 @@ class JudgedAlarm(NamedTuple):
 
 
 class Origin(NamedTuple):
-    """The file that a machine was loaded from, and hashes of its parts, by which changes of others are known."""
+    """The file of a loaded machine, and hashes of its parts, to notice changes by others."""
 
     path: Path
     parts: frozenset[bytes]
@@ -149,7 +149,7 @@ class CommissionedMachine:
         *,
         false_alarm_probability: float = FALSE_ALARM_PROBABILITY,
     ) -> Diagnosis:
-        """Say whether oil bypasses the piston in a recording, or in the file of one, against the healthy ones.
+        """Decide whether oil bypasses the piston in a recording, or in its file, against the healthy ones.
 
         Arguments, result and errors as for `sealscope.diagnose`; rig, baseline and limit are the machine's.
         """
@@ -186,7 +186,7 @@ class CommissionedMachine:
         return replace(self, healthy=tuple(healthy))
 
     def _leak_in(self, start_s: float, end_s: float) -> JudgedAlarm | None:
-        """Return the alarm of a leak that a person found, and that was not repaired, in a time [s since 1970]."""
+        """Find the alarm of a leak found by a person and not repaired in a time [s since 1970]; None without one."""
         repairs = [alarm.date_s for alarm in self.alarms if alarm.mark == "repaired"]
         words = enumerate(self.alarms, 1)
         found = (word for k, word in words if word.mark != "invalid" and not _is_taken_back(word, self.alarms[k:]))
@@ -215,7 +215,7 @@ class CommissionedMachine:
 
 
 def read_of_machine(path: str | os.PathLike[str], channel_map: ChannelMap, rate: float | None) -> Recording:
-    """Read a log by the map of its machine, or as it is where it has not the map's columns.
+    """Read a log by the map of its machine, or without the map if it lacks the map's columns.
 
     Raises UnreadableFile with what is wrong by the map, where neither can be read.
     """
@@ -231,7 +231,7 @@ def read_of_machine(path: str | os.PathLike[str], channel_map: ChannelMap, rate:
 
 
 def recordings_in(paths: Iterable[str | os.PathLike[str]] | str | os.PathLike[str]) -> list[Path]:
-    """Return the files of recordings that a path, several, or a folder name; InputError where there is none.
+    """List the files of recordings of a path, of several, or of a folder; InputError where there is none.
 
     A link in a folder that leads out of it is left out, and a warning says so: name it to have it read.
     """
@@ -305,7 +305,7 @@ def commission(
     name: str = "machine",
     keep: bool = False,
 ) -> CommissionedMachine:
-    """Commission a machine on its healthy recordings: learn once what every later diagnosis compares with.
+    """Commission a machine: learn from its healthy recordings once, for every later diagnosis.
 
     Parameters
     ----------

@@ -102,7 +102,7 @@ _FILE = make_table(
 
 @checked_call
 def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) -> Path:
-    """Write a machine's file: whole under its name, or not at all; one that is there is kept, as `.toml.bak`.
+    """Write a machine's file completely or not at all; an existing file is kept as `.toml.bak`.
 
     A link is written through. Its lessons are written beside it, as `.lessons`.
 
@@ -148,7 +148,7 @@ def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) ->
 def update_machine(
     path: str | os.PathLike[str], change: Callable[[CommissionedMachine], CommissionedMachine]
 ) -> CommissionedMachine:
-    """Read, change and write a machine's file, so that nothing which another process writes meanwhile is lost.
+    """Read, change and write a machine's file without losing the changes of another process.
 
     `change` is called once, and once more where the file has changed meanwhile; nobody waits for the first call. Raises
     InputError as `read_machine`, `write_machine` and `change` do; then the file stays as it was.
@@ -164,7 +164,7 @@ def update_machine(
 
 
 def _resolve(path: str | os.PathLike[str]) -> Path:
-    """Return the file to write that a path leads to, through links; InputError where it does not end in .toml."""
+    """Follow a path's links to the file to write; InputError where its name does not end in .toml."""
     target = _follow(path)
     if target.suffix.lower() != ".toml":
         raise InputError(f"a machine's file must end in .toml, got {target}")
@@ -173,7 +173,7 @@ def _resolve(path: str | os.PathLike[str]) -> Path:
 
 
 def _follow(path: str | os.PathLike[str]) -> Path:
-    """Return the file that a path leads to, through links; InputError where they end in a circle."""
+    """Follow a path's links to a file; InputError where they end in a circle."""
     try:
         return Path(path).resolve()
     except (OSError, RuntimeError, ValueError) as error:
@@ -245,7 +245,7 @@ def _parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
 
 
 def _change_since(origin: Origin, present: Mapping[bytes, str], written: Mapping[bytes, str]) -> str | None:
-    """Name something that was added to, or taken from, a machine's file and that writing would undo; None for nothing.
+    """Name a part added to, or removed from, a machine's file that writing would undo; None for nothing.
 
     `present`: parts of the file; `written`: parts of the machine to be written, which was read with those of `origin`.
     """
@@ -341,7 +341,7 @@ def _key(name: str) -> str:
 
 
 def _value(value: Any) -> str:
-    """Return a plain value as TOML, without what is None; numbers to the last digit."""
+    """Format a plain value as TOML, without members that are None; numbers to the last digit."""
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if isinstance(value, Mapping):

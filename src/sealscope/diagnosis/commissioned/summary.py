@@ -235,7 +235,7 @@ def _collected(healthy: Sequence[Learnt]) -> list[str]:
 
 
 def _noise(values: Array) -> float:
-    """Return the standard deviation of white noise by the second differences, without what is far off."""
+    """Estimate the standard deviation of white noise from second differences, without outliers."""
     second = np.diff(values[np.isfinite(values)], 2)
     return _rounded(float(np.median(np.abs(second))) / 0.6745 / np.sqrt(6.0)) if second.size else 0.0
 

@@ -45,7 +45,7 @@ class WatchedMachine:
 
 
 def load_watched(rig: str) -> WatchedMachine:
-    """Load a packaged rig, a rig's file or a machine's file as the monitor takes it; InputError as `load_rig`."""
+    """Load a packaged rig, a rig's file or a machine's file for the monitor; InputError as `load_rig`."""
     if not rig.endswith(".toml") or "machine" not in read_toml(Path(rig), "a rig file", rig):
         known = load_rig(rig)
         return WatchedMachine(known, known.channel_map)
@@ -63,7 +63,7 @@ def is_remeasured(rig: Rig, before: Rig) -> bool:
 
 
 def _with_measured_displacement(rig: Rig, healthy: tuple[Learnt, ...]) -> Rig:
-    """Return a rig of stated areas with the displacement that healthy recordings measured beside them."""
+    """Add the displacement measured by the healthy recordings to a rig of stated areas."""
     if rig.states(_DISPLACEMENT) or not rig.states(*_AREAS):
         return rig
     lessons = (recording.lessons.get(_BALANCE) for recording in healthy)

@@ -39,7 +39,7 @@ class Question(NamedTuple):
 
 
 class OtherEvent(NamedTuple):
-    """An event that is no leak: name, cause, words, probability, and the rarest observable that shows it."""
+    """An event other than a leak: cause, words, probability, and its rarest observable."""
 
     cause: Cause
     words: str
@@ -69,7 +69,7 @@ class DecisionContext:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """All that a decision rests on: the report that judges, all observables, the null, and the context."""
+    """Grounds of a decision: the judging report, all observables, the null, and the context."""
 
     judge: Observed
     observables: Sequence[Observable]
@@ -91,7 +91,7 @@ class Case:
         return explain(self.observables, self.null.chance, rise)
 
     def leak_probability(self, alarm: Question) -> float:
-        """Compute the probability of a leak past piston or pump, given that what answers the alarm's question moved.
+        """Compute the probability of a leak past piston or pump, given a change in the data of the alarm's question.
 
         A level above the rig's file is that of a leak unless a change within the recording, which raised it, is none.
         """
@@ -115,7 +115,7 @@ class Case:
 
     @cached_property
     def other_event(self) -> OtherEvent | None:
-        """The event that is no leak and surely explains the rarest change it can; None where none does."""
+        """The event other than a leak that surely explains the rarest change it can; None where none does."""
         allowed = self.context.false_alarm_probability / max(
             len({observable.data for observable in self.observables}), 1
         )

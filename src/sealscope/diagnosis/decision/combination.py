@@ -32,7 +32,7 @@ def is_decided(evidence: Evidence) -> bool:
 
 
 def combine(decisions: Sequence[Evidence], context: DecisionContext) -> Evidence:
-    """Choose the decision that stands, with all others beside it as `parts`.
+    """Choose the decision that stands, with all decisions as its `parts`.
 
     A recording that cannot be compared with the healthy ones it was given, or of which a part is missing, is not
     without a leak.

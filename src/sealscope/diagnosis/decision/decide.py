@@ -80,7 +80,7 @@ def _describes_else(report: Observed, judge: Observed) -> bool:
 
 
 def _leak_evidence(case: Case, alarm: Question) -> Evidence:
-    """State a leak with its size, as far as the machine's size is known."""
+    """State a leak, with its size if the machine's size is known."""
     leak, onset = case.leak, None
     cause: Cause = "piston leak"
     if leak is None:
@@ -107,7 +107,7 @@ def _leak_evidence(case: Case, alarm: Question) -> Evidence:
 
 
 def _sizes(leak: LeakMeasure, flow: Flow | None) -> dict[str, Any]:
-    """Return the leak's figures in L/min and beside the pump, or which of them are refused."""
+    """Return the leak's figures in L/min and relative to the pump, or the reason to refuse them."""
     if flow is None:
         return {}
     sizes: dict[str, Any] = {"relative": leak.relative(flow)}
@@ -153,7 +153,7 @@ def _findable(case: Case) -> float | None:
 
 
 def _with_questions(case: Case, evidence: Evidence, judging: Question | None) -> Evidence:
-    """Add score, threshold and chance of the question that judges, and all questions where there are several."""
+    """Add score, threshold and chance of the judging question, and all questions if there are several."""
     evidence = replace(evidence, detector=case.judge.provider, share=case.judge.share)
     if case.leak is not None and case.leak.ratio is not None:
         ratio = case.leak.ratio

@@ -36,7 +36,7 @@ LEAK_EVENTS = ("piston leak", "pump leak")
 
 
 class LeakRise(NamedTuple):
-    """The rise of the leakage beyond healthy recordings, and what a leak that begins within would make of it."""
+    """The rise of the leakage over healthy recordings, and the rise expected of a leak that begins within."""
 
     rise: Rise
     expected: float
@@ -117,7 +117,7 @@ def _logarithm(group: Sequence[Event], ways: Mapping[str, Sequence[_Gains]]) -> 
 
 
 def _ways_of(event: Event, weighted: Sequence[tuple[Observable, float]], rise: LeakRise | None) -> Sequence[_Gains]:
-    """Return the ways in which an event happens: at the onset that explains most, and for a leak from the start."""
+    """Return the ways an event happens: at the onset that explains most, and for a leak from the start."""
     moved = [(observable, gain) for observable, gain in weighted if event.does_move(observable)]
     gains: dict[str, float] = {}
     if moved:

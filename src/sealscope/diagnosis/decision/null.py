@@ -35,12 +35,12 @@ class HealthyNull:
     rarities: Mapping[str, Sequence[float]] = field(default_factory=dict)
 
     def chance(self, observable: Observable) -> float:
-        """Compute the predictive probability that a healthy recording shows an observable as rare."""
+        """Compute the predictive probability of an observable at least as rare in a healthy recording."""
         weights, inflations = self._inflation(key_of(observable))
         return float(weights @ np.exp(-observable.rarity / inflations))
 
     def inflate(self, key: str, chance: float) -> float:
-        """Compute the predictive probability of what a law gives a chance."""
+        """Compute the predictive probability of an event from its chance by the law."""
         weights, inflations = self._inflation(key)
         return float(weights @ np.exp(np.log(max(chance, np.finfo(float).tiny)) / inflations))
 
@@ -64,7 +64,7 @@ class HealthyNull:
 
 
 def _posterior(rarities: Sequence[float]) -> tuple[Array, Array]:
-    """Compute weights and values (NODES + 1,) of the inflation, first that of the law as it stands."""
+    """Compute weights and values (NODES + 1,) of the inflation, first that of the unchanged law."""
     believed = priors("decision")["null"]
     if not len(rarities):
         return np.ones(1), np.ones(1)

@@ -54,7 +54,7 @@ def _leak_text(case: Case, evidence: Evidence, alarm: Question | None) -> str:
 
 
 def _bound_text(case: Case, evidence: Evidence, bound: float) -> str:
-    """Return the bound in words, and what would make it closer."""
+    """Describe the bound in words, and the way to a closer one."""
     leak, ringing = case.leak, case.judge.ringing
     if leak is None:
         if case.alarms and ringing is not None:

@@ -35,7 +35,7 @@ class Detector(Protocol):
     name: str
 
     def usable(self, recording: Recording) -> str | None:
-        """Return None when the recording has what the detector needs, else the reason why not, in one line."""
+        """Return None if the detector can use the recording, else the reason why not, in one line."""
         ...
 
     def observe(self, recording: Recording, baseline: Sequence[Any] = ()) -> Observed:

@@ -115,7 +115,7 @@ def _rarities_in(reports: Sequence[Observed]) -> dict[str, float]:
 
 
 def null_of(baseline: Sequence[Healthy], rig: Rig | str | os.PathLike[str], *, shut: bool = False) -> HealthyNull:
-    """Collect what healthy recordings show of every observable; `shut`: by a balance whose pump is cut off at rest."""
+    """Collect the rarities of every observable in healthy recordings; `shut`: the pump is cut off at rest."""
     known = defaultdict[str, list[float]](list)
     for healthy in baseline:
         rarities = healthy.statistics if isinstance(healthy, Learnt) else rarities_of(healthy, rig)
@@ -131,7 +131,7 @@ def null_of(baseline: Sequence[Healthy], rig: Rig | str | os.PathLike[str], *, s
 
 
 def compare_healthy(baseline: Sequence[Healthy]) -> Iterator[Sequence[Observable]]:
-    """Yield what each healthy recording's ringing shows against all others."""
+    """Yield the comparison of each healthy recording's ringing with all others."""
     detector = RmsChange()
     lessons = lessons_of(detector, [healthy for healthy in baseline if _unusable(detector, healthy) is None])
     comparable = [

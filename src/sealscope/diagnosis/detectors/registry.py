@@ -44,7 +44,7 @@ class PlugIn:
 
     @property
     def fingerprint(self) -> str:
-        """A hash of the source file that it comes from, so that its results are not taken for another version's."""
+        """Hash of the source file, to tell its results from another version's."""
         source = getattr(sys.modules.get(getattr(self.make, "__module__", "")), "__file__", None)
         try:
             return sha256(Path(source).read_bytes()).hexdigest()[:16] if source else "unknown"

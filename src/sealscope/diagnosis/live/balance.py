@@ -60,7 +60,7 @@ class BlockConductance:
 
 
 class NotJudged(NamedTuple):
-    """Why a block that ends at the clock `end` [s] shows nothing: its status, and under what it is counted.
+    """Reason why the block up to the clock `end` [s] has no estimate: its status and counter.
 
     `apart`: what comes after it is compared with nothing before it.
     """
@@ -253,7 +253,10 @@ def size_error(rig: Rig) -> float:
 
 
 def live_equations(rig: Rig, names: Sequence[str]) -> list[Equation]:
-    """Return a machine's balances with the terms that have a column: none has what is zero or lies beside the leak."""
+    """Return a machine's balances with the terms that have a column.
+
+    A term that is zero, or parallel to the leak, has none.
+    """
     balances = [equation for equation in equations(rig, frozenset(names)) if not equation.by_command]
     nuisances = [
         tuple(term for term in balance.terms if term.nuisance and term.name != "pump leak") for balance in balances

@@ -135,7 +135,7 @@ def within(duty: Duty, low: Duty, high: Duty) -> bool:
 
 @dataclass
 class BaselineLearning:
-    """Sums of the baseline that is being learned; what no block has shown yet is None."""
+    """Sums of the baseline during learning; None where no block gave a value yet."""
 
     blocks: int = 0
     total: float = 0.0

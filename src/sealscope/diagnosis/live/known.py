@@ -64,7 +64,7 @@ def take(known: Any, gram: Any, place: Any) -> None:
 
 @large_law
 def add(known: Any, rows: float, weight: float, stepped: bool) -> None:
-    """Add the block `known.own`; forget a part of what those before said.
+    """Add the block `known.own` to the sums; forget a part of the blocks before.
 
     The leak walks between blocks by as much as a block tells of it, or any distance where it `stepped`.
     """

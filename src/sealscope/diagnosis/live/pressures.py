@@ -128,7 +128,7 @@ class PressureEstimator:
         return [BlockConductance(begin, end, g, sd, g, width, dp / LITRE_PER_MINUTE, duty)]
 
     def _resume(self, gap: float, rate: float) -> bool:
-        """Prepare for a block after a gap [s]; return whether nothing before may be compared with what comes.
+        """Prepare for a block after a gap [s]; return True if it must not be compared with any before.
 
         What is known of the machine stays at another rate, but may lie elsewhere among the likely parameters there.
         """
@@ -144,7 +144,7 @@ class PressureEstimator:
         return anew or not short
 
     def relearn(self) -> None:
-        """Know the machine's parameters as little as at first."""
+        """Forget the machine's parameters: know as little as at first."""
         if self._follower is not None:
             self._follower.interrupt(math.inf)
 

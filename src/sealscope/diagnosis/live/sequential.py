@@ -78,7 +78,7 @@ class StepDetector:
         self.forget()
 
     def forget(self) -> None:
-        """Compare with nothing before now; what is known of noise and walk stays."""
+        """Compare with no block before now; keep the noise and the walk learned."""
         self._last = -np.inf
         self._onsets = np.zeros((len(_FIELDS), len(WALKS), 0))
         self._places = np.zeros((0, len(_PLACES)))
@@ -154,7 +154,7 @@ class StepDetector:
         return np.asarray(np.where(weighted > 0.0, ratio, -np.inf) + healthy - prior)
 
     def rise(self) -> StepEstimate:
-        """Return the step that the blocks show: its onset and size, averaged over all that may be."""
+        """Estimate the step in the blocks: onset and size, averaged over all walks, onsets and sizes."""
         terms = self._terms()
         log_e = float(np.logaddexp.reduce(terms.ravel()))
         weights = np.exp(terms - log_e)
@@ -174,7 +174,7 @@ class StepDetector:
         return StepEstimate(2.0 * log_e, since, self._unit * value, self._unit * deviation)
 
     def bound(self, probability: float = 0.95) -> float:
-        """Return the rise that is exceeded with probability 1 - `probability`, given that there is one."""
+        """Compute the rise exceeded with probability 1 - `probability`, given a rise."""
         from scipy.special import ndtr
 
         if not len(self._places):
@@ -194,7 +194,7 @@ class StepDetector:
 
     @property
     def noise(self) -> float:
-        """Variance of a block's estimate over what was stated of it, beside a walk of a tenth."""
+        """Ratio of the variance of a block's estimate to the stated one, with a walk of a tenth."""
         return float((self._total[3, 0] + _PRIORS["stated"]) / (self._known + _PRIORS["stated"]))
 
     def state(self) -> dict[str, Any]:

@@ -149,7 +149,7 @@ class Watch:
 
     @property
     def evidence(self) -> Evidence:
-        """Verdict of now, with the leak that the tests show, else with the 95 % bound of one that they do not."""
+        """Present verdict, with the detected leak, or the 95 % bound of an undetected one."""
         leak, estimator = self.leak, self._estimator
         if leak is not None:
             figures: dict[str, Any] = {name: getattr(leak, name) for name in _FIGURES}
@@ -359,7 +359,7 @@ class Watch:
         )
 
     def _estimate(self, estimator: Estimator, status: str, block: BlockConductance) -> BlockEstimate:
-        """Return the block's estimate: total flow, and flow beyond the baseline's, or since the onset of the leak."""
+        """Return the block's estimate: total flow, and its excess over the baseline, or over that before the leak."""
         flow, sd = block.flow, block.sd * math.sqrt(self._detector.noise)
         total = total_interval = leak = leak_interval = excess = None
         if self.leak is not None:

@@ -77,7 +77,7 @@ def columns_of(chambers: Sequence[str]) -> list[str]:
 
 
 def judged_chambers(recording: Recording) -> tuple[str, ...]:
-    """Return the chambers whose details are judged: those whose readings are not mostly cut off, or all."""
+    """Return the chambers to judge: those with readings not mostly clipped, or all."""
     chambers = chambers_of(recording)
     return tuple(name for name in chambers if not mostly_clipped(recording[name])) or chambers
 

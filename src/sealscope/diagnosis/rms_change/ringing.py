@@ -62,7 +62,7 @@ def information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
 def rises(
     log_rms: Array, duty: Array, known: Array, known_duty: Array, times: Array | None = None
 ) -> tuple[list[Rise], Array]:
-    """Return the rise g of each quantity of a recording beyond n leak-free ones of the machine, duty taken out, and w.
+    """Estimate the rise g of each quantity over n leak-free recordings, duty removed; return these and w.
 
     `log_rms` (5 per chamber,), `duty` (4,); `known` (n, 5 per chamber), `known_duty` (n, 4). The quantities of healthy
     recordings are normal about a mean, what the duty explains, and a deviation that fades with the time between them,

@@ -146,7 +146,7 @@ class TrendPoint(LeakReading):
 
 
 def timeline(readings: Sequence[LeakReading], every: float | None = None) -> tuple[list[TrendPoint], tuple[str, ...]]:
-    """Return readings in the order of their times, and what sets each group of comparable ones apart from the first.
+    """Sort readings by time; return them and the difference of each comparable group from the first.
 
     `every`: time between them [s], in the order of their names. Raises InputError where the time of one is not known.
     """
@@ -187,7 +187,7 @@ def timeline(readings: Sequence[LeakReading], every: float | None = None) -> tup
 
 
 def findings_of(points: Sequence[TrendPoint], differences: Sequence[str]) -> list[Finding]:
-    """Return findings on the clock, on what is left out, one for each reason, and on what is compared apart."""
+    """Return findings on the clock, on readings left out, one a reason, and on separate groups."""
     findings, count = _clock(points), len(points)
     reasons: dict[str, list[TrendPoint]] = {}
     for point in points:

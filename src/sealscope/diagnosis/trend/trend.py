@@ -205,7 +205,7 @@ class Trend:
         )
 
     def _moment(self, day: float) -> str | float | None:
-        """Return a time as an ISO stamp, or in days where the times are not known."""
+        """Format a time as an ISO stamp, or in days if the times are not known."""
         if not math.isfinite(day) or not self.dated:
             return day
         return str(np.datetime64(round((self.points[0].start + (day - self.points[0].day) * DAY) * 1e3), "ms"))[:19]
@@ -303,7 +303,7 @@ def _make_trend(points: Sequence[TrendPoint], differences: tuple[str, ...], **st
 
 
 def _with_levels(trend: Trend) -> Trend:
-    """Return the trend with its levels and what they say, of one recording or more that can be compared."""
+    """Add levels and episodes to a trend of at least one comparable recording."""
     levels, allowed = _levels(trend)
     few, points, rows = levels.merged(), [*trend.points], trend.rows
     alone = np.flatnonzero(outlier_excess(levels)[1])

@@ -233,7 +233,7 @@ class Path(NamedTuple):
     first: IntArray
 
     def alarm(self, days: float) -> int | None:
-        """Return the first recording after which R is over a mean time to a false alarm, None where it never is."""
+        """Find the first recording with R over a mean time to a false alarm; None where there is none."""
         over = np.flatnonzero(self.log_R > math.log(days))
         return int(over[0]) if over.size else None
 
@@ -356,7 +356,7 @@ def describe(levels: Levels, allowed: float | None, alarmed: int | None) -> Wear
 
 
 class Episode(NamedTuple):
-    """A stretch of recordings between two repairs: rows `begin` to `end` (exclusive) of what was judged.
+    """A stretch of recordings between two repairs: rows `begin` to `end` (exclusive) of the judged ones.
 
     `alarm`: the row after which the test alarmed, None where it did not; `wear`: what the stretch says at its end;
     `fell`: whether the stretch began with a fall of the level.

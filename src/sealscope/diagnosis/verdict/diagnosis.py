@@ -97,7 +97,7 @@ class Diagnosis(Evidence):
     def of(
         cls, evidence: Evidence, recording: Recording, machine: AssumedMachine, *, file: str | None, **stated: Any
     ) -> Diagnosis:
-        """Return the diagnosis of a recording by its evidence, with what the file says of itself.
+        """Make the diagnosis of a recording from its evidence and the file's own statements.
 
         `file`: name of the recording, by default that of its file; `stated`: the other fields.
         """
@@ -175,7 +175,7 @@ class Diagnosis(Evidence):
 
     @property
     def named_cause(self) -> str | None:
-        """The cause that the verdict names: a leak's for `leak`, else another event's; None where it names none."""
+        """Cause named by the verdict: a leak's for `leak`, else another event's; None where it names none."""
         return self.cause if (self.verdict == LEAK) == (self.cause in LEAKS) else None
 
     @property
@@ -266,7 +266,7 @@ class Diagnosis(Evidence):
         )
 
     def to_frame(self) -> pandas.DataFrame:
-        """Return the figures as one row of a table, intervals as two columns; `pandas.concat` joins those of several.
+        """Return the figures as one row of a table, intervals as two columns; `pandas.concat` joins several.
 
         Raises MissingExtra where pandas is not installed.
         """

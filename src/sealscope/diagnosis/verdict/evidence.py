@@ -81,7 +81,7 @@ class TotalLeakage:
 
 @dataclass(frozen=True)
 class RelativeLeak:
-    """A leak beside what the recording itself measures: known without area and displacement.
+    """A leak relative to the recording's own measurements: known without area and displacement.
 
     `pump_share`: leak over the pump's mean flow, None where the pump's motion is not recorded; `creep`: leak over the
     piston's area, the speed at which it would creep with its lines shut [m/s], None where the position has no unit;
@@ -96,7 +96,7 @@ class RelativeLeak:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Verdict on one recording and the figures it rests on; what is not known is None.
+    """Verdict on one recording and the figures it rests on; unknown figures are None.
 
     Parameters
     ----------

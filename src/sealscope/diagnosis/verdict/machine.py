@@ -60,7 +60,7 @@ class AssumedMachine:
 
 
 def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) -> tuple[Rig, AssumedMachine]:
-    """Return the rig that detectors assume, and what it states of the machine.
+    """Return the rig assumed by detectors, and its statements about the machine.
 
     Without a `rig` it is that of the thesis: stated where the recording's own provenance says that it was made with the
     same area and displacement, else each of its values is a mere assumption (`Rig.states`).

@@ -56,7 +56,7 @@ class RepairLimit:
         return f"{self.value / MM_PER_MINUTE:.3g} mm/min of creep"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the limit as plain JSON values; the one that it does not state is null."""
+        """Return the limit as plain JSON values; the kind not stated is null."""
         return {
             "mL_per_min": self.value / ML_PER_MINUTE if self.kind == "flow" else None,
             "creep_mm_per_min": self.value / MM_PER_MINUTE if self.kind == "creep" else None,
@@ -80,7 +80,7 @@ class Severity:
 
     @property
     def level(self) -> Level | None:
-        """Level by the interval: `repair` where it is all over the limit, `monitor` where it is all under half of it.
+        """Level by the interval: `repair` if all over the limit, `monitor` if all under half of it.
 
         Else `plan`; None where the leak cannot be held against the limit.
         """
@@ -90,7 +90,7 @@ class Severity:
         return "repair" if low > 1.0 else "monitor" if high < 0.5 else "plan"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the severity as plain JSON values: each figure with `_interval` beside it, and the level."""
+        """Return the severity as plain JSON values: each figure, its `_interval`, and the level."""
         plain: dict[str, Any] = {"level": self.level}
         for name in ("mL_per_min", "pump_share", "creep_mm_per_min", "of_limit"):
             figure = getattr(self, name)
@@ -115,7 +115,7 @@ def severity(evidence: Evidence, limit: RepairLimit) -> Severity | None:
 
 
 def beside_the_pump(evidence: Evidence, recording: Recording, machine: AssumedMachine) -> RelativeLeak | None:
-    """Return a leak of a stated L/min beside the flow of the assumed pump, and as a speed of the assumed piston.
+    """Compare a leak of a stated L/min with the assumed pump's flow; compute its speed of the assumed piston.
 
     None where no L/min is stated; without the share of the pump where neither its speed nor its angle is recorded.
     """

@@ -53,7 +53,7 @@ def _tables() -> Mapping[str, Mapping[str, Any]]:
 def state_of(
     condition: str, cause: str | None = None, *, since_s: float | None = None, action: str | None = None
 ) -> MachineState:
-    """Return the state of a machine under a condition of `states.toml`; KeyError where the table has none of that name.
+    """Return the state of a machine under a condition of `states.toml`; KeyError for an unknown condition.
 
     `cause`: of the change, which proposes the action, and decides the state unless the machine leaks past piston or
     pump; `since_s`: clock [s]; `action`: in place of the table's.
