@@ -169,15 +169,15 @@ class CommissionedMachine:
         Raises InputError where it is judged leaking, or a person found a leak then, or it is known already, or cannot
         be trusted.
         """
-        added = self._with(recording, file, checksum)
+        added = self._add(recording, file, checksum)
         if self.healthy and (result := self.diagnose(recording)).verdict == LEAK:
             raise InputError(f"a healthy recording must not leak, got one that does: {result.reason} ({file})")
         start_s = start_seconds(recording, file)
-        if start_s is not None and (leak := self._leak_in(start_s, start_s + recording.duration)) is not None:
+        if start_s is not None and (leak := self._find_leak(start_s, start_s + recording.duration)) is not None:
             raise InputError(f"a healthy recording must be of a time without a leak, got {leak} ({file})")
         return added
 
-    def _with(self, recording: Recording, file: str, checksum: str) -> CommissionedMachine:
+    def _add(self, recording: Recording, file: str, checksum: str) -> CommissionedMachine:
         """Return the machine with one more recording, whether it leaks or not."""
         learnt = learn(recording, assumed_rig(self.rig, recording)[0], file, checksum)
         if twin := next((earlier for earlier in self.healthy if earlier.digest == learnt.digest), None):
@@ -185,7 +185,7 @@ class CommissionedMachine:
         healthy = sorted((*self.healthy, learnt), key=lambda lesson: (lesson.start_s or 0.0, lesson.file))
         return replace(self, healthy=tuple(healthy))
 
-    def _leak_in(self, start_s: float, end_s: float) -> JudgedAlarm | None:
+    def _find_leak(self, start_s: float, end_s: float) -> JudgedAlarm | None:
         """Find the alarm of a leak found by a person and not repaired in a time [s since 1970]; None without one."""
         repairs = [alarm.date_s for alarm in self.alarms if alarm.mark == "repaired"]
         words = enumerate(self.alarms, 1)
@@ -354,7 +354,7 @@ def commission(
     for path in recordings_in(paths):
         try:
             recording = machine.read(path)
-            machine = machine._with(recording, path.name, checksum_of(path))
+            machine = machine._add(recording, path.name, checksum_of(path))
         except SealscopeError as error:
             problems.append(str(error))
             continue

@@ -199,7 +199,7 @@ class Watch:
             self._samples.restart("restart")
         for run in self._samples.runs(remove_dropouts(samples)):
             if self._estimator is None or self._estimator.method != self.method:  # a position came later
-                self._estimator = self._estimator_by()
+                self._estimator = self._make_estimator()
             with np.errstate(all="ignore"):  # a block whose sums overflow says nothing
                 every = self._estimator.take(run)
             self._samples.settled = self._estimator.begun
@@ -209,7 +209,7 @@ class Watch:
                 else:
                     yield self.judged(shown), self.leak
 
-    def _estimator_by(self) -> Estimator:
+    def _make_estimator(self) -> Estimator:
         litres = self._litres.get(self.method, False)
         if self.method == PressureEstimator.method:
             return PressureEstimator(self._rig, litres)
@@ -291,7 +291,7 @@ class Watch:
         if not self._detector.log_e(least) > least:
             return
         rise = self._detector.rise()
-        if leak is None and self._other_duty(estimator, rise):
+        if leak is None and self._has_duty_changed(estimator, rise):
             self._samples.count("blocks not compared: changed duty")
             self._forget()
             return
@@ -301,7 +301,7 @@ class Watch:
         )
         self._raise(estimator, rise._replace(threshold=2.0 * threshold, reason=reason), block)
 
-    def _other_duty(self, estimator: Estimator, rise: StepEstimate) -> bool:
+    def _has_duty_changed(self, estimator: Estimator, rise: StepEstimate) -> bool:
         """Test whether the duty changed with a rise, beyond its range before and the effect of a leak."""
         pressure, motion = self._last["pressure"], self._last["motion"]
         after = self._last["end"] > rise.onset[0]
@@ -363,7 +363,7 @@ class Watch:
         flow, sd = block.flow, block.sd * math.sqrt(self._detector.noise)
         total = total_interval = leak = leak_interval = excess = None
         if self.leak is not None:
-            excess = self._beyond_leak(self.leak, estimator, block, sd)
+            excess = self._estimate_rise(self.leak, estimator, block, sd)
         elif self.baseline is not None:
             base, half = self.baseline, WITHIN_95 * sd
             excess = block.g - base.level, block.g - base.high - half, block.g - base.low + half
@@ -376,13 +376,13 @@ class Watch:
             leak_interval = max(0.0, low), estimator.orifice * max(0.0, high)
         return BlockEstimate(self.blocks, block.end, status, total, total_interval, leak, leak_interval)
 
-    def _beyond_leak(
+    def _estimate_rise(
         self, leak: WatchedLeak, estimator: Estimator, block: BlockConductance, sd: float
     ) -> _WithInterval:
         """Return the conductance since the onset of a leak, and its interval, in which the oil may have warmed."""
         since = self._last["end"] - self.block_seconds >= leak.onset_interval_s[1]
         recent = self._last["g"][since][-_OF_NOW:]
-        now, warmed = float(np.mean(recent)) if recent.size else block.g, self._warmed(leak, block.end)
+        now, warmed = float(np.mean(recent)) if recent.size else block.g, self._warming_factor(leak, block.end)
         before, rise = max(leak.conductance_before, 0.0), now - leak.conductance_before
         noise = sd / math.sqrt(max(len(recent), 1))
         spread = WITHIN_95 * math.hypot(noise, leak.conductance_before_sd, estimator.size_error * rise)
@@ -417,7 +417,7 @@ class Watch:
             return estimate
         if leak is not None:
             before, scale = leak.conductance_before, estimator.inside
-            warmed = self._warmed(leak, estimate.t)
+            warmed = self._warming_factor(leak, estimate.t)
             least, most = max(before, 0.0) * warmed, before / warmed
             known = leak.conductance_before_sd
         else:
@@ -432,7 +432,7 @@ class Watch:
         return replace(estimate, leak_lpm=value, leak_interval_lpm=(max(0.0, low), max(0.0, high)))
 
     @staticmethod
-    def _warmed(leak: WatchedLeak, t: float) -> float:
+    def _warming_factor(leak: WatchedLeak, t: float) -> float:
         """Return the factor by which warmer oil may have raised the conductance since the onset of a leak."""
         oil, hours = priors("inference")["oil"], max(0.0, t - leak.onset_s) / 3600.0
         return float(oil["warmest"] ** min(1.0, hours / oil["shift"]))
@@ -458,10 +458,10 @@ class Watch:
             raise InputError(f"saved state must have version {STATE_VERSION}, got {version}")
         rate, hours = (part_of(state, name, (float, int)) for name in ("false_alarms_per_1000_h", "learn_hours"))
         litres = restored(dict[str, bool], part_of(state, "litres", Mapping), "litres")
-        watch = cls(_rig_of(part_of(state, "rig", str)), rate, hours, litres=litres)
+        watch = cls(_parse_rig(part_of(state, "rig", str)), rate, hours, litres=litres)
         recall(watch, _SAVED, state, _KINDS_OF_SAVED)
         if (estimator := part_of(state, "estimator", (Mapping, type(None)))) is not None:
-            watch._estimator = watch._estimator_by()
+            watch._estimator = watch._make_estimator()
             watch._estimator.recall(estimator)
         return watch
 
@@ -475,7 +475,7 @@ _KINDS_OF_SAVED = {"baseline": WatchBaseline, "leak": WatchedLeak}
 
 
 @lru_cache(maxsize=256)
-def _rig_of(text: str) -> Rig:
+def _parse_rig(text: str) -> Rig:
     """Return the rig of a saved state; raises InputError where it is none."""
     from sealscope.parameters import Rig
 

@@ -68,7 +68,7 @@ def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) 
     known = load_rig(_DEFAULT if rig is None else rig)
     stated_by: StatedBy = "call"
     if rig is None:
-        stated_by = "recording" if _made_with(recording.provenance, known) else "nobody"
+        stated_by = "recording" if _is_simulated_with(recording.provenance, known) else "nobody"
         known = known if stated_by == "recording" else unstated()
     elif not states_rig(known):
         stated_by = "nobody"
@@ -111,7 +111,7 @@ def unstated() -> Rig:
     return load_rig(_DEFAULT).as_assumed(_REASON)
 
 
-def _made_with(provenance: Mapping[str, Any], rig: Rig) -> bool:
+def _is_simulated_with(provenance: Mapping[str, Any], rig: Rig) -> bool:
     """Test whether the rig of a simulated recording has the area and displacement of this one."""
     experiment = provenance.get("experiment")
     if provenance.get("origin") != "simulation" or not isinstance(experiment, Mapping):
