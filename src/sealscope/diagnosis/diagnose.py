@@ -108,15 +108,15 @@ class Examination:
         """
         context = DecisionContext(false_alarm_probability=self.false_alarm_probability, refusal=self.refusal)
         names = sorted(detectors(), key=rank)
-        judged = dict[str, Evidence]()
+        decisions = dict[str, Evidence]()
         reports = [self.signals, *(self.report(name) for name in names if name not in ORDER)]
         for name in names:
-            if name not in ORDER or not any(is_decided(observable) for observable in judged.values()):
-                judged[name] = self._decide(name, reports, context)
+            if name not in ORDER or not any(is_decided(decision) for decision in decisions.values()):
+                decisions[name] = self._decide(name, reports, context)
         failed = next(
-            (self.report(name).lack for name in ORDER if name in judged and self.report(name).has_failed), None
+            (self.report(name).lack for name in ORDER if name in decisions and self.report(name).has_failed), None
         )
-        return combine(list(judged.values()), replace(context, refusal=self.refusal or failed))
+        return combine(list(decisions.values()), replace(context, refusal=self.refusal or failed))
 
     def _decide(self, name: str, reports: Sequence[Observed], context: DecisionContext) -> Evidence:
         report = self.report(name)

@@ -69,8 +69,8 @@ class JudgedAlarm(NamedTuple):
 
     def __str__(self) -> str:
         leak = "" if self.leak_lpm is None else f", {self.leak_lpm:.2g} L/min"
-        since = "" if self.mark == "invalid" else f", since {_date(self.onset_s)}{leak}"
-        return f"{self.alarm} {self.mark} {_date(self.date_s)}{since}{self.reason and f' ({self.reason})'}".strip()
+        onset_text = "" if self.mark == "invalid" else f", since {_date(self.onset_s)}{leak}"
+        return f"{self.alarm} {self.mark} {_date(self.date_s)}{onset_text}{self.reason and f' ({self.reason})'}".strip()
 
 
 class Origin(NamedTuple):
@@ -180,8 +180,8 @@ class CommissionedMachine:
     def _add(self, recording: Recording, file: str, checksum: str) -> CommissionedMachine:
         """Return the machine with one more recording, whether it leaks or not."""
         learnt = learn(recording, assumed_rig(self.rig, recording)[0], file, checksum)
-        if twin := next((earlier for earlier in self.healthy if earlier.digest == learnt.digest), None):
-            raise InputError(f"a healthy recording must be new, got the samples of {twin.file} ({file})")
+        if copy := next((earlier for earlier in self.healthy if earlier.digest == learnt.digest), None):
+            raise InputError(f"a healthy recording must be new, got the samples of {copy.file} ({file})")
         healthy = sorted((*self.healthy, learnt), key=lambda lesson: (lesson.start_s or 0.0, lesson.file))
         return replace(self, healthy=tuple(healthy))
 
@@ -189,8 +189,8 @@ class CommissionedMachine:
         """Find the alarm of a leak found by a person and not repaired in a time [s since 1970]; None without one."""
         repairs = [alarm.date_s for alarm in self.alarms if alarm.mark == "repaired"]
         words = enumerate(self.alarms, 1)
-        found = (word for k, word in words if word.mark != "invalid" and not _is_taken_back(word, self.alarms[k:]))
-        leaks = (word for word in found if word.onset_s <= end_s)
+        alarms = (word for k, word in words if word.mark != "invalid" and not _is_taken_back(word, self.alarms[k:]))
+        leaks = (word for word in alarms if word.onset_s <= end_s)
         return next((leak for leak in leaks if not any(leak.onset_s <= repair <= start_s for repair in repairs)), None)
 
     def since(self, start_s: float) -> CommissionedMachine:
@@ -243,8 +243,8 @@ def recordings_in(paths: Iterable[str | os.PathLike[str]] | str | os.PathLike[st
     files: list[Path] = []
     for path in entries:
         if path.is_dir():
-            inside = inner_files(path, sorted(item for item in path.iterdir() if not item.name.startswith(".")))
-            files += [file for file in inside if file.suffix.lower() not in NO_RECORDINGS and not _is_written(file)]
+            contents = inner_files(path, sorted(item for item in path.iterdir() if not item.name.startswith(".")))
+            files += [file for file in contents if file.suffix.lower() not in NO_RECORDINGS and not _is_written(file)]
         else:
             files.append(path)
     if not files:

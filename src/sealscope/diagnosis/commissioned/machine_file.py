@@ -190,9 +190,9 @@ def _write(machine: CommissionedMachine, target: Path) -> None:
 
     Raises InputError where the text would not be read again.
     """
-    taught, data = [format_lesson(learnt) for learnt in machine.healthy], _format_text(machine, target)
+    lessons, data = [format_lesson(learnt) for learnt in machine.healthy], _format_text(machine, target)
     _stated_in(parse_toml(data, "a machine's file", str(target)), str(target))
-    backup, lines = target.with_suffix(".toml.bak"), {line.checksum: line for line in taught}
+    backup, lines = target.with_suffix(".toml.bak"), {line.checksum: line for line in lessons}
     texts = [(path, _read_if_there(path)) for path in (target, backup)]
     present = {line.checksum: line for path, tree in texts for line in read_lines(_lessons_path(path, tree))}
     for checksum in (checksum for _, tree in texts for checksum in _lessons_named(tree) if checksum in present):
@@ -238,8 +238,8 @@ def _parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
         return sha256(json.dumps(value, sort_keys=True, default=str).encode()).digest()[:16]
 
     head = {name: value for name, value in tree["machine"].items() if name not in _REWRITTEN}
-    stated = {name: table for name, table in tree.items() if name not in OF_MACHINES}
-    parts = {hash_of([head, stated]): "another statement of the machine"}
+    tables = {name: table for name, table in tree.items() if name not in OF_MACHINES}
+    parts = {hash_of([head, tables]): "another statement of the machine"}
     parts |= {hash_of(row["lesson"]): f"another recording, {row['file']}" for row in tree["healthy"]}
     return parts | {hash_of(row): f"another mark of {row['alarm']}" for row in tree.get("alarms", ())}
 
@@ -278,11 +278,11 @@ def _lessons_named(tree: Mapping[str, Any]) -> list[str]:
 
 def _lessons_path(path: Path, tree: Mapping[str, Any]) -> Path:
     """Return a machine's file of lessons: the one of the same name if it exists, else the one its text states."""
-    usual, head = path.with_suffix(SUFFIX), tree.get("machine")
-    stated = head.get("lessons") if isinstance(head, dict) else None
-    if usual.exists() or not isinstance(stated, str) or _FILE_NAME.fullmatch(stated) is None:
-        return usual
-    return path.with_name(stated) if path.with_name(stated).exists() else usual
+    default, head = path.with_suffix(SUFFIX), tree.get("machine")
+    name = head.get("lessons") if isinstance(head, dict) else None
+    if default.exists() or not isinstance(name, str) or _FILE_NAME.fullmatch(name) is None:
+        return default
+    return path.with_name(name) if path.with_name(name).exists() else default
 
 
 def _tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
@@ -345,8 +345,8 @@ def _value(value: Any) -> str:
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if isinstance(value, Mapping):
-        stated = (f"{_key(name)} = {_value(item)}" for name, item in value.items() if item is not None)
-        return "{ " + ", ".join(stated) + " }"
+        members = (f"{_key(name)} = {_value(item)}" for name, item in value.items() if item is not None)
+        return "{ " + ", ".join(members) + " }"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(_value, value)) + "]"
     if isinstance(value, float):

@@ -76,8 +76,8 @@ class Summary:
         noise = []
         for name, value in self.noise.items():
             unit = units.get(name, "")
-            shown = {"Pa": "bar", "m": "mm"}.get(unit, unit)
-            noise.append(f"{name} {from_si(value, shown, unit):.2g} {shown}")
+            display_unit = {"Pa": "bar", "m": "mm"}.get(unit, unit)
+            noise.append(f"{name} {from_si(value, display_unit, unit):.2g} {display_unit}")
         rows = [
             (
                 "recordings",
@@ -163,15 +163,15 @@ def summarised(healthy: Sequence[Learnt], rig: Rig | None, left_out: Sequence[st
     noises = [recording.about.get("noise", {}) for recording in healthy]
     names = dict.fromkeys(name for noise_of in noises for name in noise_of)
     noise = {name: float(np.median([noise_of[name] for noise_of in noises if name in noise_of])) for name in names}
-    taught = [recording for recording in healthy if _BALANCE in recording.lessons]
+    with_lessons = [recording for recording in healthy if _BALANCE in recording.lessons]
     comparable = [
         recording
-        for recording in taught
-        if recording.lessons[_BALANCE]["terms"] == taught[0].lessons[_BALANCE]["terms"]
+        for recording in with_lessons
+        if recording.lessons[_BALANCE]["terms"] == with_lessons[0].lessons[_BALANCE]["terms"]
     ]
     problems += [
-        f"{recording.file} has other channels than {taught[0].file}"
-        for recording in taught
+        f"{recording.file} has other channels than {with_lessons[0].file}"
+        for recording in with_lessons
         if recording not in comparable
     ]
     rig, channels = rig or unstated(), frozenset(comparable[0].units if comparable else ())
@@ -193,9 +193,9 @@ def _terms(sums: Sequence[Array], rig: Rig, channels: frozenset[str]) -> dict[st
     def fitted(gram: Array) -> Array:
         return solve(gram[np.ix_(chosen, chosen)], gram[chosen, columns.left])
 
-    together, single = np.sum(sums, axis=0), np.array([fitted(gram) for gram in sums])
-    values = fitted(together)
-    variance = np.diag(solve(together[np.ix_(chosen, chosen)], np.eye(len(chosen))))
+    total, single = np.sum(sums, axis=0), np.array([fitted(gram) for gram in sums])
+    values = fitted(total)
+    variance = np.diag(solve(total[np.ix_(chosen, chosen)], np.eye(len(chosen))))
     scatter = single.std(axis=0, ddof=1).tolist() if len(sums) > 1 else [None] * len(chosen)
     return {
         name: TermEstimate(float(values[i]), float(np.sqrt(max(variance[i], 0.0))), scatter[i], units[name])
@@ -212,8 +212,8 @@ def _smallest(balance: VolumeBalance, lessons: Sequence[Mapping[str, Any]], chan
     from scipy.special import ndtri
 
     def findable(repeated: int) -> float:
-        coming = balance.next_rise(lessons, channels, repeated)
-        return float((coming.threshold(FALSE_ALARM_PROBABILITY) + ndtri(_ASKED["power"])) * coming.deviation)
+        rise = balance.next_rise(lessons, channels, repeated)
+        return float((rise.threshold(FALSE_ALARM_PROBABILITY) + ndtri(_ASKED["power"])) * rise.deviation)
 
     pressure, flow = (float(np.median([lesson[name] for lesson in lessons])) for name in ("pressure", "flow"))
     scale, smallest = float(np.median([lesson["scale"] for lesson in lessons])), findable(1)

@@ -123,13 +123,13 @@ class Case:
         for observable in sorted(self.observables, key=lambda candidate: chances[id(candidate)]):
             if chances[id(observable)] >= allowed:
                 return None
-            moving = [event for event in load_events() if event.does_move(observable)]
-            causes = dict.fromkeys(event.cause for event in moving if event.name not in LEAK_EVENTS)
+            moving_events = [event for event in load_events() if event.does_move(observable)]
+            causes = dict.fromkeys(event.cause for event in moving_events if event.name not in LEAK_EVENTS)
             for cause in (named for named in causes if named is not None):
-                sure = probability_of(self.explanations, cause=cause, data=observable.data)
-                if sure > _PRIORS["explanation"]["named"]:
-                    words = max((e for e in moving if e.cause == cause), key=lambda e: e.probability).words
-                    return OtherEvent(cause, words, sure, observable, chances[id(observable)])
+                certainty = probability_of(self.explanations, cause=cause, data=observable.data)
+                if certainty > _PRIORS["explanation"]["named"]:
+                    words = max((e for e in moving_events if e.cause == cause), key=lambda e: e.probability).words
+                    return OtherEvent(cause, words, certainty, observable, chances[id(observable)])
         return None
 
 
@@ -161,8 +161,8 @@ def step_key(provider: str) -> str:
 def _change_questions(case: Case) -> tuple[Question, ...]:
     """Return the question of a provider that measures no leak: the change of the observables that a leak moves."""
     leak = next(event for event in load_events() if event.name == LEAK_EVENTS[0])
-    moved = [observable for observable in case.judge.observables if leak.does_move(observable)]
-    rarest = min(moved, key=lambda observable: observable.chance, default=None)
+    moved_observables = [observable for observable in case.judge.observables if leak.does_move(observable)]
+    rarest = min(moved_observables, key=lambda observable: observable.chance, default=None)
     if rarest is None:
         return ()
     allowed, chance = case.context.false_alarm_probability, case.null.chance(rarest)

@@ -40,8 +40,8 @@ def combine(decisions: Sequence[Evidence], context: DecisionContext) -> Evidence
     ranked = sorted(decisions, key=lambda decision: rank(decision.detector))
     usable = [decision for decision in ranked if decision.usable]
     measuring = any(decision.detector in ORDER for decision in usable)
-    judging = [decision for decision in usable if not (measuring and decision.detector == RMS_CHANGE)]
-    judge = next((decision for decision in judging if not decision.abstains), None)
+    candidates = [decision for decision in usable if not (measuring and decision.detector == RMS_CHANGE)]
+    judge = next((decision for decision in candidates if not decision.abstains), None)
     if judge is None:
         return _undecided(ranked, usable)
     reasons, doubts = [judge.reason], []
@@ -54,15 +54,15 @@ def combine(decisions: Sequence[Evidence], context: DecisionContext) -> Evidence
             doubts.append(text_of("doubt", "rest"))
     verdict = CANNOT_TELL if doubts else judge.verdict
     other_parts = [decision for decision in ranked if decision is not judge]
-    stated = replace(judge, verdict=verdict, reason="".join([*reasons, *doubts]), parts=(judge, *other_parts))
-    return stated if verdict == LEAK else replace(stated, onset_s=None, onset_interval_s=None)
+    decision_made = replace(judge, verdict=verdict, reason="".join([*reasons, *doubts]), parts=(judge, *other_parts))
+    return decision_made if verdict == LEAK else replace(decision_made, onset_s=None, onset_interval_s=None)
 
 
 def _undecided(ranked: Sequence[Evidence], usable: Sequence[Evidence]) -> Evidence:
     """State why no detector has a verdict: by the first usable one, else by the one that needs least."""
     if usable:
-        stated = usable[0]
+        decision_made = usable[0]
     else:
         built_in = [decision for decision in ranked if decision.detector in (*ORDER, RMS_CHANGE)] or list(ranked)
-        stated = Evidence(CANNOT_TELL, built_in[-1].reason if built_in else "there is no detector")
-    return replace(stated, detector="", parts=tuple(ranked), usable=True)
+        decision_made = Evidence(CANNOT_TELL, built_in[-1].reason if built_in else "there is no detector")
+    return replace(decision_made, detector="", parts=tuple(ranked), usable=True)

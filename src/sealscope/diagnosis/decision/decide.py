@@ -52,9 +52,9 @@ def decide(judge: Observed, reports: Sequence[Observed], null: HealthyNull, cont
     observables = [*judge.observables, *(observable for report in other_reports for observable in report.observables)]
     case = Case(judge, observables, null, context)
     least: float = _PRIORS["explanation"]["leak"]
-    shown = next((alarm for alarm in case.alarms if case.leak_probability(alarm) > least), None)
-    if shown is not None:
-        return _leak_evidence(case, shown)
+    leak_alarm = next((alarm for alarm in case.alarms if case.leak_probability(alarm) > least), None)
+    if leak_alarm is not None:
+        return _leak_evidence(case, leak_alarm)
     alarm, leak = next(iter(case.alarms), None), case.leak
     bound = _bound(case, alarm)
     verdict = decide_verdict(False, *_bound_and_worth(case, bound))
@@ -84,8 +84,8 @@ def _leak_evidence(case: Case, alarm: Question) -> Evidence:
     leak, onset = case.leak, None
     cause: Cause = "piston leak"
     if leak is None:
-        shown = min(case.judge.observables, key=lambda observable: observable.chance)
-        onset, flow = shown.onset, None
+        rarest = min(case.judge.observables, key=lambda observable: observable.chance)
+        onset, flow = rarest.onset, None
     else:
         pump = probability_of(case.explanations, "pump leak")
         tells_pump = any(observable.name == "pump leak" for observable in case.observables) and pump < RAREST

@@ -87,9 +87,9 @@ def explain(
         largest[observable.data] = max(factor, largest.get(observable.data, 0.0))
     weighted = [(quantity, factor / (1.0 + misfit * largest[quantity.data])) for quantity, factor in factors]
     ways = {event.name: _ways_of(event, weighted, rise) for event in events}
-    telling = [event for event in events if max(sum(gains.values()) for gains in ways[event.name]) > LEAST]
+    telling_events = [event for event in events if max(sum(gains.values()) for gains in ways[event.name]) > LEAST]
     groups: list[tuple[Event, ...]] = [(event,) for event in events]
-    groups += [group for size in range(2, MOST + 1) for group in combinations(telling, size)]
+    groups += [group for size in range(2, MOST + 1) for group in combinations(telling_events, size)]
     moved = {
         name: frozenset(kind for gains in rows for kind, gain in gains.items() if gain > 0.0)
         for name, rows in ways.items()
@@ -123,12 +123,16 @@ def _ways_of(event: Event, weighted: Sequence[tuple[Observable, float]], rise: L
     if moved:
         anchor = max(moved, key=lambda pair: pair[1])[0]
         # an event explains what it disturbs only once other data show it
-        shown = {observable.data for observable, gain in moved if gain > LEAST}
-        disturbed = [pair for pair in weighted if shown and pair[0].data not in shown and event.does_disturb(pair[0])]
+        explained_data = {observable.data for observable, gain in moved if gain > LEAST}
+        disturbed = [
+            pair
+            for pair in weighted
+            if explained_data and pair[0].data not in explained_data and event.does_disturb(pair[0])
+        ]
         for observable, gain in moved + disturbed:
             if _coincide(observable, anchor):
-                sized = gain + (0.5 * observable.advantage if event.is_sized else 0.0)
-                gains[observable.data] = max(sized, gains.get(observable.data, 0.0))
+                size_gain = gain + (0.5 * observable.advantage if event.is_sized else 0.0)
+                gains[observable.data] = max(size_gain, gains.get(observable.data, 0.0))
     ways: list[_Gains] = [gains]
     if rise is not None and event.name in LEAK_EVENTS:
         if gains.get("volumes", 0.0) > 0.0:
@@ -162,9 +166,9 @@ def probability_of(
     """
     relevant = [explanation for explanation in explanations if data is None or data in explanation.data]
     total = sum(explanation.probability for explanation in relevant)
-    held = sum(
+    matching = sum(
         explanation.probability
         for explanation in relevant
         if explanation.has(*names) or (cause is not None and any(event.cause == cause for event in explanation.events))
     )
-    return float(held / total) if total > 0.0 else 0.0
+    return float(matching / total) if total > 0.0 else 0.0

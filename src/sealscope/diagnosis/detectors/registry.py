@@ -77,12 +77,12 @@ def plug_ins(used: frozenset[str]) -> Mapping[str, PlugIn]:
     One that cannot be loaded, or whose name is `used` by a built-in detector, by another plug-in or by a reserved
     word, is left out with one line that names its distribution. Looked for once in a process.
     """
-    known: dict[str, PlugIn] = {}
+    found_plug_ins: dict[str, PlugIn] = {}
     for point in sorted(entry_points(group=GROUP), key=lambda point: (point.name, point.value)):
         distribution = point.dist.name if point.dist is not None else point.value
         try:
-            if point.name in known:
-                raise ValueError(f"its name is that of a detector of {known[point.name].distribution}")
+            if point.name in found_plug_ins:
+                raise ValueError(f"its name is that of a detector of {found_plug_ins[point.name].distribution}")
             if point.name in used or point.name in _RESERVED:
                 raise ValueError("its name is taken by Sealscope itself")
             if any(mark in point.name for mark in (" @ ", ",", "\n")) or not point.name.strip():
@@ -93,5 +93,5 @@ def plug_ins(used: frozenset[str]) -> Mapping[str, PlugIn]:
         except Exception as error:
             failure(point.name, distribution, error)
             continue
-        known[point.name] = PlugIn(point.name, distribution, make)
-    return known
+        found_plug_ins[point.name] = PlugIn(point.name, distribution, make)
+    return found_plug_ins

@@ -135,18 +135,18 @@ class LiveBalance:
         The first blocks say nothing until there are `LEARNED`; the last of these says what all of them do. After a gap
         the balance goes on with what it knew; what lay before the gap and fills no block is dropped.
         """
-        shown: list[Shown] = []
+        results: list[Shown] = []
         stream = self._stream
         if stream is None or not run.follows:
             if stream is not None:
-                shown += self._take_blocks(stream.push({}, last=True))
+                results += self._take_blocks(stream.push({}, last=True))
             if stream is None or run.rate != self._rate:
                 fresh, self._rate = BlockStream(self._balances, run.rate, BLOCK_SECONDS), run.rate
                 if stream is not None:
                     fresh.recall({**stream.state(), "samples": {}, "first": 0, "done": 0})
                 self._stream = stream = fresh
             stream.restart(float(run.t[0]))
-        return shown + self._take_blocks(stream.push({name: run.channels[name] for name in self.names}))
+        return results + self._take_blocks(stream.push({name: run.channels[name] for name in self.names}))
 
     def _take_blocks(self, blocks: Blocks | None) -> list[Shown]:
         return [] if blocks is None else [self._take_block(block) for block in _parts(blocks)]
@@ -160,8 +160,8 @@ class LiveBalance:
             if self._woken >= WAKES:
                 self.relearn()
                 return NotJudged(end, "learning", "blocks: moves as never before", True)
-            shown = self._estimate_block(block)
-            return shown if isinstance(shown, NotJudged) else [shown]
+            result = self._estimate_block(block)
+            return result if isinstance(result, NotJudged) else [result]
         if not block.gram[0, 0, -1, -1] > 0.0 and self._waiting is None:
             return NotJudged(end, "at standstill", "blocks: at standstill")
         self._waiting = block if self._waiting is None else Blocks.joined([self._waiting, block])

@@ -71,12 +71,12 @@ class PressureEstimator:
             self._held[:] = math.nan
         kept = np.hstack([before, [run.t, *(run.channels[name] for name in _READ)]])
         first, length = (round(seconds * run.rate) for seconds in (_PRIORS["begins"], self.block_seconds))
-        shown: list[Shown] = []
+        results: list[Shown] = []
         while self._follower is None and run.rate >= _SLOWEST and kept.shape[1] >= first:
             beginning = _recording(kept[:, :first], run.rate)
             if reason := unusable(beginning, self._rig) or does_not_move(beginning):
                 kept = kept[:, first // 2 :]
-                shown.append(NotJudged(float(run.t[-1]), "", f"half minutes before the first block: {reason}"))
+                results.append(NotJudged(float(run.t[-1]), "", f"half minutes before the first block: {reason}"))
             else:
                 self._follower = Follower.begun(beginning, self._rig)
         while (self._follower is not None or run.rate < _SLOWEST) and kept.shape[1] >= length:
@@ -87,9 +87,9 @@ class PressureEstimator:
                 self._held[k - 1] = kept[k, length - 1] if hold.flags[length - 1] else math.nan
                 kept[k, :length][hold.flags[:length]] = math.nan
             block, kept = _recording(kept[:, :length], run.rate), kept[:, length:]
-            shown.append(self._estimate_block(block))
+            results.append(self._estimate_block(block))
         self._kept = kept.copy()
-        return shown
+        return results
 
     def _estimate_block(self, block: Recording) -> Shown:
         """Return the conductance of a block, or the reason why it is not judged."""

@@ -100,10 +100,10 @@ class StepDetector:
         spread = self._spread + WALKS * max(elapsed, 1.0)
         sigma, error = spread + variance, g - self._level
         square, gain = error**2 / sigma, spread / sigma
-        begins = self._known >= 4
-        if begins:
+        is_warm = self._known >= 4
+        if is_warm:
             self._begin_onset(begin, end)
-        _follow(self._onsets, self._places, error, sigma, gain, PARTS if begins else PARTS[:0])
+        _follow(self._onsets, self._places, error, sigma, gain, PARTS if is_warm else PARTS[:0])
         self._learn(sigma, square)
         self._level = self._level + gain * error
         self._spread = gain * variance
@@ -170,8 +170,8 @@ class StepDetector:
         low, high = np.searchsorted(np.cumsum(shares[order]), [0.025, 0.975])
         last = order[min(high, len(order) - 1)]
         part = float((onset - begin)[-len(PARTS)]) / len(PARTS)  # a part of a block, about
-        since = float(shares @ onset), float(onset[order[low]]) - part, float(onset[last]) + part
-        return StepEstimate(2.0 * log_e, since, self._unit * value, self._unit * deviation)
+        interval = float(shares @ onset), float(onset[order[low]]) - part, float(onset[last]) + part
+        return StepEstimate(2.0 * log_e, interval, self._unit * value, self._unit * deviation)
 
     def bound(self, probability: float = 0.95) -> float:
         """Compute the rise exceeded with probability 1 - `probability`, given a rise."""

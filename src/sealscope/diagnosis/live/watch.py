@@ -201,13 +201,13 @@ class Watch:
             if self._estimator is None or self._estimator.method != self.method:  # a position came later
                 self._estimator = self._make_estimator()
             with np.errstate(all="ignore"):  # a block whose sums overflow says nothing
-                every = self._estimator.take(run)
+                results = self._estimator.take(run)
             self._samples.settled = self._estimator.begun
-            for shown in every:
-                if isinstance(shown, NotJudged) and not shown.status:
-                    self._samples.count(shown.counted)
+            for result in results:
+                if isinstance(result, NotJudged) and not result.status:
+                    self._samples.count(result.counted)
                 else:
-                    yield self.judged(shown), self.leak
+                    yield self.judged(result), self.leak
 
     def _make_estimator(self) -> Estimator:
         litres = self._litres.get(self.method, False)
@@ -335,8 +335,8 @@ class Watch:
         leak, (onset, *ends) = self.leak, rise.onset
         if before is None:
             earlier = self._last["g"][self._last["end"] <= ends[0]][-GROUP:]
-            known = float(np.mean(earlier)) if earlier.size else block.g - rise.size
-            before = leak.conductance_before if leak is not None else known
+            mean_before = float(np.mean(earlier)) if earlier.size else block.g - rise.size
+            before = leak.conductance_before if leak is not None else mean_before
         reason = rise.reason if estimator.litres else f"{rise.reason}; {self.why_no_litres}"
         half = WITHIN_95 * math.hypot(rise.deviation, estimator.size_error * rise.size)
         low, high = (
@@ -380,13 +380,13 @@ class Watch:
         self, leak: WatchedLeak, estimator: Estimator, block: BlockConductance, sd: float
     ) -> _WithInterval:
         """Return the conductance since the onset of a leak, and its interval, in which the oil may have warmed."""
-        since = self._last["end"] - self.block_seconds >= leak.onset_interval_s[1]
-        recent = self._last["g"][since][-_OF_NOW:]
-        now, warmed = float(np.mean(recent)) if recent.size else block.g, self._warming_factor(leak, block.end)
+        is_after = self._last["end"] - self.block_seconds >= leak.onset_interval_s[1]
+        recent = self._last["g"][is_after][-_OF_NOW:]
+        now, warming = float(np.mean(recent)) if recent.size else block.g, self._warming_factor(leak, block.end)
         before, rise = max(leak.conductance_before, 0.0), now - leak.conductance_before
         noise = sd / math.sqrt(max(len(recent), 1))
         spread = WITHIN_95 * math.hypot(noise, leak.conductance_before_sd, estimator.size_error * rise)
-        return rise, estimator.inside * (now - before * warmed - spread), now - before / warmed + spread
+        return rise, estimator.inside * (now - before * warming - spread), now - before / warming + spread
 
     def over_cycles(self, estimate: BlockEstimate) -> BlockEstimate:
         """Return the estimate of the last block with mean flows over the cycles seen, as a recording's are.
@@ -398,8 +398,8 @@ class Watch:
             return estimate
         rows = self._last
         if leak is not None:
-            since = rows["end"] - self.block_seconds >= leak.onset_interval_s[1]
-            rows = rows[since] if since.any() else rows[-1:]
+            is_after = rows["end"] - self.block_seconds >= leak.onset_interval_s[1]
+            rows = rows[is_after] if is_after.any() else rows[-1:]
         flow = rows["flow"]
         noise = math.sqrt(self._detector.noise * float(np.sum((rows["sd"] * flow) ** 2))) / len(rows)
 
@@ -417,16 +417,16 @@ class Watch:
             return estimate
         if leak is not None:
             before, scale = leak.conductance_before, estimator.inside
-            warmed = self._warming_factor(leak, estimate.t)
-            least, most = max(before, 0.0) * warmed, before / warmed
-            known = leak.conductance_before_sd
+            warming = self._warming_factor(leak, estimate.t)
+            least, most = max(before, 0.0) * warming, before / warming
+            deviation_before = leak.conductance_before_sd
         else:
             base = self.baseline
             assert base is not None
-            before, scale, least, most, known = base.level, 1.0, base.high, base.low, 0.0
+            before, scale, least, most, deviation_before = base.level, 1.0, base.high, base.low, 0.0
         unit = float(flow.mean())
         value, deviation = mean_of((rows["g"] - before) * flow)
-        half = WITHIN_95 * math.hypot(deviation, known * unit, estimator.size_error * value)
+        half = WITHIN_95 * math.hypot(deviation, deviation_before * unit, estimator.size_error * value)
         low = scale * (value + (before - least) * unit - half)
         high = estimator.orifice * (value + (before - most) * unit + half)
         return replace(estimate, leak_lpm=value, leak_interval_lpm=(max(0.0, low), max(0.0, high)))

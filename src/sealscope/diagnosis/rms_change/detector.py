@@ -61,8 +61,8 @@ class RmsChange:
         """Return the lesson of a healthy recording: log RMS and duty, their chambers, and the start."""
         levels, duty = whole_levels(recording)
         chambers, start = list(judged_chambers(recording)), start_seconds(recording)
-        known = {"chambers": chambers, "recorded": list(chambers_of(recording)), "rate": recording.rate}
-        return {**known, "start_s": start, "levels": levels, "duty": duty}
+        lesson_head = {"chambers": chambers, "recorded": list(chambers_of(recording)), "rate": recording.rate}
+        return {**lesson_head, "start_s": start, "levels": levels, "duty": duty}
 
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
         """Return the changes of the details' RMS, within the recording or against the healthy ones."""

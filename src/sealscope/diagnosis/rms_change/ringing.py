@@ -48,15 +48,15 @@ def information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
     believed = np.array([float(exponents[name]) for name in explaining])
     time = blocks.edges[:-1] + 0.5 * blocks.seconds
     over_all = float(np.sqrt(len(time) * blocks.seconds / walks["time"]))
-    machine, stated = "duty" if blocks.cycle is None else "machine", []
+    machine, results = "duty" if blocks.cycle is None else "machine", []
     for name, y, w, variance in zip(blocks.names, left.T, weight.T, error, strict=True):
         drift = walks["noise" if name.startswith("d1 ") else machine] * over_all
         precision, vector = w**2 / variance, w * y / variance
         weighted = precision[:, None] * duty
         gain = weighted @ np.linalg.inv(duty.T @ weighted + np.diag(believed**-2))
         precision, vector = np.diag(precision) - gain @ weighted.T, vector - gain @ (duty.T @ vector)
-        stated.append(Information(time, precision, vector, slope=drift, walk=drift))
-    return stated, weight.mean(axis=0)
+        results.append(Information(time, precision, vector, slope=drift, walk=drift))
+    return results, weight.mean(axis=0)
 
 
 def rises(
@@ -75,16 +75,19 @@ def rises(
     quantiles = (np.arange(walk["tried"]) + 0.5) / walk["tried"]
     gained = walk["machine"] * np.tan(0.5 * np.pi * quantiles)
     rates = (gained / prior["session"]) ** 2 / (2.0 * walk["time"])
-    since, same_session = np.zeros((n + 1, n + 1)), np.ones((n + 1, n + 1))
+    elapsed, same_session = np.zeros((n + 1, n + 1)), np.ones((n + 1, n + 1))
     if times is not None:
         sessions = sessions_of(list(times), prior["pause"])
-        since, same_session = np.abs(np.subtract.outer(times, times)), np.equal.outer(sessions, sessions).astype(float)
-    fading = prior["session"] ** 2 * np.exp(-rates[:, None, None] * since) * same_session
+        elapsed, same_session = (
+            np.abs(np.subtract.outer(times, times)),
+            np.equal.outer(sessions, sessions).astype(float),
+        )
+    fading = prior["session"] ** 2 * np.exp(-rates[:, None, None] * elapsed) * same_session
     population = Population(fading + effects @ effects.T, np.zeros(len(rates)))
     values, weights = beyond_noise(np.vstack([log_rms, known]), known)
     weight = weights[1:].mean(axis=0)
-    stated = []
+    results = []
     for change, healthy, w in zip(values[0] / weight, values[1:].T / weight[:, None], weight, strict=True):
         scatter = float(np.hypot(prior["scatter"], prior["error"] / w))
-        stated.append(population.rise(change[None], healthy[None], scatter, prior["freedom"]))
-    return stated, weight
+        results.append(population.rise(change[None], healthy[None], scatter, prior["freedom"]))
+    return results, weight

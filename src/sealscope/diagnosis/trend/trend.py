@@ -305,33 +305,33 @@ def _make_trend(points: Sequence[TrendPoint], differences: tuple[str, ...], **st
 def _with_levels(trend: Trend) -> Trend:
     """Add levels and episodes to a trend of at least one comparable recording."""
     levels, allowed = _levels(trend)
-    few, points, rows = levels.merged(), [*trend.points], trend.rows
-    alone = np.flatnonzero(outlier_excess(levels)[1])
+    merged, points, rows = levels.merged(), [*trend.points], trend.rows
+    outliers = np.flatnonzero(outlier_excess(levels)[1])
     remark = "apart from the recordings before and after: it counts as if it were near"
     findings = [*trend.findings]
-    if alone.size:
-        files = listed((points[rows[k]].file for k in alone), 3)
-        text = f"{alone.size} of {len(points)} {remark} ({files})"
-        findings.append(Finding("outlier", "warning", None, alone.size, None, text))
+    if outliers.size:
+        files = listed((points[rows[k]].file for k in outliers), 3)
+        text = f"{outliers.size} of {len(points)} {remark} ({files})"
+        findings.append(Finding("outlier", "warning", None, outliers.size, None, text))
     for k, row in enumerate(rows):
         value, half = float(levels.value[k]), WITHIN_95 * float(levels.error[k])
-        note = remark if k in alone else ""
+        note = remark if k in outliers else ""
         points[row] = replace(points[row], value=value, low=value - half, high=value + half, note=note)
-    known = max(1, _count_healthy(trend) * len(few) // len(levels))
+    healthy_count = max(1, _count_healthy(trend) * len(merged) // len(levels))
     return replace(
         trend,
         points=tuple(points),
         findings=tuple(findings),
-        episodes=tuple(episodes(few, years=trend.years, known=known, allowed=allowed)),
-        rows=tuple(rows[int(np.argmin(np.abs(levels.t - t)))] for t in few.t) if few is not levels else rows,
+        episodes=tuple(episodes(merged, years=trend.years, known=healthy_count, allowed=allowed)),
+        rows=tuple(rows[int(np.argmin(np.abs(levels.t - t)))] for t in merged.t) if merged is not levels else rows,
     )
 
 
 def _count_healthy(trend: Trend) -> int:
     """Count the compared recordings among the first ones, known to be healthy; at least the first."""
     first = dict.fromkeys(point.digest for point in trend.points)  # a copy counts once
-    known = {*islice(first, trend.healthy)}
-    return max(1, sum(trend.points[row].digest in known for row in trend.rows))
+    healthy_digests = {*islice(first, trend.healthy)}
+    return max(1, sum(trend.points[row].digest in healthy_digests for row in trend.rows))
 
 
 def _levels(trend: Trend) -> tuple[Levels, float | None]:

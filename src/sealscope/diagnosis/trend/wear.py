@@ -79,17 +79,17 @@ class Levels:
     @property
     def interval(self) -> float:
         """Typical time between two recordings [days]."""
-        waits = np.diff(self.t)
-        return float(np.median(waits[waits > 0.0])) if np.any(waits > 0.0) else 1.0
+        steps = np.diff(self.t)
+        return float(np.median(steps[steps > 0.0])) if np.any(steps > 0.0) else 1.0
 
     @property
     def scatter(self) -> float:
         """Deviation of a recording from its neighbours: their median step, shrunk towards the prior."""
         prior = self.prior
         steps = np.abs(np.diff(self.value))[np.diff(self.group) == 0] / math.sqrt(2.0)
-        known = prior.scale**2 + (float(np.mean(self.error**2)) if len(self) else 0.0)
+        prior_variance = prior.scale**2 + (float(np.mean(self.error**2)) if len(self) else 0.0)
         measured = (1.4826 * float(np.median(steps))) ** 2 if steps.size else 0.0
-        return math.sqrt((prior.freedom * known + steps.size * measured) / (prior.freedom + steps.size))
+        return math.sqrt((prior.freedom * prior_variance + steps.size * measured) / (prior.freedom + steps.size))
 
     def merged(self, most: int = 240) -> Levels:
         """Return about so many levels at most: neighbours of a group are averaged where there are more."""
@@ -146,7 +146,9 @@ class _Changes(NamedTuple):
         begin = np.arange(max(known, 1), len(levels))
         step = (np.arange(len(levels))[:, None] >= begin).astype(float)
         growth = np.maximum(levels.t[:, None] - levels.t[begin - 1], 0.0) / DAYS_PER_MONTH
-        slopes = [] if steps_only else [DAYS_PER_MONTH / levels.interval / many for many in believed["intervals"]]
+        slopes = (
+            [] if steps_only else [DAYS_PER_MONTH / levels.interval / interval for interval in believed["intervals"]]
+        )
         steps = len(believed["steps"])
         scale = np.array([*believed["steps"], *slopes], dtype=float)[:, None]
         grows = np.arange(scale.size)[:, None] >= steps
@@ -188,20 +190,22 @@ def _nodes(levels: Levels, shapes: Array, *, sloping: bool = False) -> list[_Nod
     last, later = outlier_excess(levels)
     values = levels.value - levels.value[0] - later
     reach = max(prior.scale, 0.3 * float(np.ptp(levels.value)))
-    wide = (_WIDE * reach) ** 2
-    mean = wide * (levels.group == levels.group[-1])
-    shared = wide * (levels.group[:, None] == levels.group) + levels.slope_sd**2 * np.outer(*(levels.covariate,) * 2)
+    wide_variance = (_WIDE * reach) ** 2
+    mean = wide_variance * (levels.group == levels.group[-1])
+    shared = wide_variance * (levels.group[:, None] == levels.group) + levels.slope_sd**2 * np.outer(
+        *(levels.covariate,) * 2
+    )
     if sloping:
-        grown = 10.0 * levels.scatter / levels.interval * (levels.t - levels.t[0])
-        shared += np.outer(grown, grown)
+        growth = 10.0 * levels.scatter / levels.interval * (levels.t - levels.t[0])
+        shared += np.outer(growth, growth)
     waits = np.abs(levels.t[:, None] - levels.t)
-    lasting = np.mean([np.exp(-waits / time) for time in believed["times"]], axis=0)
+    correlation = np.mean([np.exp(-waits / time) for time in believed["times"]], axis=0)
     right = np.column_stack([values, mean, shapes])
     nodes = []
     for tau in np.geomspace(0.1 * prior.scale, 10.0 * reach, believed["nodes"]):
         log_prior = -prior.freedom * (math.log(tau) + 0.5 * (prior.scale / tau) ** 2)
         for share in believed["lasts"]:
-            covariance = shared + tau**2 * share * lasting
+            covariance = shared + tau**2 * share * correlation
             covariance[np.diag_indices(len(levels))] += tau**2 * (1.0 - share + _TINY) + levels.error**2
             L = np.linalg.cholesky(covariance)
             z, u, g = np.split(solve_triangular(L, right, lower=True, check_finite=False), [1, 2], axis=1)
@@ -210,7 +214,7 @@ def _nodes(levels: Levels, shapes: Array, *, sloping: bool = False) -> list[_Nod
             log = log_prior - np.cumsum(np.log(L.diagonal())) - 0.5 * square
             a, b = np.cumsum(g**2, axis=0), np.cumsum(g * z, axis=0) - g * (z - held)
             base = float(levels.value[0] + u[:-1, 0] @ z[:-1, 0] + u[-1, 0] * held[-1, 0])
-            nodes.append(_Node(float(tau), log, a, b, base, wide - float(u[:, 0] @ u[:, 0]), g.T @ u[:, 0]))
+            nodes.append(_Node(float(tau), log, a, b, base, wide_variance - float(u[:, 0] @ u[:, 0]), g.T @ u[:, 0]))
     return nodes
 
 

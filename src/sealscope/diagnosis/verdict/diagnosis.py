@@ -319,13 +319,13 @@ class Diagnosis(Evidence):
         return axes
 
     def __str__(self) -> str:
-        since = "" if self.onset_s is None else f" since {self.onset_s:.1f} s"
-        return f"{self.file}: {self.verdict}{since} ({self.reason})"
+        onset_text = "" if self.onset_s is None else f" since {self.onset_s:.1f} s"
+        return f"{self.file}: {self.verdict}{onset_text} ({self.reason})"
 
     def __repr__(self) -> str:
         figures = {"onset_s": self.onset_s, "leak_lpm": self.leak_lpm, "score": self.score, "threshold": self.threshold}
-        stated = "".join(f", {name}={value:.4g}" for name, value in figures.items() if value is not None)
-        return f"Diagnosis({self.verdict!r}, file={self.file!r}{stated})"
+        figures_text = "".join(f", {name}={value:.4g}" for name, value in figures.items() if value is not None)
+        return f"Diagnosis({self.verdict!r}, file={self.file!r}{figures_text})"
 
     def _repr_html_(self) -> str:
         """Return the diagnosis as a table for notebooks."""

@@ -75,8 +75,8 @@ class TotalLeakage:
     @property
     def healthy(self) -> bool:
         """True if the flow is surely no more than a healthy machine's."""
-        known = self.healthy_lpm is not None and self.interval_lpm is not None
-        return known and self.interval_lpm[1] <= self.healthy_lpm  # type: ignore[index,operator]
+        is_known = self.healthy_lpm is not None and self.interval_lpm is not None
+        return is_known and self.interval_lpm[1] <= self.healthy_lpm  # type: ignore[index,operator]
 
 
 @dataclass(frozen=True)

@@ -65,22 +65,22 @@ def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) 
     Without a `rig` it is that of the thesis: stated where the recording's own provenance says that it was made with the
     same area and displacement, else each of its values is a mere assumption (`Rig.states`).
     """
-    known = load_rig(_DEFAULT if rig is None else rig)
+    used_rig = load_rig(_DEFAULT if rig is None else rig)
     stated_by: StatedBy = "call"
     if rig is None:
-        stated_by = "recording" if _is_simulated_with(recording.provenance, known) else "nobody"
-        known = known if stated_by == "recording" else unstated()
-    elif not states_rig(known):
+        stated_by = "recording" if _is_simulated_with(recording.provenance, used_rig) else "nobody"
+        used_rig = used_rig if stated_by == "recording" else unstated()
+    elif not states_rig(used_rig):
         stated_by = "nobody"
-    return known, AssumedMachine(
-        known.name,
+    return used_rig, AssumedMachine(
+        used_rig.name,
         stated_by,
-        area=0.5 * (known.cylinder.A_A + known.cylinder.A_B),
-        displacement=known.pump.q_b,
-        area_stated=known.states("cylinder.A_A", "cylinder.A_B"),
-        displacement_stated=known.states("pump.q_b"),
+        area=0.5 * (used_rig.cylinder.A_A + used_rig.cylinder.A_B),
+        displacement=used_rig.pump.q_b,
+        area_stated=used_rig.states("cylinder.A_A", "cylinder.A_B"),
+        displacement_stated=used_rig.states("pump.q_b"),
         flow_meter=measures_flow(recording.units),
-        areas=(known.cylinder.A_A, known.cylinder.A_B),
+        areas=(used_rig.cylinder.A_A, used_rig.cylinder.A_B),
         bypass="q_leak" in recording.units,
     )
 
