@@ -1,4 +1,4 @@
-"""A commissioned machine: its rig, how its logs are read, and what its healthy recordings have taught."""
+"""A commissioned machine: its rig, the map of its logs, and the lessons of its healthy recordings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What healthy recordings say of a machine: terms, sensors, scatter, the smallest leak, and what looks wrong."""
+"""Summary of a machine from healthy recordings: terms, sensors, scatter, smallest leak, and problems."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def about_recording(recording: Recording, inspection: Inspection) -> dict[str, A
 
 
 def summarised(healthy: Sequence[Learnt], rig: Rig | None, left_out: Sequence[str] = ()) -> Summary:
-    """Return the summary of a machine's healthy recordings; `left_out`: those that could not be used, and why."""
+    """Summarise a machine's healthy recordings; `left_out`: the unusable ones with reasons."""
     problems = [*left_out, *_collected(healthy)]
     noises = [recording.about.get("noise", {}) for recording in healthy]
     names = dict.fromkeys(name for noise_of in noises for name in noise_of)

@@ -1,4 +1,4 @@
-"""What a decision rests on: the report that judges, what competes, healthy recordings, and the questions asked."""
+"""Grounds of a decision: the judging report, rival explanations, healthy recordings, and the questions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The one decision: what was observed of a recording, and of healthy ones, becomes a verdict.
+"""The one decision: from observations of a recording, and of healthy ones, to a verdict.
 
 `leak` where a question is answered with yes at its share of the false-alarm probability, by the null that healthy
 recordings calibrate, and leaks are the most probable explanation. `no leak` with the 95 % bound of a leak over all

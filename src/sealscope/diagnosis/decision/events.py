@@ -1,4 +1,4 @@
-"""The table of events: what may happen, how often, and which observables it moves (`events.toml`)."""
+"""The table of possible events: their frequency, and the observables they move (`events.toml`)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which events explain what was observed: sets of at most three, each with its probability.
+"""Explanations of the observations: sets of at most three events, each with its probability.
 
 A set's posterior is the product of its events' probabilities and, for each kind of data, the Bayes factor of the best
 description that an event of the set gives; data that no event of the set moves earn nothing. So noise that steps

@@ -79,5 +79,5 @@ def _posterior(rarities: Sequence[float]) -> tuple[Array, Array]:
 
 
 def key_of(observable: Observable) -> str:
-    """Return the name under which an observable's rarities are stored; those against others share one."""
+    """Return the name that stores an observable's rarities; comparisons with other recordings share one."""
     return f"{observable.data}: {observable.name}" if observable.onset is not None else f"{observable.data}: against"

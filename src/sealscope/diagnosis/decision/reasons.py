@@ -1,4 +1,4 @@
-"""Why a verdict is what it is, in one line: keys and values of `decide`, filled in from `texts.toml`."""
+"""The reason of a verdict, in one line: keys and values of `decide`, filled in from `texts.toml`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The detector protocol, and the checks of what a detector returns."""
+"""The detector protocol, and the checks of a detector's report."""
 
 from __future__ import annotations
 

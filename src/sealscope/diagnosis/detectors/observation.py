@@ -1,4 +1,4 @@
-"""Run detectors on a recording: what each observes, why it cannot, and what healthy recordings show of the same."""
+"""Run detectors on a recording: observations, reasons for none, and the same for healthy recordings."""
 
 from __future__ import annotations
 

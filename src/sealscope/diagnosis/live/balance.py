@@ -1,4 +1,4 @@
-"""The volume balance of a running machine: what each block says of the leakage conductance.
+"""The volume balance of a running machine: the leakage conductance of each block.
 
 The sums are those of a recording (`balance.BlockStream`). All coefficients but the leak's are what the last blocks say
 of them (`known`). What passes the pump beside the piston is part of the conductance: piston and pump lie in parallel.

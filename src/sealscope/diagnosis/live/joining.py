@@ -29,7 +29,7 @@ _CLOCKS: float = _PRIORS["rate"]
 
 
 def ways_to_watch(rig: Rig) -> tuple[tuple[str, ...], ...]:
-    """Return the sets of channels by any of which an actuator is watched, the best first.
+    """Return the sets of channels that suffice to watch an actuator, the best first.
 
     A balance of volumes reads the position; the response of the pressures needs none, but a cylinder of like areas.
     """
@@ -55,7 +55,7 @@ def same_rate(rate: float, before: float) -> bool:
 
 
 class SampleRun(NamedTuple):
-    """Samples without a hole: times `t` [s], `channels`, sampling `rate` [Hz], and whether they follow those before."""
+    """Samples without a hole: times `t` [s], `channels`, sampling `rate` [Hz]; `follows`: no gap before them."""
 
     t: Array
     channels: Mapping[str, Array]

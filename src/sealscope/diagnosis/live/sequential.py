@@ -210,7 +210,7 @@ class StepDetector:
 
 @kernel
 def _follow(onsets: Any, places: Any, error: Any, sigma: Any, gain: Any, fresh: Any) -> None:
-    """Take innovations (q, 1) and their variances into the sums of all onsets, of which the last begin with a part."""
+    """Add innovations (q, 1) and their variances to the sums of all onsets; the last begin with a part."""
     answer, weighted, square, total, _ = onsets
     count, begun = len(places), len(places) - len(fresh)
     for q in range(len(sigma)):

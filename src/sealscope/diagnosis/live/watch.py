@@ -104,7 +104,7 @@ class Watch:
         self._last, self._group = np.empty(0, _LAST), np.empty(0, _GROUP)
 
     def _probability(self, test: str, seconds: float) -> float:
-        """Return the probability of a false alarm of one look of a test, with so many seconds between looks.
+        """Return the false-alarm probability of one look of a test, given the seconds between looks.
 
         Raises InputError where no threshold can be set for it.
         """
@@ -216,7 +216,7 @@ class Watch:
         return LiveBalance(self._rig, self._samples.names, litres)
 
     def continue_from(self, blocks: int, baseline_version: int) -> None:
-        """Count blocks and baselines on from those of a watch before, whose settings or state were of another kind."""
+        """Continue the counts of blocks and baselines of an earlier watch with other settings or state."""
         self.blocks, self.baseline_version = blocks, baseline_version + 1
 
     def relearn(self) -> None:

@@ -1,4 +1,4 @@
-"""What the RMS of a detail says of the machine's own part of it, within a recording and between recordings.
+"""The machine's own part in the RMS of a detail, within a recording and between recordings.
 
 Energy of a detail d_j is that of white noise, which every level holds alike (d1 holds hardly anything else), and the
 machine's own: E_j = (1 + g)^2 E_own,j + E_1. So the change g of the machine's amplitude is, to first order,

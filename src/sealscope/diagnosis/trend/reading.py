@@ -1,4 +1,4 @@
-"""Readings: what a single recording states of the leakage, and the order in which those of a machine are compared."""
+"""Readings: the leakage of a single recording, and the order to compare a machine's readings in."""
 
 from __future__ import annotations
 

@@ -278,7 +278,7 @@ def trend(
 
 
 def _make_trend(points: Sequence[TrendPoint], differences: tuple[str, ...], **stated: Any) -> Trend:
-    """Return the trend of readings in the order of their times; `stated`: what the caller states of it."""
+    """Make the trend of readings in the order of their times; `stated`: further fields of it."""
     rows = tuple(k for k, point in enumerate(points) if point.group >= 0)
     kept = [points[k] for k in rows]
     flows = bool(kept) and all(point.states_flow for point in kept)

@@ -92,7 +92,7 @@ class Levels:
         return math.sqrt((prior.freedom * prior_variance + steps.size * measured) / (prior.freedom + steps.size))
 
     def merged(self, most: int = 240) -> Levels:
-        """Return about so many levels at most: neighbours of a group are averaged where there are more."""
+        """Reduce the levels to about `most`: average neighbours of a group where there are more."""
         size = -(-len(self) // most)
         if size <= 1:
             return self

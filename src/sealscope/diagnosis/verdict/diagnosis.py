@@ -1,4 +1,4 @@
-"""Diagnosis: the fused evidence on one recording with what its reader needs beside it, as in the output contract."""
+"""Diagnosis: the fused evidence on one recording, and its context for the reader, as in the output contract."""
 
 from __future__ import annotations
 

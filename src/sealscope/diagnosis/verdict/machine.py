@@ -1,4 +1,4 @@
-"""The machine that a diagnosis assumes: what every L/min rests on, and whether it was stated or merely assumed."""
+"""The machine assumed by a diagnosis: the sizes behind every L/min, stated or merely assumed."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def healthy_leakage(rig: Rig) -> float:
 
 
 def unstated() -> Rig:
-    """Return the default rig, each value of which is a mere assumption."""
+    """Return the default rig, with each value marked as an assumption."""
     return load_rig(_DEFAULT).as_assumed(_REASON)
 
 

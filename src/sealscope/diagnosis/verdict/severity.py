@@ -1,4 +1,4 @@
-"""How bad a leak is: as a flow, beside the pump's flow, as a speed of the piston, and against a repair limit."""
+"""Severity of a leak: as a flow, relative to the pump's flow, as a piston speed, and against a repair limit."""
 
 from __future__ import annotations
 

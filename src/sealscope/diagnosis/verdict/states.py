@@ -1,4 +1,4 @@
-"""States of a machine as NAMUR NE 107 names them, from what a recording or a watched actuator shows.
+"""States of a machine by NAMUR NE 107, for a recording or a watched actuator.
 
 The tables are in `states.toml`: the states, the conditions that lead to them, the causes, and what is to be done.
 
