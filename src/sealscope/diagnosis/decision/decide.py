@@ -134,7 +134,7 @@ def _bound(case: Case, alarm: Question | None) -> float:
 
 
 def _bound_and_worth(case: Case, bound: float) -> tuple[float, float]:
-    """Return a bound and the largest one that is worth stating: of the leak's flow, else of the ringing's fall."""
+    """Return a bound and the largest one worth stating: of the leak's flow, else of the ringing's fall."""
     if case.leak is not None:
         return bound, bound_worth_stating(case.leak.pump_flow[1])
     ringing, details = case.judge.ringing, priors("rms_change")

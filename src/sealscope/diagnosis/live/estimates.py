@@ -147,7 +147,7 @@ class BaselineLearning:
     group: list[float] = field(default_factory=list)
 
     def add(self, g: float, flow: float, duty: Duty, group: int) -> None:
-        """Take a block's conductance, flow of a unit of it [L/min] and duty; means are of `group` blocks."""
+        """Add a block's conductance, flow of a unit of it [L/min] and duty; means are of `group` blocks."""
         self.blocks += 1
         self.total += g
         self.flow += flow

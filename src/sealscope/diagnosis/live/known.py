@@ -56,7 +56,7 @@ def known_shapes(n: int) -> tuple[tuple[int, ...], ...]:
 
 @law
 def take(known: Any, gram: Any, place: Any) -> None:
-    """Put a block's sums (m, m) into `known.own`: of the columns `place`, the others, the leak's and the left side."""
+    """Copy a block's sums (m, m) into `known.own`, in the order `place`: nuisances, leak, left side."""
     for i in range(len(place)):
         for j in range(len(place)):
             known.own[i, j] = gram[place[i], place[j]]
@@ -118,7 +118,7 @@ def _sum_residual_squares(sums: Any, right: Any) -> float:
 
 @large_law
 def begin(known: Any) -> None:
-    """Take coefficients and the variance of a row from all that was added."""
+    """Compute the coefficients and the variance of a row from the sums."""
     n = len(known.matrix)
     right = known.matrix[:, n:]
     right[:] = 0.0
@@ -170,7 +170,7 @@ def says(known: Any, rows: float, adds: bool) -> tuple[float, float, float, floa
 
 @law
 def motion(square: float, rows: float, numbers: Any) -> float:
-    """Return a block's motion, by the left side's sum of squares, over the usual one of as many rows.
+    """Compute a block's motion, the left side's sum of squares, over the usual one of as many rows.
 
     Infinite where none was usual.
     """

@@ -89,7 +89,7 @@ class StepDetector:
         return unit > 0.0 and abs(g) < _FARTHEST * unit and unit / _FARTHEST < deviation < _FARTHEST * unit
 
     def take(self, begin: float, end: float, g: float, deviation: float) -> None:
-        """Take a block from `begin` to `end` [s]: its estimate and the deviation of this."""
+        """Add a block from `begin` to `end` [s]: its estimate `g` and the `deviation` of `g`."""
         self._unit = self._unit or deviation
         g, variance = g / self._unit, (deviation / self._unit) ** 2
         self._blocks += 1

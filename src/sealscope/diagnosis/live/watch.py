@@ -228,7 +228,7 @@ class Watch:
         self.dismiss()
 
     def dismiss(self) -> None:
-        """Take the leak back and compare with nothing before now; the baseline stays."""
+        """Withdraw the leak and compare with no block before now; keep the baseline."""
         self.leak = None
         self._forget()
 

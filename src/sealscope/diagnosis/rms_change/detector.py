@@ -49,7 +49,7 @@ class RmsChange:
         """Nothing is assumed of the machine."""
 
     def usable(self, recording: Recording) -> str | None:
-        """Return None when the recording has a chamber pressure that moves, else the reason why not."""
+        """Return None if the recording is long enough and its chamber pressures move, else the reason why not."""
         if lack := lack_of_chambers(recording):
             return lack
         if len(recording) < shortest():

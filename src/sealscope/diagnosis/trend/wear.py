@@ -72,7 +72,7 @@ class Levels:
         return self.t.size
 
     def part(self, rows: slice) -> Levels:
-        """Return some of the recordings."""
+        """Select some of the recordings by `rows`."""
         t, value, error, covariate = (values[rows] for values in (self.t, self.value, self.error, self.covariate))
         return Levels(t, value, error, self.group[rows], covariate, self.prior, self.slope_sd)
 
@@ -161,7 +161,7 @@ class _Changes(NamedTuple):
 
     @classmethod
     def single(cls, shape: Array, scale: float) -> _Changes:
-        """Return a change of one shape (n,), whose scale is in tau."""
+        """Make a single change of one shape (n,), with its `scale` in tau."""
         first, one = np.zeros(1, dtype=np.int64), np.ones(1)
         return cls(shape[:, None], first, scale * one, first, one > 0.0, 0.0 * one)
 

@@ -138,7 +138,7 @@ def _mean_speed(recording: Recording) -> float:
 
 
 def _figure(value: float | None, interval: tuple[float, float] | None, factor: float = 1.0) -> _Figure:
-    """Return a figure with its interval, without one where the interval is not stated."""
+    """Return a figure with its interval, times a factor; None where a number is missing or infinite."""
     if value is None or interval is None or not all(math.isfinite(number) for number in (value, *interval)):
         return None
     return factor * value, factor * interval[0], factor * interval[1]
