@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.rms_change.blocks import cut, whole
+from sealscope.diagnosis.rms_change.blocks import cut_blocks, whole_levels
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Recording
 from sealscope.signals.details import details
@@ -69,7 +69,7 @@ def test_cycle_from_the_pressures_where_there_is_no_command() -> None:
 )
 def test_blocks_are_shares_of_the_cycle(command: str, phases: int, length: float) -> None:
     recording = duty(command, duration=90.0, start=1000.0)
-    blocks = cut(recording)
+    blocks = cut_blocks(recording)
     assert blocks.phases == phases
     assert blocks.edges.size == len(blocks.log_rms) + 1
     assert blocks.log_rms.shape[1] == len(blocks.names) == 10
@@ -82,7 +82,7 @@ def test_blocks_are_shares_of_the_cycle(command: str, phases: int, length: float
 
 def test_log_rms_is_that_of_the_details() -> None:
     recording = duty("prbs 3 every 0.5 s", start=20.0)
-    blocks = cut(recording)
+    blocks = cut_blocks(recording)
     bounds = np.rint((blocks.edges - recording.t[0]) * RATE).astype(int)
     for chamber in ("p_A", "p_B"):
         result = details(recording[chamber])
@@ -92,7 +92,7 @@ def test_log_rms_is_that_of_the_details() -> None:
             column = blocks.names.index(f"{quantity} of {chamber}")
             np.testing.assert_allclose(np.exp(blocks.log_rms[:, column]), direct, rtol=1e-9)
             inside = values[result.inside()]
-            assert whole(recording)[0][column] == pytest.approx(np.log(np.sqrt(np.mean(inside**2))), rel=1e-9)
+            assert whole_levels(recording)[0][column] == pytest.approx(np.log(np.sqrt(np.mean(inside**2))), rel=1e-9)
 
 
 def test_each_phases_own_level_is_taken_out() -> None:
@@ -101,7 +101,7 @@ def test_each_phases_own_level_is_taken_out() -> None:
     loud = 1.0 + 0.9 * np.sin(recording.t)  # the noise follows the stroke
     p_A = 3e5 + loud * random.normal(size=len(recording))
     recording = Recording(recording.t, {**recording.channels, "p_A": p_A}, recording.units, RATE)
-    blocks = cut(recording)
+    blocks = cut_blocks(recording)
     d1 = [blocks.names.index(f"d1 of {chamber}") for chamber in blocks.chambers]
     assert blocks.phases == 4
     means = np.array([blocks.log_rms[phase::4].mean(axis=0) for phase in range(4)])
@@ -110,14 +110,14 @@ def test_each_phases_own_level_is_taken_out() -> None:
 
 
 def test_blocks_hold_enough_samples_at_a_low_rate() -> None:
-    blocks = cut(duty("prbs 3 every 0.5 s", duration=500.0, rate=10.0))
+    blocks = cut_blocks(duty("prbs 3 every 0.5 s", duration=500.0, rate=10.0))
     np.testing.assert_allclose(np.diff(blocks.edges), 6.4)
 
 
 @pytest.mark.parametrize("samples", [226, 500, 900])
 def test_short_recordings_have_few_blocks_or_none(samples: int) -> None:
     recording = duty("prbs 3 every 0.5 s").samples(slice(0, samples))
-    blocks = cut(recording)
+    blocks = cut_blocks(recording)
     assert len(blocks.log_rms) == (samples - 225) // 750
     assert blocks.log_rms.shape[1] == 10
 
@@ -127,7 +127,7 @@ def test_a_reading_that_does_not_move_is_named() -> None:
     p_B = np.array(recording["p_B"])
     p_B[20000:23000] = p_B.min()
     held = Recording(recording.t, {**recording.channels, "p_B": p_B}, recording.units, RATE)
-    still = cut(held).still
+    still = cut_blocks(held).still
     assert still is not None
     assert still.startswith("p_B does not move from 14")
-    assert cut(recording).still is None
+    assert cut_blocks(recording).still is None

@@ -80,7 +80,7 @@ def test_a_change_of_the_duty_is_no_step_of_the_machine() -> None:
 )
 def test_the_start_is_left_out(n: int, cycle: float | None, first: int) -> None:
     """10 s (7 blocks), or three cycles, or an eighth of the record, whichever says least."""
-    result = blocks_of(np.zeros((n, len(QUANTITIES))), cycle).settled()
+    result = blocks_of(np.zeros((n, len(QUANTITIES))), cycle).without_start()
     assert len(result.log_rms) == n - first
     assert result.edges[0] == first * BLOCK
     assert len(result.edges) == n - first + 1

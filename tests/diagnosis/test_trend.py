@@ -18,7 +18,7 @@ from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.trend.reading import LeakReading, reading_of
 from sealscope.diagnosis.trend.trend import Trend
 from sealscope.diagnosis.trend.trend import trend as trend_of
-from sealscope.diagnosis.trend.wear import DayToDay, Levels, beyond, search
+from sealscope.diagnosis.trend.wear import DayToDay, Levels, outlier_excess, search
 from sealscope.errors import InputError
 from sealscope.recordings.oil import oil_temperature
 from sealscope.units import DAY, DAYS_PER_MONTH, LITRE_PER_MINUTE
@@ -108,7 +108,7 @@ def test_the_statistic_is_the_ratio_of_the_likelihoods(monkeypatch: pytest.Monke
     monkeypatch.setitem(priors("trend")["between"], "nodes", 3)  # type: ignore[arg-type]
     monkeypatch.setitem(priors("trend")["between"], "lasts", [0.5])  # type: ignore[arg-type]
     levels = levels_at(np.array([0.0, 1.0, 3.0, 4.0]), np.array([5.0, 5.5, 6.2, 6.9]), np.array([0.1, 0.5, 0.2, 0.3]))
-    assert not np.any(beyond(levels))
+    assert not np.any(outlier_excess(levels))
     assert search(levels, 2).log_R[-1] == pytest.approx(math.log(oracle(levels, PRIOR, 2)), abs=2e-3)
 
 

@@ -45,7 +45,7 @@ def check_probability(probability: float) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Examination:
-    """One recording, its gaps bridged, without missing samples, and what detectors are given beside it.
+    """One recording, gaps bridged and without missing samples, and the other inputs of detectors.
 
     `baseline`: leak-free recordings of the machine; `rig`: what detectors may assume of it; `distrust`: why the
     pressures cannot be judged, None where they can: then no detector is run; `refusal`: why none of the baselines that
@@ -64,16 +64,16 @@ class Examination:
 
     def through(self, channels: Iterable[str]) -> Examination:
         """Return the same recording with these channels alone."""
-        wanted = set(channels)
+        names_wanted = set(channels)
         recording, *baseline = (
-            healthy.only(name for name in healthy.channels if name in wanted)
+            healthy.only(name for name in healthy.channels if name in names_wanted)
             for healthy in (self.recording, *self.baseline)
             if isinstance(healthy, Recording)
         )
         return replace(self, recording=recording, baseline=baseline, _reports={})
 
     def report(self, name: str) -> Observed:
-        """Return what a detector observes, and why it observes nothing where it cannot.
+        """Return a detector's observations, or the reason why it has none.
 
         Raises KeyError for a detector that is not registered.
         """
@@ -83,12 +83,12 @@ class Examination:
 
     @cached_property
     def signals(self) -> Observed:
-        """What no detector of leaks observes: duty, noise, hum and levels."""
+        """Observations of duty, noise, hum and levels, which no detector of leaks makes."""
         return Observed(SIGNALS, lack=self.distrust) if self.distrust else observe_signals(self.recording)
 
     @cached_property
     def null(self) -> HealthyNull:
-        """What the healthy recordings show of every observable."""
+        """Distribution of every observable over the healthy recordings."""
         leak = self.report(ORDER[0]).leak if ORDER[0] in detectors() else None
         return null_of(self.baseline, self.rig, shut=isinstance(leak, BalanceLeak) and leak.balance.shut)
 
@@ -108,15 +108,15 @@ class Examination:
         """
         context = DecisionContext(false_alarm_probability=self.false_alarm_probability, refusal=self.refusal)
         names = sorted(detectors(), key=rank)
-        judged = dict[str, Evidence]()
+        decisions = dict[str, Evidence]()
         reports = [self.signals, *(self.report(name) for name in names if name not in ORDER)]
         for name in names:
-            if name not in ORDER or not any(is_decided(own) for own in judged.values()):
-                judged[name] = self._decide(name, reports, context)
+            if name not in ORDER or not any(is_decided(decision) for decision in decisions.values()):
+                decisions[name] = self._decide(name, reports, context)
         failed = next(
-            (self.report(name).lack for name in ORDER if name in judged and self.report(name).has_failed), None
+            (self.report(name).lack for name in ORDER if name in decisions and self.report(name).has_failed), None
         )
-        return combine(list(judged.values()), replace(context, refusal=self.refusal or failed))
+        return combine(list(decisions.values()), replace(context, refusal=self.refusal or failed))
 
     def _decide(self, name: str, reports: Sequence[Observed], context: DecisionContext) -> Evidence:
         report = self.report(name)
@@ -136,7 +136,7 @@ def diagnose(
     limit: str | None = None,
     file: str | os.PathLike[str] | None = None,
 ) -> Diagnosis:
-    """Say whether oil bypasses the piston in a recording.
+    """Decide whether oil bypasses the piston in a recording.
 
     The balance of volumes judges; where the channels allow none, the response of the pressures does, then plug-ins,
     last the change of RMS. What plug-ins and the change of RMS say is stated beside the verdict.
@@ -210,7 +210,7 @@ def _checked(recording: object, baseline: Recording | Sequence[Healthy]) -> list
     except TypeError:
         kind = type(baseline).__name__
         raise InputError(f"baseline must be a Recording or a sequence of Recordings, got {kind}") from None
-    named = [("baseline" if single else f"baseline[{k}]", own, Recording | Learnt) for k, own in enumerate(healthy)]
+    named = [("baseline" if single else f"baseline[{k}]", entry, Recording | Learnt) for k, entry in enumerate(healthy)]
     for name, value, kinds in (("recording", recording, Recording), *named):
         if not isinstance(value, kinds):
             hint = "; sealscope.read makes one of a file" if isinstance(value, str | os.PathLike) else ""

@@ -105,23 +105,23 @@ def comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baselines:
     recording itself, and all but one copy (that with the most channels) of the same recording. What differs in speed,
     load and temperature is for the detectors to describe.
     """
-    healthy = [own if isinstance(own, Learnt) else inspected(own) for own in baseline]
+    healthy = [recording if isinstance(recording, Learnt) else inspected(recording) for recording in baseline]
     chosen: dict[str, int] = {}
     left_out: dict[tuple[Severity, str], list[int]] = {}
     for k in sorted(range(len(healthy)), key=lambda k: -len(healthy[k].units)):
-        own = healthy[k]
-        alike = all(own.units.get(name) == judged.units[name] for name in chambers_of(judged.part))
+        earlier = healthy[k]
+        same_units = all(earlier.units.get(name) == judged.units[name] for name in chambers_of(judged.part))
         kind: tuple[Severity, str] | None = None
-        if isinstance(own, Inspection) and own.defect is not None:
-            kind = "warning", own.defect
-        elif own.digest == judged.digest:
+        if isinstance(earlier, Inspection) and earlier.defect is not None:
+            kind = "warning", earlier.defect
+        elif earlier.digest == judged.digest:
             kind = "warning", "the same samples as the recording itself"
-        elif not alike:
+        elif not same_units:
             kind = "note", "other channels or units"
-        elif own.digest in chosen:
+        elif earlier.digest in chosen:
             kind = "note", "the same samples as another baseline recording"
         if kind is None:
-            chosen[own.digest] = k
+            chosen[earlier.digest] = k
         else:
             left_out.setdefault(kind, []).append(k)
     findings = []
@@ -134,5 +134,7 @@ def comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baselines:
     if healthy and not chosen:
         most = max(left_out, key=lambda kind: len(left_out[kind]))
         refusal = f"no baseline recording can be used: {most[1]}"
-    parts = (own.part if isinstance(own := healthy[k], Inspection) else own for k in sorted(chosen.values()))
+    parts = (
+        earlier.part if isinstance(earlier := healthy[k], Inspection) else earlier for k in sorted(chosen.values())
+    )
     return Baselines(tuple(parts), tuple(findings), refusal)

@@ -14,7 +14,7 @@ Lesson = Mapping[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class Learnt:
-    """What the healthy recording of a `file` has taught.
+    """Lessons of the healthy recording of a `file`.
 
     `digest`: hash of its chamber pressures in hexadecimal digits, by which copies are known; `units` by channel; `rate`
     [Hz]; `seconds` long; `start_s`: when its first sample was taken [s since 1970], None where not known; `lessons` by
@@ -38,6 +38,9 @@ Healthy = Recording | Learnt
 
 
 def lessons_of(detector: Any, baseline: Sequence[Healthy]) -> list[Lesson]:
-    """Return what a detector has learnt of each healthy recording, from its samples or from what was written down."""
-    known = (own.lessons.get(detector.name) if isinstance(own, Learnt) else detector.learn(own) for own in baseline)
+    """Return a detector's lesson of each healthy recording, from its samples or as written down."""
+    known = (
+        recording.lessons.get(detector.name) if isinstance(recording, Learnt) else detector.learn(recording)
+        for recording in baseline
+    )
     return [lesson for lesson in known if lesson is not None]

@@ -1,1 +1,1 @@
-"""A machine commissioned once: what its healthy recordings taught, written down and used everywhere."""
+"""A machine commissioned once: the lessons of its healthy recordings, saved and used everywhere."""

@@ -67,7 +67,7 @@ def without_leaks(healthy: Sequence[Learnt], outliers: Sequence[Outlier]) -> tup
 
 
 def with_remarks(healthy: Sequence[Learnt], outliers: Sequence[Outlier]) -> tuple[Learnt, ...]:
-    """Return the recordings with what the others say among what looks wrong with each."""
+    """Add the verdict by the others to the problems of each recording."""
     remarks = {outlier.file: f"{outlier.summary} {BY_OTHERS}: {outlier.reason}" for outlier in outliers}
     return tuple(
         replace(learnt, about={**learnt.about, "wrong": [*learnt.about.get("wrong", ()), remarks[learnt.file]]})

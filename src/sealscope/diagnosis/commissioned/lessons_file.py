@@ -59,7 +59,7 @@ def make_table(extra: Literal["allow", "ignore"] = "ignore", **kinds: Any) -> An
 
 
 def table_of(kind: Any) -> Any:
-    """Return the type of a table whose values are of one kind; the first that is not is the error."""
+    """Return the type of a table with values of one kind; the first other value is the error."""
 
     def check(table: Any) -> Any:
         if not isinstance(table, dict):
@@ -93,7 +93,7 @@ def _check_statistic(value: Any) -> Any:
 
 
 def _check_sums(lesson: Any) -> Any:
-    """Check sums of products: their shape, and that flow and leak, which all estimates rest on, can be of one duty."""
+    """Check sums of products: their shape, and that flow and leak can be of one duty. All estimates rest on these."""
     size = len(lesson.terms) + 1
     if lesson.sums.ndim != 3 or not len(lesson.sums) or lesson.sums.shape[1:] != (size, size):
         raise ValueError(f"sums must be of the shape (E, {size}, {size}), got {lesson.sums.shape}")
@@ -189,7 +189,7 @@ _LESSON = make_table(
 
 
 def _pack(value: Any) -> Any:
-    """Return a value as JSON holds it, without what is None; a list of fractional numbers is an array."""
+    """Return a value for JSON, without members that are None; a list of fractional numbers is an array."""
     if isinstance(value, Mapping):
         return {str(name): _pack(inner) for name, inner in value.items() if inner is not None}
     if isinstance(value, np.generic):
@@ -207,7 +207,7 @@ def _pack(value: Any) -> Any:
 
 
 def check_lesson(method: str, lesson: Mapping[str, Any]) -> None:
-    """Raise ArithmeticError where what a method has learnt could not be read again, as with infinite numbers."""
+    """Raise ArithmeticError if a method's lesson could not be read again, for example with infinite numbers."""
     try:
         packed = _pack(lesson)
         json.dumps(packed, allow_nan=False)
@@ -217,7 +217,7 @@ def check_lesson(method: str, lesson: Mapping[str, Any]) -> None:
 
 
 def format_lesson(learnt: Learnt) -> Line:
-    """Format what a recording has taught as a line of the file.
+    """Format the lessons of a recording as a line of the file.
 
     Raises InputError where it would not be read again, as with numbers that are not finite.
     """

@@ -1,4 +1,4 @@
-"""A commissioned machine: its rig, how its logs are read, and what its healthy recordings have taught."""
+"""A commissioned machine: its rig, the map of its logs, and the lessons of its healthy recordings."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ JUDGEMENTS: tuple[Judgement, ...] = get_args(Judgement)
 
 
 class JudgedAlarm(NamedTuple):
-    """What a person said of an alarm of the monitor.
+    """A person's judgement of an alarm of the monitor.
 
     `alarm`: its name, "" for a repair without one; `mark`, said at `date_s`; of a leak since `onset_s` [s since 1970];
     `leak_lpm` [L/min] and `reason`, where they are known.
@@ -69,21 +69,21 @@ class JudgedAlarm(NamedTuple):
 
     def __str__(self) -> str:
         leak = "" if self.leak_lpm is None else f", {self.leak_lpm:.2g} L/min"
-        since = "" if self.mark == "invalid" else f", since {_date(self.onset_s)}{leak}"
-        return f"{self.alarm} {self.mark} {_date(self.date_s)}{since}{self.reason and f' ({self.reason})'}".strip()
+        onset_text = "" if self.mark == "invalid" else f", since {_date(self.onset_s)}{leak}"
+        return f"{self.alarm} {self.mark} {_date(self.date_s)}{onset_text}{self.reason and f' ({self.reason})'}".strip()
 
 
 class Origin(NamedTuple):
-    """The file that a machine was loaded from, and hashes of its parts, by which changes of others are known."""
+    """The file of a loaded machine, and hashes of its parts, to notice changes by others."""
 
     path: Path
     parts: frozenset[bytes]
 
 
 def _is_taken_back(word: JudgedAlarm, later: Iterable[JudgedAlarm]) -> bool:
-    """Whether a later word calls the alarm invalid; a new alarm of the same name begins after this word."""
-    own = (each for each in later if each.alarm == word.alarm and each.onset_s <= word.date_s)
-    return any(each.mark == "invalid" for each in own)
+    """Test whether a later word calls the alarm invalid; a new alarm of the same name begins after this word."""
+    answers = (answer for answer in later if answer.alarm == word.alarm and answer.onset_s <= word.date_s)
+    return any(answer.mark == "invalid" for answer in answers)
 
 
 def _date(moment: float) -> str:
@@ -134,7 +134,7 @@ class CommissionedMachine:
 
     @cached_property
     def summary(self) -> Summary:
-        """What the healthy recordings say of the machine, of its sensors and of the smallest leak."""
+        """Summary of the machine, its sensors and the smallest leak, from the healthy recordings."""
         from sealscope.diagnosis.commissioned.summary import summarised
 
         return summarised(self.healthy, self.rig, self.left_out)
@@ -149,13 +149,13 @@ class CommissionedMachine:
         *,
         false_alarm_probability: float = FALSE_ALARM_PROBABILITY,
     ) -> Diagnosis:
-        """Say whether oil bypasses the piston in a recording, or in the file of one, against the healthy ones.
+        """Decide whether oil bypasses the piston in a recording, or in its file, against the healthy ones.
 
         Arguments, result and errors as for `sealscope.diagnose`; rig, baseline and limit are the machine's.
         """
-        own = recording if isinstance(recording, Recording) else self.read(recording)
+        judged = recording if isinstance(recording, Recording) else self.read(recording)
         return diagnose(
-            own,
+            judged,
             self.healthy,
             false_alarm_probability=false_alarm_probability,
             rig=self.rig,
@@ -169,28 +169,28 @@ class CommissionedMachine:
         Raises InputError where it is judged leaking, or a person found a leak then, or it is known already, or cannot
         be trusted.
         """
-        added = self._with(recording, file, checksum)
+        added = self._add(recording, file, checksum)
         if self.healthy and (result := self.diagnose(recording)).verdict == LEAK:
             raise InputError(f"a healthy recording must not leak, got one that does: {result.reason} ({file})")
         start_s = start_seconds(recording, file)
-        if start_s is not None and (leak := self._leak_in(start_s, start_s + recording.duration)) is not None:
+        if start_s is not None and (leak := self._find_leak(start_s, start_s + recording.duration)) is not None:
             raise InputError(f"a healthy recording must be of a time without a leak, got {leak} ({file})")
         return added
 
-    def _with(self, recording: Recording, file: str, checksum: str) -> CommissionedMachine:
+    def _add(self, recording: Recording, file: str, checksum: str) -> CommissionedMachine:
         """Return the machine with one more recording, whether it leaks or not."""
         learnt = learn(recording, assumed_rig(self.rig, recording)[0], file, checksum)
-        if twin := next((own for own in self.healthy if own.digest == learnt.digest), None):
-            raise InputError(f"a healthy recording must be new, got the samples of {twin.file} ({file})")
-        healthy = sorted((*self.healthy, learnt), key=lambda own: (own.start_s or 0.0, own.file))
+        if copy := next((earlier for earlier in self.healthy if earlier.digest == learnt.digest), None):
+            raise InputError(f"a healthy recording must be new, got the samples of {copy.file} ({file})")
+        healthy = sorted((*self.healthy, learnt), key=lambda lesson: (lesson.start_s or 0.0, lesson.file))
         return replace(self, healthy=tuple(healthy))
 
-    def _leak_in(self, start_s: float, end_s: float) -> JudgedAlarm | None:
-        """Return the alarm of a leak that a person found, and that was not repaired, in a time [s since 1970]."""
+    def _find_leak(self, start_s: float, end_s: float) -> JudgedAlarm | None:
+        """Find the alarm of a leak found by a person and not repaired in a time [s since 1970]; None without one."""
         repairs = [alarm.date_s for alarm in self.alarms if alarm.mark == "repaired"]
         words = enumerate(self.alarms, 1)
-        found = (own for k, own in words if own.mark != "invalid" and not _is_taken_back(own, self.alarms[k:]))
-        leaks = (own for own in found if own.onset_s <= end_s)
+        alarms = (word for k, word in words if word.mark != "invalid" and not _is_taken_back(word, self.alarms[k:]))
+        leaks = (word for word in alarms if word.onset_s <= end_s)
         return next((leak for leak in leaks if not any(leak.onset_s <= repair <= start_s for repair in repairs)), None)
 
     def since(self, start_s: float) -> CommissionedMachine:
@@ -198,7 +198,9 @@ class CommissionedMachine:
 
         Raises InputError where none is left.
         """
-        left = tuple(own for own in self.healthy if own.start_s is not None and own.start_s >= start_s)
+        left = tuple(
+            recording for recording in self.healthy if recording.start_s is not None and recording.start_s >= start_s
+        )
         if not left:
             raise InputError(f"a machine must keep a healthy recording, got none of {_date(start_s)} or later")
         alarms = tuple(alarm for alarm in self.alarms if alarm.onset_s >= start_s)
@@ -213,7 +215,7 @@ class CommissionedMachine:
 
 
 def read_of_machine(path: str | os.PathLike[str], channel_map: ChannelMap, rate: float | None) -> Recording:
-    """Read a log by the map of its machine, or as it is where it has not the map's columns.
+    """Read a log by the map of its machine, or without the map if it lacks the map's columns.
 
     Raises UnreadableFile with what is wrong by the map, where neither can be read.
     """
@@ -229,20 +231,20 @@ def read_of_machine(path: str | os.PathLike[str], channel_map: ChannelMap, rate:
 
 
 def recordings_in(paths: Iterable[str | os.PathLike[str]] | str | os.PathLike[str]) -> list[Path]:
-    """Return the files of recordings that a path, several, or a folder name; InputError where there is none.
+    """List the files of recordings of a path, of several, or of a folder; InputError where there is none.
 
     A link in a folder that leads out of it is left out, and a warning says so: name it to have it read.
     """
     try:
         named = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
-        given = [Path(path) for path in named]
+        entries = [Path(path) for path in named]
     except TypeError:
         raise InputError(f"recordings must be a folder's path or paths of files, got {paths!r:.60}") from None
     files: list[Path] = []
-    for path in given:
+    for path in entries:
         if path.is_dir():
-            inside = inner_files(path, sorted(each for each in path.iterdir() if not each.name.startswith(".")))
-            files += [own for own in inside if own.suffix.lower() not in NO_RECORDINGS and not _is_written(own)]
+            contents = inner_files(path, sorted(item for item in path.iterdir() if not item.name.startswith(".")))
+            files += [file for file in contents if file.suffix.lower() not in NO_RECORDINGS and not _is_written(file)]
         else:
             files.append(path)
     if not files:
@@ -259,7 +261,7 @@ def _is_written(file: Path) -> bool:
 
 
 def learn(recording: Recording, rig: Rig, file: str, checksum: str = "") -> Learnt:
-    """Return what a healthy recording teaches every detector.
+    """Return the lessons of a healthy recording for every detector.
 
     Raises InputError where it cannot be trusted, or teaches nothing.
     """
@@ -286,10 +288,10 @@ def learn(recording: Recording, rig: Rig, file: str, checksum: str = "") -> Lear
     if not lessons:
         raise InputError(f"a healthy recording must hold channels that a method reads, got none such ({file})")
     units = {name: part.units[name] for name in part.channels}
-    about = {"sha256": checksum, **about_recording(recording, inspection)}
+    description = {"sha256": checksum, **about_recording(recording, inspection)}
     start = start_seconds(recording, file)
     rarities = dict(rarities_of(part, rig))
-    return Learnt(file, inspection.digest, units, part.rate, recording.duration, start, lessons, about, rarities)
+    return Learnt(file, inspection.digest, units, part.rate, recording.duration, start, lessons, description, rarities)
 
 
 @checked_call
@@ -303,7 +305,7 @@ def commission(
     name: str = "machine",
     keep: bool = False,
 ) -> CommissionedMachine:
-    """Commission a machine on its healthy recordings: learn once what every later diagnosis compares with.
+    """Commission a machine: learn from its healthy recordings once, for every later diagnosis.
 
     Parameters
     ----------
@@ -352,7 +354,7 @@ def commission(
     for path in recordings_in(paths):
         try:
             recording = machine.read(path)
-            machine = machine._with(recording, path.name, checksum_of(path))
+            machine = machine._add(recording, path.name, checksum_of(path))
         except SealscopeError as error:
             problems.append(str(error))
             continue
@@ -363,9 +365,9 @@ def commission(
         raise InputError(f"a machine must have a healthy recording that can be used, got none: {problems[0]}")
     machine = replace(machine, left_out=tuple(problems))
 
-    def judge(learnt: Learnt, others: tuple[Learnt, ...]) -> Diagnosis:
+    def judge(learnt: Learnt, rest: tuple[Learnt, ...]) -> Diagnosis:
         recording = recordings.get(learnt.file) or machine.read(places[learnt.file])
-        return replace(machine, healthy=others).diagnose(recording)
+        return replace(machine, healthy=rest).diagnose(recording)
 
     outliers = find_outliers(machine.healthy, judge)
     healthy, leaking = (machine.healthy, ()) if keep else without_leaks(machine.healthy, outliers)

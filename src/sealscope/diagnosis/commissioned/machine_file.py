@@ -102,7 +102,7 @@ _FILE = make_table(
 
 @checked_call
 def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) -> Path:
-    """Write a machine's file: whole under its name, or not at all; one that is there is kept, as `.toml.bak`.
+    """Write a machine's file completely or not at all; an existing file is kept as `.toml.bak`.
 
     A link is written through. Its lessons are written beside it, as `.lessons`.
 
@@ -148,7 +148,7 @@ def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) ->
 def update_machine(
     path: str | os.PathLike[str], change: Callable[[CommissionedMachine], CommissionedMachine]
 ) -> CommissionedMachine:
-    """Read, change and write a machine's file, so that nothing which another process writes meanwhile is lost.
+    """Read, change and write a machine's file without losing the changes of another process.
 
     `change` is called once, and once more where the file has changed meanwhile; nobody waits for the first call. Raises
     InputError as `read_machine`, `write_machine` and `change` do; then the file stays as it was.
@@ -164,7 +164,7 @@ def update_machine(
 
 
 def _resolve(path: str | os.PathLike[str]) -> Path:
-    """Return the file to write that a path leads to, through links; InputError where it does not end in .toml."""
+    """Follow a path's links to the file to write; InputError where its name does not end in .toml."""
     target = _follow(path)
     if target.suffix.lower() != ".toml":
         raise InputError(f"a machine's file must end in .toml, got {target}")
@@ -173,7 +173,7 @@ def _resolve(path: str | os.PathLike[str]) -> Path:
 
 
 def _follow(path: str | os.PathLike[str]) -> Path:
-    """Return the file that a path leads to, through links; InputError where they end in a circle."""
+    """Follow a path's links to a file; InputError where they end in a circle."""
     try:
         return Path(path).resolve()
     except (OSError, RuntimeError, ValueError) as error:
@@ -190,9 +190,9 @@ def _write(machine: CommissionedMachine, target: Path) -> None:
 
     Raises InputError where the text would not be read again.
     """
-    taught, data = [format_lesson(learnt) for learnt in machine.healthy], _format_text(machine, target)
+    lessons, data = [format_lesson(learnt) for learnt in machine.healthy], _format_text(machine, target)
     _stated_in(parse_toml(data, "a machine's file", str(target)), str(target))
-    backup, lines = target.with_suffix(".toml.bak"), {line.checksum: line for line in taught}
+    backup, lines = target.with_suffix(".toml.bak"), {line.checksum: line for line in lessons}
     texts = [(path, _read_if_there(path)) for path in (target, backup)]
     present = {line.checksum: line for path, tree in texts for line in read_lines(_lessons_path(path, tree))}
     for checksum in (checksum for _, tree in texts for checksum in _lessons_named(tree) if checksum in present):
@@ -232,26 +232,26 @@ def _read_alarms(rows: Any) -> tuple[JudgedAlarm, ...]:
 
 
 def _parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
-    """Return what a machine's text holds that another process may add or take away: hash and name of each."""
+    """Return the hash and name of each part of a machine's text that another process may add or remove."""
 
     def hash_of(value: Any) -> bytes:
         return sha256(json.dumps(value, sort_keys=True, default=str).encode()).digest()[:16]
 
     head = {name: value for name, value in tree["machine"].items() if name not in _REWRITTEN}
-    stated = {name: table for name, table in tree.items() if name not in OF_MACHINES}
-    parts = {hash_of([head, stated]): "another statement of the machine"}
+    tables = {name: table for name, table in tree.items() if name not in OF_MACHINES}
+    parts = {hash_of([head, tables]): "another statement of the machine"}
     parts |= {hash_of(row["lesson"]): f"another recording, {row['file']}" for row in tree["healthy"]}
     return parts | {hash_of(row): f"another mark of {row['alarm']}" for row in tree.get("alarms", ())}
 
 
-def _change_since(origin: Origin, present: Mapping[bytes, str], own: Mapping[bytes, str]) -> str | None:
-    """Name something that was added to, or taken from, a machine's file and that writing would undo; None for nothing.
+def _change_since(origin: Origin, present: Mapping[bytes, str], written: Mapping[bytes, str]) -> str | None:
+    """Name a part added to, or removed from, a machine's file that writing would undo; None for nothing.
 
-    `present`: parts of the file; `own`: parts of the machine to be written, which was read with those of `origin`.
+    `present`: parts of the file; `written`: parts of the machine to be written, which was read with those of `origin`.
     """
-    added = [name for part, name in present.items() if part not in origin.parts and part not in own]
-    taken = [name for part, name in own.items() if part in origin.parts and part not in present]
-    return next(iter((*added, *taken)), None)
+    added = [name for part, name in present.items() if part not in origin.parts and part not in written]
+    removed = [name for part, name in written.items() if part in origin.parts and part not in present]
+    return next(iter((*added, *removed)), None)
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -277,12 +277,12 @@ def _lessons_named(tree: Mapping[str, Any]) -> list[str]:
 
 
 def _lessons_path(path: Path, tree: Mapping[str, Any]) -> Path:
-    """Return the file of lessons of a text: that of its name, or where there is none that which it states."""
-    beside, head = path.with_suffix(SUFFIX), tree.get("machine")
-    stated = head.get("lessons") if isinstance(head, dict) else None
-    if beside.exists() or not isinstance(stated, str) or _FILE_NAME.fullmatch(stated) is None:
-        return beside
-    return path.with_name(stated) if path.with_name(stated).exists() else beside
+    """Return a machine's file of lessons: the one of the same name if it exists, else the one its text states."""
+    default, head = path.with_suffix(SUFFIX), tree.get("machine")
+    name = head.get("lessons") if isinstance(head, dict) else None
+    if default.exists() or not isinstance(name, str) or _FILE_NAME.fullmatch(name) is None:
+        return default
+    return path.with_name(name) if path.with_name(name).exists() else default
 
 
 def _tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
@@ -325,7 +325,7 @@ def _lines(tree: Mapping[str, Any], path: str = "", head: str = "") -> list[str]
     for name, value in tree.items():
         place = f"{path}.{_key(name)}" if path else _key(name)
         figures = isinstance(value, Mapping) and all(
-            isinstance(own, str | float | int | None) for own in value.values()
+            isinstance(item, str | float | int | None) for item in value.values()
         )
         if isinstance(value, Mapping) and not (path and value and figures):
             within += _lines(value, place, f"[{place}]")
@@ -341,12 +341,12 @@ def _key(name: str) -> str:
 
 
 def _value(value: Any) -> str:
-    """Return a plain value as TOML, without what is None; numbers to the last digit."""
+    """Format a plain value as TOML, without members that are None; numbers to the last digit."""
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if isinstance(value, Mapping):
-        stated = (f"{_key(name)} = {_value(own)}" for name, own in value.items() if own is not None)
-        return "{ " + ", ".join(stated) + " }"
+        members = (f"{_key(name)} = {_value(item)}" for name, item in value.items() if item is not None)
+        return "{ " + ", ".join(members) + " }"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(_value, value)) + "]"
     if isinstance(value, float):
@@ -385,7 +385,7 @@ def read_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
     place, target = os.fspath(path), _follow(path)
     tree = read_toml(target, "a machine's file", place)
     stated = _stated_in(tree, place)
-    head, rig = stated["machine"], {name: of for name, of in tree.items() if name not in (*OF_MACHINES, "map")}
+    head, rig = stated["machine"], {name: table for name, table in tree.items() if name not in (*OF_MACHINES, "map")}
     lessons = _lessons_path(target, tree)
     if not lessons.exists():
         rule = (

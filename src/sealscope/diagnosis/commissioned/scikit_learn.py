@@ -69,9 +69,9 @@ class LeakDetector(OutlierMixin, BaseEstimator):  # type: ignore[misc]
 
     def decision_function(self, X: Paths) -> Array:
         """Return threshold less score of each file: < 0 for a leak, nan where it cannot be judged."""
-        judged = self._diagnoses(X)
-        score: Array = np.array([own.score for own in judged], dtype=float)
-        return np.array([own.threshold for own in judged], dtype=float) - score
+        diagnoses = self._diagnoses(X)
+        score: Array = np.array([diagnosis.score for diagnosis in diagnoses], dtype=float)
+        return np.array([diagnosis.threshold for diagnosis in diagnoses], dtype=float) - score
 
     def predict(self, X: Paths) -> NDArray[np.int64]:
         """Return -1 for each file with a leak, 1 for one without, 0 where it cannot be told."""

@@ -1,4 +1,4 @@
-"""What healthy recordings say of a machine: terms, sensors, scatter, the smallest leak, and what looks wrong."""
+"""Summary of a machine from healthy recordings: terms, sensors, scatter, smallest leak, and problems."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Smallest(NamedTuple):
 
 @dataclass(frozen=True)
 class Summary:
-    """What is stated of a machine by its healthy recordings.
+    """Figures of a machine from its healthy recordings.
 
     `terms` by name; `noise` of each channel in its unit; `smallest` leak, None where no balance states one; `problems`:
     what looks wrong, a line each.
@@ -68,20 +68,23 @@ class Summary:
     problems: list[str] = field(default_factory=list)
 
     def text(self, healthy: Sequence[Learnt], rig: Rig | None) -> str:
-        """Return it in some ten lines."""
+        """Format the summary in some ten lines."""
         units = healthy[0].units if healthy else {}
-        starts = [own.start_s for own in healthy if own.start_s is not None]
+        starts = [recording.start_s for recording in healthy if recording.start_s is not None]
         dates = sorted(datetime.fromtimestamp(start, UTC).date().isoformat() for start in starts)
         span = f", {' to '.join(dict.fromkeys((dates[0], dates[-1])))}" if dates else ""
         noise = []
         for name, value in self.noise.items():
             unit = units.get(name, "")
-            shown = {"Pa": "bar", "m": "mm"}.get(unit, unit)
-            noise.append(f"{name} {from_si(value, shown, unit):.2g} {shown}")
+            display_unit = {"Pa": "bar", "m": "mm"}.get(unit, unit)
+            noise.append(f"{name} {from_si(value, display_unit, unit):.2g} {display_unit}")
         rows = [
-            ("recordings", f"{len(healthy)} healthy, {sum(own.seconds for own in healthy):.4g} s in all{span}"),
+            (
+                "recordings",
+                f"{len(healthy)} healthy, {sum(recording.seconds for recording in healthy):.4g} s in all{span}",
+            ),
             ("channels", ", ".join(f"{name} [{unit}]" for name, unit in units.items())),
-            ("machine", _stated(rig)),
+            ("machine", _describe_rig(rig)),
             ("duty", _duty(healthy)),
             ("noise", ", ".join(noise)),
         ]
@@ -105,8 +108,8 @@ class Summary:
         return "\n".join(paragraphs(rows, 16))
 
 
-def _stated(rig: Rig | None) -> str:
-    """Return what is stated of the machine, in words."""
+def _describe_rig(rig: Rig | None) -> str:
+    """Describe the stated sizes of the machine in words."""
     rig = rig or unstated()
     if rig.states("cylinder.M_eq"):
         return rig.title or rig.name
@@ -121,12 +124,14 @@ def _stated(rig: Rig | None) -> str:
 
 def _duty(healthy: Sequence[Learnt]) -> str:
     """Return the ranges of the pump's mean flow, where the machine's size is stated, of pressure and temperature."""
-    lessons = [own.lessons.get(_BALANCE, {}) for own in healthy]
+    lessons = [recording.lessons.get(_BALANCE, {}) for recording in healthy]
     flows = [lesson.get("flow", 0.0) * lesson.get("scale", 0.0) / LITRE_PER_MINUTE for lesson in lessons]
     ranges = {
         "L/min": [flow for flow in flows if flow > 0.0],
-        "bar between the chambers": [own.about["pressure_bar"] for own in healthy if "pressure_bar" in own.about],
-        "deg C": [own.about["oil_degC"] for own in healthy if "oil_degC" in own.about],
+        "bar between the chambers": [
+            recording.about["pressure_bar"] for recording in healthy if "pressure_bar" in recording.about
+        ],
+        "deg C": [recording.about["oil_degC"] for recording in healthy if "oil_degC" in recording.about],
     }
     texts = []
     for unit, values in ranges.items():
@@ -137,36 +142,44 @@ def _duty(healthy: Sequence[Learnt]) -> str:
 
 
 def about_recording(recording: Recording, inspection: Inspection) -> dict[str, Any]:
-    """Return what people read of a healthy recording, and what looks wrong with it."""
-    part, about = inspection.part, dict[str, Any]()
+    """Describe a healthy recording for people, with its problems."""
+    part, description = inspection.part, dict[str, Any]()
     if {"p_A", "p_B"} <= set(part.channels) and part.units["p_A"] == "Pa":
-        about["pressure_bar"] = _rounded(float(np.mean(np.abs(part["p_A"] - part["p_B"]))) / BAR)
+        description["pressure_bar"] = _rounded(float(np.mean(np.abs(part["p_A"] - part["p_B"]))) / BAR)
     if (oil := oil_temperature(recording)) is not None:
-        about["oil_degC"] = _rounded(oil)
-    about["noise"] = {name: noise for name in part.channels if (noise := _noise(part[name])) > 0.0}
-    about["wrong"] = [
+        description["oil_degC"] = _rounded(oil)
+    description["noise"] = {name: noise for name in part.channels if (noise := _noise(part[name])) > 0.0}
+    description["wrong"] = [
         *(finding.text for finding in inspection.findings if finding.severity != "note"),
         *(text for name in ("p_A", "p_B") if name in part and (text := _below_vacuum(part, name))),
         *(text for name in ("omega", "u") if name in part and (text := _glitches(part, name))),
     ]
-    return about
+    return description
 
 
 def summarised(healthy: Sequence[Learnt], rig: Rig | None, left_out: Sequence[str] = ()) -> Summary:
-    """Return the summary of a machine's healthy recordings; `left_out`: those that could not be used, and why."""
+    """Summarise a machine's healthy recordings; `left_out`: the unusable ones with reasons."""
     problems = [*left_out, *_collected(healthy)]
-    noises = [own.about.get("noise", {}) for own in healthy]
-    names = dict.fromkeys(name for own in noises for name in own)
-    noise = {name: float(np.median([own[name] for own in noises if name in own])) for name in names}
-    taught = [own for own in healthy if _BALANCE in own.lessons]
-    alike = [own for own in taught if own.lessons[_BALANCE]["terms"] == taught[0].lessons[_BALANCE]["terms"]]
-    problems += [f"{own.file} has other channels than {taught[0].file}" for own in taught if own not in alike]
-    rig, channels = rig or unstated(), frozenset(alike[0].units if alike else ())
-    if not (alike and equations(rig, channels)):
+    noises = [recording.about.get("noise", {}) for recording in healthy]
+    names = dict.fromkeys(name for noise_of in noises for name in noise_of)
+    noise = {name: float(np.median([noise_of[name] for noise_of in noises if name in noise_of])) for name in names}
+    with_lessons = [recording for recording in healthy if _BALANCE in recording.lessons]
+    comparable = [
+        recording
+        for recording in with_lessons
+        if recording.lessons[_BALANCE]["terms"] == with_lessons[0].lessons[_BALANCE]["terms"]
+    ]
+    problems += [
+        f"{recording.file} has other channels than {with_lessons[0].file}"
+        for recording in with_lessons
+        if recording not in comparable
+    ]
+    rig, channels = rig or unstated(), frozenset(comparable[0].units if comparable else ())
+    if not (comparable and equations(rig, channels)):
         return Summary({}, noise, None, problems)
-    lessons, balance = [own.lessons[_BALANCE] for own in alike], VolumeBalance(rig)
+    lessons, balance = [recording.lessons[_BALANCE] for recording in comparable], VolumeBalance(rig)
     terms = _terms([np.asarray(lesson["sums"], dtype=float)[0] for lesson in lessons], rig, channels)
-    if len(alike) == 1:
+    if len(comparable) == 1:
         return Summary(terms, noise, None, problems)
     return Summary(terms, noise, _smallest(balance, lessons, channels), problems)
 
@@ -177,13 +190,13 @@ def _terms(sums: Sequence[Array], rig: Rig, channels: frozenset[str]) -> dict[st
     columns, units = Columns(equation), {term.name: term.unit for term in equation.terms}
     chosen = list(columns.nuisance)
 
-    def fitted(own: Array) -> Array:
-        return solve(own[np.ix_(chosen, chosen)], own[chosen, columns.left])
+    def fitted(gram: Array) -> Array:
+        return solve(gram[np.ix_(chosen, chosen)], gram[chosen, columns.left])
 
-    together, apart = np.sum(sums, axis=0), np.array([fitted(own) for own in sums])
-    values = fitted(together)
-    variance = np.diag(solve(together[np.ix_(chosen, chosen)], np.eye(len(chosen))))
-    scatter = apart.std(axis=0, ddof=1).tolist() if len(sums) > 1 else [None] * len(chosen)
+    total, single = np.sum(sums, axis=0), np.array([fitted(gram) for gram in sums])
+    values = fitted(total)
+    variance = np.diag(solve(total[np.ix_(chosen, chosen)], np.eye(len(chosen))))
+    scatter = single.std(axis=0, ddof=1).tolist() if len(sums) > 1 else [None] * len(chosen)
     return {
         name: TermEstimate(float(values[i]), float(np.sqrt(max(variance[i], 0.0))), scatter[i], units[name])
         for i, name in enumerate(columns.names[k] for k in chosen)
@@ -199,22 +212,22 @@ def _smallest(balance: VolumeBalance, lessons: Sequence[Mapping[str, Any]], chan
     from scipy.special import ndtri
 
     def findable(repeated: int) -> float:
-        coming = balance.next_rise(lessons, channels, repeated)
-        return float((coming.threshold(FALSE_ALARM_PROBABILITY) + ndtri(_ASKED["power"])) * coming.deviation)
+        rise = balance.next_rise(lessons, channels, repeated)
+        return float((rise.threshold(FALSE_ALARM_PROBABILITY) + ndtri(_ASKED["power"])) * rise.deviation)
 
-    pressure, flow = (float(np.median([own[name] for own in lessons])) for name in ("pressure", "flow"))
-    scale, own = float(np.median([lesson["scale"] for lesson in lessons])), findable(1)
-    halved = next((times for times in _ASKED["repeats"] if findable(times) <= 0.5 * own), None)
-    share = own * pressure / flow if flow > 0.0 else float("nan")
-    return Smallest(own * pressure * scale / LITRE_PER_MINUTE if scale > 0.0 else None, share, halved)
+    pressure, flow = (float(np.median([lesson[name] for lesson in lessons])) for name in ("pressure", "flow"))
+    scale, smallest = float(np.median([lesson["scale"] for lesson in lessons])), findable(1)
+    halved = next((times for times in _ASKED["repeats"] if findable(times) <= 0.5 * smallest), None)
+    share = smallest * pressure / flow if flow > 0.0 else float("nan")
+    return Smallest(smallest * pressure * scale / LITRE_PER_MINUTE if scale > 0.0 else None, share, halved)
 
 
 def _collected(healthy: Sequence[Learnt]) -> list[str]:
-    """Return what looks wrong, each kind of it once, with the file or the number of files."""
+    """Return the problems, each kind once, with the file or the number of files."""
     kinds: dict[str, list[tuple[str, str]]] = {}
-    for own in healthy:
-        for text in own.about.get("wrong", ()):
-            kinds.setdefault(text.partition(":")[0], []).append((text, own.file))
+    for recording in healthy:
+        for text in recording.about.get("wrong", ()):
+            kinds.setdefault(text.partition(":")[0], []).append((text, recording.file))
     return [
         f"{max(kind)[0]} ({kind[0][1] if len(kind) == 1 else f'in {len(kind)} of {len(healthy)}'})"
         for kind in kinds.values()
@@ -222,7 +235,7 @@ def _collected(healthy: Sequence[Learnt]) -> list[str]:
 
 
 def _noise(values: Array) -> float:
-    """Return the standard deviation of white noise by the second differences, without what is far off."""
+    """Estimate the standard deviation of white noise from second differences, without outliers."""
     second = np.diff(values[np.isfinite(values)], 2)
     return _rounded(float(np.median(np.abs(second))) / 0.6745 / np.sqrt(6.0)) if second.size else 0.0
 
@@ -235,7 +248,7 @@ def _below_vacuum(part: Recording, name: str) -> str:
 
 
 def _glitches(part: Recording, name: str) -> str:
-    """Return how many samples jump away and back by far more than all others."""
+    """Report the number of samples that jump away and back by far more than all others."""
     values = part[name]
     if len(values) < 3:
         return ""

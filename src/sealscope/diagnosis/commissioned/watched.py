@@ -24,7 +24,7 @@ _AREAS, _DISPLACEMENT = ("cylinder.A_A", "cylinder.A_B"), "pump.q_b"
 
 @dataclass(frozen=True)
 class WatchedMachine:
-    """What a rig's or a machine's file states of an actuator to be watched.
+    """An actuator to be watched, from a rig's or a machine's file.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class WatchedMachine:
 
 
 def load_watched(rig: str) -> WatchedMachine:
-    """Load a packaged rig, a rig's file or a machine's file as the monitor takes it; InputError as `load_rig`."""
+    """Load a packaged rig, a rig's file or a machine's file for the monitor; InputError as `load_rig`."""
     if not rig.endswith(".toml") or "machine" not in read_toml(Path(rig), "a rig file", rig):
         known = load_rig(rig)
         return WatchedMachine(known, known.channel_map)
@@ -55,18 +55,18 @@ def load_watched(rig: str) -> WatchedMachine:
 
 
 def is_remeasured(rig: Rig, before: Rig) -> bool:
-    """Return whether a rig is that of before, its displacement measured anew from more healthy recordings."""
-    values, others = rig.model_dump(), before.model_dump()
-    for own in (values, others):
-        own.get("pump", {}).pop("q_b", None)
-    return values == others and bool(np.isclose(rig.pump.q_b, before.pump.q_b, rtol=0.05))
+    """Test whether two rigs differ only in the displacement, measured anew from more healthy recordings."""
+    values, values_before = rig.model_dump(), before.model_dump()
+    for tree in (values, values_before):
+        tree.get("pump", {}).pop("q_b", None)
+    return values == values_before and bool(np.isclose(rig.pump.q_b, before.pump.q_b, rtol=0.05))
 
 
 def _with_measured_displacement(rig: Rig, healthy: tuple[Learnt, ...]) -> Rig:
-    """Return a rig of stated areas with the displacement that healthy recordings measured beside them."""
+    """Add the displacement measured by the healthy recordings to a rig of stated areas."""
     if rig.states(_DISPLACEMENT) or not rig.states(*_AREAS):
         return rig
-    lessons = (own.lessons.get(_BALANCE) for own in healthy)
+    lessons = (recording.lessons.get(_BALANCE) for recording in healthy)
     scales = [float(lesson["scale"]) for lesson in lessons if isinstance(lesson, Mapping) and "scale" in lesson]
     measured = [scale for scale in scales if np.isfinite(scale) and scale > 0.0]
     if not measured:

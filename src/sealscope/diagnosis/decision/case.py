@@ -1,4 +1,4 @@
-"""What a decision rests on: the report that judges, what competes, healthy recordings, and the questions asked."""
+"""Grounds of a decision: the judging report, rival explanations, healthy recordings, and the questions."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Question(NamedTuple):
 
 
 class OtherEvent(NamedTuple):
-    """An event that is no leak: name, cause, words, probability, and the rarest observable that shows it."""
+    """An event other than a leak: cause, words, probability, and its rarest observable."""
 
     cause: Cause
     words: str
@@ -50,7 +50,7 @@ class OtherEvent(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DecisionContext:
-    """What a decision is made under.
+    """Conditions of a decision.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ class DecisionContext:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """All that a decision rests on: the report that judges, all observables, the null, and the context."""
+    """Grounds of a decision: the judging report, all observables, the null, and the context."""
 
     judge: Observed
     observables: Sequence[Observable]
@@ -78,7 +78,7 @@ class Case:
 
     @property
     def leak(self) -> LeakMeasure | None:
-        """What the judging provider measures of the leak."""
+        """Leak as measured by the judging provider."""
         return self.judge.leak
 
     @cached_property
@@ -91,7 +91,7 @@ class Case:
         return explain(self.observables, self.null.chance, rise)
 
     def leak_probability(self, alarm: Question) -> float:
-        """Compute the probability of a leak past piston or pump, given that what answers the alarm's question moved.
+        """Compute the probability of a leak past piston or pump, given a change in the data of the alarm's question.
 
         A level above the rig's file is that of a leak unless a change within the recording, which raised it, is none.
         """
@@ -115,19 +115,21 @@ class Case:
 
     @cached_property
     def other_event(self) -> OtherEvent | None:
-        """The event that is no leak and surely explains the rarest change it can; None where none does."""
-        allowed = self.context.false_alarm_probability / max(len({own.data for own in self.observables}), 1)
-        chances = {id(own): self.null.chance(own) for own in self.observables}
-        for observable in sorted(self.observables, key=lambda own: chances[id(own)]):
+        """The event other than a leak that surely explains the rarest change it can; None where none does."""
+        allowed = self.context.false_alarm_probability / max(
+            len({observable.data for observable in self.observables}), 1
+        )
+        chances = {id(observable): self.null.chance(observable) for observable in self.observables}
+        for observable in sorted(self.observables, key=lambda candidate: chances[id(candidate)]):
             if chances[id(observable)] >= allowed:
                 return None
-            moving = [event for event in load_events() if event.does_move(observable)]
-            causes = dict.fromkeys(event.cause for event in moving if event.name not in LEAK_EVENTS)
-            for cause in (own for own in causes if own is not None):
-                sure = probability_of(self.explanations, cause=cause, data=observable.data)
-                if sure > _PRIORS["explanation"]["named"]:
-                    words = max((e for e in moving if e.cause == cause), key=lambda e: e.probability).words
-                    return OtherEvent(cause, words, sure, observable, chances[id(observable)])
+            moving_events = [event for event in load_events() if event.does_move(observable)]
+            causes = dict.fromkeys(event.cause for event in moving_events if event.name not in LEAK_EVENTS)
+            for cause in (named for named in causes if named is not None):
+                certainty = probability_of(self.explanations, cause=cause, data=observable.data)
+                if certainty > _PRIORS["explanation"]["named"]:
+                    words = max((e for e in moving_events if e.cause == cause), key=lambda e: e.probability).words
+                    return OtherEvent(cause, words, certainty, observable, chances[id(observable)])
         return None
 
 
@@ -157,10 +159,10 @@ def step_key(provider: str) -> str:
 
 
 def _change_questions(case: Case) -> tuple[Question, ...]:
-    """Return the question of a provider that measures no leak: whether what a leak moves changed as it does."""
+    """Return the question of a provider that measures no leak: the change of the observables that a leak moves."""
     leak = next(event for event in load_events() if event.name == LEAK_EVENTS[0])
-    moved = [observable for observable in case.judge.observables if leak.does_move(observable)]
-    rarest = min(moved, key=lambda own: own.chance, default=None)
+    moved_observables = [observable for observable in case.judge.observables if leak.does_move(observable)]
+    rarest = min(moved_observables, key=lambda observable: observable.chance, default=None)
     if rarest is None:
         return ()
     allowed, chance = case.context.false_alarm_probability, case.null.chance(rarest)

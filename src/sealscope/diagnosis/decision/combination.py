@@ -27,21 +27,21 @@ def rank(detector: str) -> int:
 
 
 def is_decided(evidence: Evidence) -> bool:
-    """Return whether evidence stands: a verdict, or a change that is seen and not explained."""
+    """Test whether evidence stands: a verdict, or an unexplained change."""
     return evidence.usable and not evidence.abstains
 
 
 def combine(decisions: Sequence[Evidence], context: DecisionContext) -> Evidence:
-    """Choose the decision that stands, with all others beside it as `parts`.
+    """Choose the decision that stands, with all decisions as its `parts`.
 
     A recording that cannot be compared with the healthy ones it was given, or of which a part is missing, is not
     without a leak.
     """
-    ranked = sorted(decisions, key=lambda own: rank(own.detector))
-    usable = [own for own in ranked if own.usable]
-    measuring = any(own.detector in ORDER for own in usable)
-    judging = [own for own in usable if not (measuring and own.detector == RMS_CHANGE)]
-    judge = next((own for own in judging if not own.abstains), None)
+    ranked = sorted(decisions, key=lambda decision: rank(decision.detector))
+    usable = [decision for decision in ranked if decision.usable]
+    measuring = any(decision.detector in ORDER for decision in usable)
+    candidates = [decision for decision in usable if not (measuring and decision.detector == RMS_CHANGE)]
+    judge = next((decision for decision in candidates if not decision.abstains), None)
     if judge is None:
         return _undecided(ranked, usable)
     reasons, doubts = [judge.reason], []
@@ -53,16 +53,16 @@ def combine(decisions: Sequence[Evidence], context: DecisionContext) -> Evidence
         if judge.share < WHOLE:
             doubts.append(text_of("doubt", "rest"))
     verdict = CANNOT_TELL if doubts else judge.verdict
-    others = [own for own in ranked if own is not judge]
-    stated = replace(judge, verdict=verdict, reason="".join([*reasons, *doubts]), parts=(judge, *others))
-    return stated if verdict == LEAK else replace(stated, onset_s=None, onset_interval_s=None)
+    other_parts = [decision for decision in ranked if decision is not judge]
+    decision_made = replace(judge, verdict=verdict, reason="".join([*reasons, *doubts]), parts=(judge, *other_parts))
+    return decision_made if verdict == LEAK else replace(decision_made, onset_s=None, onset_interval_s=None)
 
 
 def _undecided(ranked: Sequence[Evidence], usable: Sequence[Evidence]) -> Evidence:
-    """Say why no detector has a verdict: by the first that could be used, else by the one that needs least."""
+    """State why no detector has a verdict: by the first usable one, else by the one that needs least."""
     if usable:
-        stated = usable[0]
+        decision_made = usable[0]
     else:
-        built_in = [own for own in ranked if own.detector in (*ORDER, RMS_CHANGE)] or list(ranked)
-        stated = Evidence(CANNOT_TELL, built_in[-1].reason if built_in else "there is no detector")
-    return replace(stated, detector="", parts=tuple(ranked), usable=True)
+        built_in = [decision for decision in ranked if decision.detector in (*ORDER, RMS_CHANGE)] or list(ranked)
+        decision_made = Evidence(CANNOT_TELL, built_in[-1].reason if built_in else "there is no detector")
+    return replace(decision_made, detector="", parts=tuple(ranked), usable=True)

@@ -1,4 +1,4 @@
-"""The one decision: what was observed of a recording, and of healthy ones, becomes a verdict.
+"""The one decision: from observations of a recording, and of healthy ones, to a verdict.
 
 `leak` where a question is answered with yes at its share of the false-alarm probability, by the null that healthy
 recordings calibrate, and leaks are the most probable explanation. `no leak` with the 95 % bound of a leak over all
@@ -46,15 +46,15 @@ def decide(judge: Observed, reports: Sequence[Observed], null: HealthyNull, cont
     """
     if judge.lack:
         return Evidence(CANNOT_TELL, judge.lack, detector=judge.provider, usable=False)
-    others = [
+    other_reports = [
         report for report in reports if report is not judge and context.is_weighed and _describes_else(report, judge)
     ]
-    observables = [*judge.observables, *(observable for own in others for observable in own.observables)]
+    observables = [*judge.observables, *(observable for report in other_reports for observable in report.observables)]
     case = Case(judge, observables, null, context)
     least: float = _PRIORS["explanation"]["leak"]
-    shown = next((alarm for alarm in case.alarms if case.leak_probability(alarm) > least), None)
-    if shown is not None:
-        return _leak_evidence(case, shown)
+    leak_alarm = next((alarm for alarm in case.alarms if case.leak_probability(alarm) > least), None)
+    if leak_alarm is not None:
+        return _leak_evidence(case, leak_alarm)
     alarm, leak = next(iter(case.alarms), None), case.leak
     bound = _bound(case, alarm)
     verdict = decide_verdict(False, *_bound_and_worth(case, bound))
@@ -75,17 +75,17 @@ def decide(judge: Observed, reports: Sequence[Observed], null: HealthyNull, cont
 
 
 def _describes_else(report: Observed, judge: Observed) -> bool:
-    """Return whether a report is of other data than those of the judge: two leak measures share their samples."""
+    """Test whether a report rests on other data than the judge's: two leak measures share their samples."""
     return report.leak is None or judge.leak is None
 
 
 def _leak_evidence(case: Case, alarm: Question) -> Evidence:
-    """State a leak with its size, as far as the machine's size is known."""
+    """State a leak, with its size if the machine's size is known."""
     leak, onset = case.leak, None
     cause: Cause = "piston leak"
     if leak is None:
-        shown = min(case.judge.observables, key=lambda own: own.chance)
-        onset, flow = shown.onset, None
+        rarest = min(case.judge.observables, key=lambda observable: observable.chance)
+        onset, flow = rarest.onset, None
     else:
         pump = probability_of(case.explanations, "pump leak")
         tells_pump = any(observable.name == "pump leak" for observable in case.observables) and pump < RAREST
@@ -107,7 +107,7 @@ def _leak_evidence(case: Case, alarm: Question) -> Evidence:
 
 
 def _sizes(leak: LeakMeasure, flow: Flow | None) -> dict[str, Any]:
-    """Return the leak's figures in L/min and beside the pump, or which of them are refused."""
+    """Return the leak's figures in L/min and relative to the pump, or the reason to refuse them."""
     if flow is None:
         return {}
     sizes: dict[str, Any] = {"relative": leak.relative(flow)}
@@ -134,7 +134,7 @@ def _bound(case: Case, alarm: Question | None) -> float:
 
 
 def _bound_and_worth(case: Case, bound: float) -> tuple[float, float]:
-    """Return a bound and the largest one that is worth stating: of the leak's flow, else of the ringing's fall."""
+    """Return a bound and the largest one worth stating: of the leak's flow, else of the ringing's fall."""
     if case.leak is not None:
         return bound, bound_worth_stating(case.leak.pump_flow[1])
     ringing, details = case.judge.ringing, priors("rms_change")
@@ -153,7 +153,7 @@ def _findable(case: Case) -> float | None:
 
 
 def _with_questions(case: Case, evidence: Evidence, judging: Question | None) -> Evidence:
-    """Add score, threshold and chance of the question that judges, and all questions where there are several."""
+    """Add score, threshold and chance of the judging question, and all questions if there are several."""
     evidence = replace(evidence, detector=case.judge.provider, share=case.judge.share)
     if case.leak is not None and case.leak.ratio is not None:
         ratio = case.leak.ratio

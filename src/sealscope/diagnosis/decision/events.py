@@ -1,4 +1,4 @@
-"""The table of events: what may happen, how often, and which observables it moves (`events.toml`)."""
+"""The table of possible events: their frequency, and the observables they move (`events.toml`)."""
 
 from __future__ import annotations
 
@@ -42,15 +42,15 @@ class Event:
 
     @property
     def is_sized(self) -> bool:
-        """Return whether the event has a size that its observables' `advantage` judges; what has no name has none."""
+        """Test whether the event has a size, judged by the `advantage` of its observables; an unnamed one none."""
         return self.cause is not None
 
     def does_move(self, observable: Observable) -> bool:
-        """Return whether an observable shows the event."""
+        """Test whether the event moves an observable."""
         return _matches(observable, self.moves)
 
     def does_disturb(self, observable: Observable) -> bool:
-        """Return whether the event may move an observable as well."""
+        """Test whether the event may move an observable as a side effect."""
         return _matches(observable, self.disturbs)
 
 

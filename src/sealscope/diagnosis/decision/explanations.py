@@ -1,4 +1,4 @@
-"""Which events explain what was observed: sets of at most three, each with its probability.
+"""Explanations of the observations: sets of at most three events, each with its probability.
 
 A set's posterior is the product of its events' probabilities and, for each kind of data, the Bayes factor of the best
 description that an event of the set gives; data that no event of the set moves earn nothing. So noise that steps
@@ -36,7 +36,7 @@ LEAK_EVENTS = ("piston leak", "pump leak")
 
 
 class LeakRise(NamedTuple):
-    """The rise of the leakage beyond healthy recordings, and what a leak that begins within would make of it."""
+    """The rise of the leakage over healthy recordings, and the rise expected of a leak that begins within."""
 
     rise: Rise
     expected: float
@@ -51,7 +51,7 @@ class Explanation:
     data: frozenset[str] = frozenset()
 
     def has(self, *names: str) -> bool:
-        """Return whether one of the events has one of the names."""
+        """Test whether one of the events has one of the names."""
         return any(event.name in names for event in self.events)
 
 
@@ -80,16 +80,16 @@ def explain(
         The most probable first; their probabilities add up to one.
     """
     events = load_events()
-    factors = [(own, log_bayes_factor(chance(own))) for own in observables]
+    factors = [(quantity, log_bayes_factor(chance(quantity))) for quantity in observables]
     misfit: float = 2.0 * priors("decision")["explanation"]["misfit"]
     largest: dict[str, float] = {}
     for observable, factor in factors:
         largest[observable.data] = max(factor, largest.get(observable.data, 0.0))
-    weighted = [(own, factor / (1.0 + misfit * largest[own.data])) for own, factor in factors]
+    weighted = [(quantity, factor / (1.0 + misfit * largest[quantity.data])) for quantity, factor in factors]
     ways = {event.name: _ways_of(event, weighted, rise) for event in events}
-    telling = [event for event in events if max(sum(gains.values()) for gains in ways[event.name]) > LEAST]
+    telling_events = [event for event in events if max(sum(gains.values()) for gains in ways[event.name]) > LEAST]
     groups: list[tuple[Event, ...]] = [(event,) for event in events]
-    groups += [group for size in range(2, MOST + 1) for group in combinations(telling, size)]
+    groups += [group for size in range(2, MOST + 1) for group in combinations(telling_events, size)]
     moved = {
         name: frozenset(kind for gains in rows for kind, gain in gains.items() if gain > 0.0)
         for name, rows in ways.items()
@@ -117,18 +117,22 @@ def _logarithm(group: Sequence[Event], ways: Mapping[str, Sequence[_Gains]]) -> 
 
 
 def _ways_of(event: Event, weighted: Sequence[tuple[Observable, float]], rise: LeakRise | None) -> Sequence[_Gains]:
-    """Return the ways in which an event happens: at the onset that explains most, and for a leak from the start."""
-    moved = [(own, gain) for own, gain in weighted if event.does_move(own)]
+    """Return the ways an event happens: at the onset that explains most, and for a leak from the start."""
+    moved = [(observable, gain) for observable, gain in weighted if event.does_move(observable)]
     gains: dict[str, float] = {}
     if moved:
         anchor = max(moved, key=lambda pair: pair[1])[0]
         # an event explains what it disturbs only once other data show it
-        shown = {observable.data for observable, gain in moved if gain > LEAST}
-        disturbed = [pair for pair in weighted if shown and pair[0].data not in shown and event.does_disturb(pair[0])]
-        for own, gain in moved + disturbed:
-            if _coincide(own, anchor):
-                sized = gain + (0.5 * own.advantage if event.is_sized else 0.0)
-                gains[own.data] = max(sized, gains.get(own.data, 0.0))
+        explained_data = {observable.data for observable, gain in moved if gain > LEAST}
+        disturbed = [
+            pair
+            for pair in weighted
+            if explained_data and pair[0].data not in explained_data and event.does_disturb(pair[0])
+        ]
+        for observable, gain in moved + disturbed:
+            if _coincide(observable, anchor):
+                size_gain = gain + (0.5 * observable.advantage if event.is_sized else 0.0)
+                gains[observable.data] = max(size_gain, gains.get(observable.data, 0.0))
     ways: list[_Gains] = [gains]
     if rise is not None and event.name in LEAK_EVENTS:
         if gains.get("volumes", 0.0) > 0.0:
@@ -146,7 +150,7 @@ def log_bayes_factor(chance: float) -> float:
 
 
 def _coincide(observable: Observable, anchor: Observable) -> bool:
-    """Return whether two observables may have changed at the same time."""
+    """Test whether two observables may have changed at the same time."""
     if observable.onset is None or anchor.onset is None:
         return True
     reach = 0.5 * (observable.onset.high - observable.onset.low + anchor.onset.high - anchor.onset.low)
@@ -160,11 +164,11 @@ def probability_of(
 
     `data`: given that something happened that moves this kind of data; the chance under the null says whether it did.
     """
-    asked = [explanation for explanation in explanations if data is None or data in explanation.data]
-    total = sum(own.probability for own in asked)
-    held = sum(
-        own.probability
-        for own in asked
-        if own.has(*names) or (cause is not None and any(event.cause == cause for event in own.events))
+    relevant = [explanation for explanation in explanations if data is None or data in explanation.data]
+    total = sum(explanation.probability for explanation in relevant)
+    matching = sum(
+        explanation.probability
+        for explanation in relevant
+        if explanation.has(*names) or (cause is not None and any(event.cause == cause for event in explanation.events))
     )
-    return float(held / total) if total > 0.0 else 0.0
+    return float(matching / total) if total > 0.0 else 0.0

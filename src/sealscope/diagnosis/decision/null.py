@@ -35,12 +35,12 @@ class HealthyNull:
     rarities: Mapping[str, Sequence[float]] = field(default_factory=dict)
 
     def chance(self, observable: Observable) -> float:
-        """Compute the predictive probability that a healthy recording shows an observable as rare."""
+        """Compute the predictive probability of an observable at least as rare in a healthy recording."""
         weights, inflations = self._inflation(key_of(observable))
         return float(weights @ np.exp(-observable.rarity / inflations))
 
     def inflate(self, key: str, chance: float) -> float:
-        """Compute the predictive probability of what a law gives a chance."""
+        """Compute the predictive probability of an event from its chance by the law."""
         weights, inflations = self._inflation(key)
         return float(weights @ np.exp(np.log(max(chance, np.finfo(float).tiny)) / inflations))
 
@@ -54,17 +54,17 @@ class HealthyNull:
         return float(np.exp(-brentq(lambda u: self.inflate(key, np.exp(-u)) - chance, 0.0, low)))
 
     def _inflation(self, key: str) -> tuple[Array, Array]:
-        if key not in self._known:
-            self._known[key] = _posterior(self.rarities.get(key, ()))
-        return self._known[key]
+        if key not in self._posteriors:
+            self._posteriors[key] = _posterior(self.rarities.get(key, ()))
+        return self._posteriors[key]
 
     @cached_property
-    def _known(self) -> dict[str, tuple[Array, Array]]:
+    def _posteriors(self) -> dict[str, tuple[Array, Array]]:
         return {}
 
 
 def _posterior(rarities: Sequence[float]) -> tuple[Array, Array]:
-    """Compute weights and values (NODES + 1,) of the inflation, first that of the law as it stands."""
+    """Compute weights and values (NODES + 1,) of the inflation, first that of the unchanged law."""
     believed = priors("decision")["null"]
     if not len(rarities):
         return np.ones(1), np.ones(1)
@@ -79,5 +79,5 @@ def _posterior(rarities: Sequence[float]) -> tuple[Array, Array]:
 
 
 def key_of(observable: Observable) -> str:
-    """Return the name under which an observable's rarities are stored; those against others share one."""
+    """Return the name that stores an observable's rarities; comparisons with other recordings share one."""
     return f"{observable.data}: {observable.name}" if observable.onset is not None else f"{observable.data}: against"

@@ -1,4 +1,4 @@
-"""Why a verdict is what it is, in one line: keys and values of `decide`, filled in from `texts.toml`."""
+"""The reason of a verdict, in one line: keys and values of `decide`, filled in from `texts.toml`."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ def _leak_text(case: Case, evidence: Evidence, alarm: Question | None) -> str:
     )
     total = evidence.total_leakage
     if case.leak is None:
-        shown = min(case.judge.observables, key=lambda own: own.chance)
-        if shown.data == "plug-in":
+        rarest = min(case.judge.observables, key=lambda observable: observable.chance)
+        if rarest.data == "plug-in":
             return text_of("leak", "plug_in", provider=case.judge.provider)
-        percent = 100.0 * abs(np.expm1(shown.size))
-        where = _onset_text(shown) or _against_text(case.judge.ringing)
-        return text_of("leak", "details", what=f"RMS: {shown.name}", percent=percent, where=where)
+        percent = 100.0 * abs(np.expm1(rarest.size))
+        where = _onset_text(rarest) or _against_text(case.judge.ringing)
+        return text_of("leak", "details", what=f"RMS: {rarest.name}", percent=percent, where=where)
     if key == "level" and total is not None and total.lpm is not None and total.healthy_lpm is not None:
         return text_of("leak", "level_flow", lpm=total.lpm, healthy=total.healthy_lpm)
     if key != "level" and case.leak.provider == "pressure response":
@@ -54,7 +54,7 @@ def _leak_text(case: Case, evidence: Evidence, alarm: Question | None) -> str:
 
 
 def _bound_text(case: Case, evidence: Evidence, bound: float) -> str:
-    """Return the bound in words, and what would make it closer."""
+    """Describe the bound in words, and the way to a closer one."""
     leak, ringing = case.leak, case.judge.ringing
     if leak is None:
         if case.alarms and ringing is not None:
@@ -87,12 +87,12 @@ def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) ->
 
 
 def _changed_ringing_text(case: Case, ringing: Ringing) -> str:
-    """Return how the ringing changed, and how probable a leak is that changed it."""
-    shown = min(case.judge.observables, key=lambda own: own.chance)
-    percent = 100.0 * abs(np.expm1(shown.size))
-    where = _onset_text(shown) or _against_text(ringing)
+    """Describe the change of the ringing, and the probability of a leak behind it."""
+    rarest = min(case.judge.observables, key=lambda observable: observable.chance)
+    percent = 100.0 * abs(np.expm1(rarest.size))
+    where = _onset_text(rarest) or _against_text(ringing)
     leak = 100.0 * case.leak_probability(case.alarms[0])
-    return text_of("bound", "ringing_changed", what=shown.name, percent=percent, where=where, leak=leak)
+    return text_of("bound", "ringing_changed", what=rarest.name, percent=percent, where=where, leak=leak)
 
 
 def _against_text(ringing: Ringing | None) -> str:
@@ -103,7 +103,7 @@ def _against_text(ringing: Ringing | None) -> str:
 
 
 def _rivals_text(case: Case, alarm: Question) -> str:
-    """Return which explanation competes with a leak, and the recording that would separate them."""
+    """Name the explanation that competes with a leak, and the recording that would separate them."""
     leak = case.leak_probability(alarm)
     best = next((explanation for explanation in case.explanations if not explanation.has(*LEAK_EVENTS)), None)
     if best is None:
@@ -112,13 +112,13 @@ def _rivals_text(case: Case, alarm: Question) -> str:
     if event.cause is None:
         onset = None if case.leak is None or case.leak.step is None else case.leak.step.onset()
         return "" if onset is None else text_of("doubt", "regime", seconds=onset.value)
-    shown = max(
+    highest = max(
         (observable for observable in case.observables if event.does_move(observable)),
-        key=lambda own: own.score,
+        key=lambda observable: observable.score,
         default=None,
     )
     separates = text_of("separates", event.cause if has_text("separates", event.cause) else "default")
-    onset_text = "" if shown is None else _onset_text(shown)
+    onset_text = "" if highest is None else _onset_text(highest)
     share = 100.0 * (1.0 - leak)
     return text_of(
         "doubt", "rivals", words=event.words, onset=onset_text, share=share, leak=100.0 * leak, separates=separates
@@ -130,7 +130,7 @@ def _onset_text(observable: Observable) -> str:
 
 
 def _shown_text(other: OtherEvent) -> str:
-    """Return what shows an event, where its words do not."""
+    """Name the observable of an event, unless its words do."""
     name = other.observable.name
     return "" if name in other.words else text_of("doubt", "shown", name=name)
 

@@ -20,5 +20,5 @@ def text_of(table: str, key: str, **values: Any) -> str:
 
 
 def has_text(table: str, key: str) -> bool:
-    """Return whether a table holds a key."""
+    """Test whether a table holds a key."""
     return key in _texts()[table]

@@ -33,6 +33,6 @@ def decide_verdict(is_leak: bool, bound: float, worth: float) -> Verdict:
 
 
 def bound_worth_stating(flow: float) -> float:
-    """Return the largest bound that is worth stating beside a pump's flow, in its unit."""
+    """Return the largest bound worth stating for a pump's flow, in the flow's unit."""
     share: float = priors("decision")["worth"]["share"]
     return share * flow if flow > 0.0 else 0.0

@@ -1,4 +1,4 @@
-"""The detector protocol, and the checks of what a detector returns."""
+"""The detector protocol, and the checks of a detector's report."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ class Detector(Protocol):
     name: str
 
     def usable(self, recording: Recording) -> str | None:
-        """Return None when the recording has what the detector needs, else the reason why not, in one line."""
+        """Return None if the detector can use the recording, else the reason why not, in one line."""
         ...
 
     def observe(self, recording: Recording, baseline: Sequence[Any] = ()) -> Observed:
-        """Return what the detector observes of a recording that is `usable`: numbers, no verdict.
+        """Return the detector's observations of a `usable` recording: numbers, no verdict.
 
         `baseline`: leak-free recordings of the same machine, at any duty, no two of them copies; where
         there is none, changes within the recording are looked for.
@@ -52,7 +52,7 @@ Factory = Callable[["Rig"], Detector]
 
 
 def unusable(detector: Detector, recording: Recording) -> str | None:
-    """Return in one line why a detector cannot use a recording, None where it can."""
+    """Return the reason, in one line, why a detector cannot use a recording, None where it can."""
     reason: Any = detector.usable(recording)
     if reason is None:
         return None
@@ -83,7 +83,7 @@ def make_observable(
 
 
 def checked(report: Any, name: str) -> Observed:
-    """Return what a detector's `observe` gave, or raise TypeError or ValueError where it is no valid report."""
+    """Return the report of a detector's `observe`; raise TypeError or ValueError where it is not valid."""
     if isinstance(report, Observable):
         report = Observed(name, (report,))
     if not isinstance(report, Observed):
@@ -109,9 +109,9 @@ def failure(name: str, distribution: str | None, error: Exception) -> str:
     if distribution is None and isinstance(error, ArithmeticError | np.linalg.LinAlgError):
         _log.debug("%s cannot be computed", name, exc_info=True)
         return f"{name} cannot be computed on this recording: {' '.join(str(error).split()).lower()}"
-    of = f" of {distribution}" if distribution else ""
+    source = f" of {distribution}" if distribution else ""
     what = " ".join(f"{type(error).__name__}: {error}".split()).rstrip(": ")
-    line = f"detector {name!r}{of} is left out: {what}"
+    line = f"detector {name!r}{source} is left out: {what}"
     _log_once(line)
     return line
 

@@ -1,4 +1,4 @@
-"""Run detectors on a recording: what each observes, why it cannot, and what healthy recordings show of the same."""
+"""Run detectors on a recording: observations, reasons for none, and the same for healthy recordings."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def _rarities_in(reports: Sequence[Observed]) -> dict[str, float]:
 
 
 def null_of(baseline: Sequence[Healthy], rig: Rig | str | os.PathLike[str], *, shut: bool = False) -> HealthyNull:
-    """Collect what healthy recordings show of every observable; `shut`: by a balance whose pump is cut off at rest."""
+    """Collect the rarities of every observable in healthy recordings; `shut`: the pump is cut off at rest."""
     known = defaultdict[str, list[float]](list)
     for healthy in baseline:
         rarities = healthy.statistics if isinstance(healthy, Learnt) else rarities_of(healthy, rig)
@@ -131,9 +131,13 @@ def null_of(baseline: Sequence[Healthy], rig: Rig | str | os.PathLike[str], *, s
 
 
 def compare_healthy(baseline: Sequence[Healthy]) -> Iterator[Sequence[Observable]]:
-    """Yield what each healthy recording's ringing shows against all others."""
+    """Yield the comparison of each healthy recording's ringing with all others."""
     detector = RmsChange()
     lessons = lessons_of(detector, [healthy for healthy in baseline if _unusable(detector, healthy) is None])
-    alike = [own for own in lessons if own["chambers"] == lessons[0]["chambers"] and own["rate"] == lessons[0]["rate"]]
-    for k, lesson in enumerate(alike if len(alike) > FEWEST else ()):
-        yield compare_lessons(lesson, alike[:k] + alike[k + 1 :], lesson["chambers"])[0]
+    comparable = [
+        lesson
+        for lesson in lessons
+        if lesson["chambers"] == lessons[0]["chambers"] and lesson["rate"] == lessons[0]["rate"]
+    ]
+    for k, lesson in enumerate(comparable if len(comparable) > FEWEST else ()):
+        yield compare_lessons(lesson, comparable[:k] + comparable[k + 1 :], lesson["chambers"])[0]

@@ -44,7 +44,7 @@ class PlugIn:
 
     @property
     def fingerprint(self) -> str:
-        """A hash of the source file that it comes from, so that its results are not taken for another version's."""
+        """Hash of the source file, to tell its results from another version's."""
         source = getattr(sys.modules.get(getattr(self.make, "__module__", "")), "__file__", None)
         try:
             return sha256(Path(source).read_bytes()).hexdigest()[:16] if source else "unknown"
@@ -52,16 +52,16 @@ class PlugIn:
             return "unknown"
 
 
-def _made(module: str, name: str, rig: Rig) -> Detector:
+def _make_detector(module: str, name: str, rig: Rig) -> Detector:
     detector: Detector = getattr(import_module(f"sealscope.diagnosis.{module}"), name)(rig)
     return detector
 
 
 #: The built-in detectors by name, loaded when first made; one contract test runs them all.
 DETECTORS: dict[str, Factory] = {
-    "volume balance": partial(_made, "inference.volumes.detector", "VolumeBalance"),
-    "pressure response": partial(_made, "inference.pressures.detector", "PressureResponse"),
-    "rms change": partial(_made, "rms_change.detector", "RmsChange"),
+    "volume balance": partial(_make_detector, "inference.volumes.detector", "VolumeBalance"),
+    "pressure response": partial(_make_detector, "inference.pressures.detector", "PressureResponse"),
+    "rms change": partial(_make_detector, "rms_change.detector", "RmsChange"),
 }
 
 
@@ -71,19 +71,19 @@ def detectors() -> Mapping[str, Factory]:
 
 
 @cache
-def plug_ins(taken: frozenset[str]) -> Mapping[str, PlugIn]:
+def plug_ins(used: frozenset[str]) -> Mapping[str, PlugIn]:
     """Return the detectors of installed distributions, in the order of their names.
 
-    One that cannot be loaded, or whose name is `taken` by a built-in detector, by another plug-in or by a reserved
+    One that cannot be loaded, or whose name is `used` by a built-in detector, by another plug-in or by a reserved
     word, is left out with one line that names its distribution. Looked for once in a process.
     """
-    known: dict[str, PlugIn] = {}
+    found_plug_ins: dict[str, PlugIn] = {}
     for point in sorted(entry_points(group=GROUP), key=lambda point: (point.name, point.value)):
         distribution = point.dist.name if point.dist is not None else point.value
         try:
-            if point.name in known:
-                raise ValueError(f"its name is that of a detector of {known[point.name].distribution}")
-            if point.name in taken or point.name in _RESERVED:
+            if point.name in found_plug_ins:
+                raise ValueError(f"its name is that of a detector of {found_plug_ins[point.name].distribution}")
+            if point.name in used or point.name in _RESERVED:
                 raise ValueError("its name is taken by Sealscope itself")
             if any(mark in point.name for mark in (" @ ", ",", "\n")) or not point.name.strip():
                 raise ValueError("its name must be plain words without ',' and '@'")
@@ -93,5 +93,5 @@ def plug_ins(taken: frozenset[str]) -> Mapping[str, PlugIn]:
         except Exception as error:
             failure(point.name, distribution, error)
             continue
-        known[point.name] = PlugIn(point.name, distribution, make)
-    return known
+        found_plug_ins[point.name] = PlugIn(point.name, distribution, make)
+    return found_plug_ins

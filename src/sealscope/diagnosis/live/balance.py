@@ -1,4 +1,4 @@
-"""The volume balance of a running machine: what each block says of the leakage conductance.
+"""The volume balance of a running machine: the leakage conductance of each block.
 
 The sums are those of a recording (`balance.BlockStream`). All coefficients but the leak's are what the last blocks say
 of them (`known`). What passes the pump beside the piston is part of the conductance: piston and pump lie in parallel.
@@ -41,7 +41,7 @@ WAKES: int = _PRIORS["wakes"]
 
 @dataclass(frozen=True)
 class BlockConductance:
-    """What a block shows of the machine.
+    """State of the machine in one block.
 
     `begin`, `end`: of its samples [s]; `g`, `sd`: conductance of what passes pump and piston, and its deviation
     [m^3/(s Pa)], of a series that does not move as the other coefficients become known; `total`: as these are known
@@ -60,7 +60,7 @@ class BlockConductance:
 
 
 class NotJudged(NamedTuple):
-    """Why a block that ends at the clock `end` [s] shows nothing: its status, and under what it is counted.
+    """Reason why the block up to the clock `end` [s] has no estimate: its status and counter.
 
     `apart`: what comes after it is compared with nothing before it.
     """
@@ -76,7 +76,7 @@ Shown = Sequence[BlockConductance] | NotJudged
 
 
 @kernel
-def _learns(known: Known, grams: Any, place: Any, rows: Any) -> None:
+def _learn_blocks(known: Known, grams: Any, place: Any, rows: Any) -> None:
     for k in range(len(grams)):
         take(known, grams[k], place)
         add(known, rows[k], 1.0, False)
@@ -84,7 +84,7 @@ def _learns(known: Known, grams: Any, place: Any, rows: Any) -> None:
 
 
 @kernel
-def _says(known: Known, gram: Any, place: Any, rows: float, adds: bool) -> tuple[float, float, float, float]:
+def _solve_block(known: Known, gram: Any, place: Any, rows: float, adds: bool) -> tuple[float, float, float, float]:
     take(known, gram, place)
     return says(known, rows, adds)  # type: ignore[no-any-return]
 
@@ -116,9 +116,9 @@ class LiveBalance:
         self.litres = self.states_flow(rig) if litres is None else litres
         self._places, self._known = [], []
         for columns in map(Columns, self._balances):
-            others = [k for k in columns.nuisance if k != columns.leak]
-            self._places.append(np.array([*others, columns.leak, columns.left]))
-            self._known.append(Known(*(np.zeros(shape) for shape in known_shapes(len(others)))))
+            nuisances = [k for k in columns.nuisance if k != columns.leak]
+            self._places.append(np.array([*nuisances, columns.leak, columns.left]))
+            self._known.append(Known(*(np.zeros(shape) for shape in known_shapes(len(nuisances)))))
         self._precision, self._woken = 0.0, 0  # of the usual block; blocks that moved as never before
         self._waiting: Blocks | None = None
         self._stream: BlockStream | None = None
@@ -126,32 +126,32 @@ class LiveBalance:
 
     @staticmethod
     def states_flow(rig: Rig) -> bool:
-        """Return whether a rig states what turns the balance into L/min."""
+        """Test whether a rig states the sizes needed for a leak in L/min."""
         return rig.states(*(("cylinder.A_A", "cylinder.A_B") if _valved(rig) else ("pump.q_b",)))
 
     def take(self, run: SampleRun) -> list[Shown]:
-        """Take the next samples; return what each block says that they complete.
+        """Take the next samples; return the result of each block they complete.
 
         The first blocks say nothing until there are `LEARNED`; the last of these says what all of them do. After a gap
         the balance goes on with what it knew; what lay before the gap and fills no block is dropped.
         """
-        shown: list[Shown] = []
+        results: list[Shown] = []
         stream = self._stream
         if stream is None or not run.follows:
             if stream is not None:
-                shown += self._said(stream.push({}, last=True))
+                results += self._take_blocks(stream.push({}, last=True))
             if stream is None or run.rate != self._rate:
                 fresh, self._rate = BlockStream(self._balances, run.rate, BLOCK_SECONDS), run.rate
                 if stream is not None:
                     fresh.recall({**stream.state(), "samples": {}, "first": 0, "done": 0})
                 self._stream = stream = fresh
             stream.restart(float(run.t[0]))
-        return shown + self._said(stream.push({name: run.channels[name] for name in self.names}))
+        return results + self._take_blocks(stream.push({name: run.channels[name] for name in self.names}))
 
-    def _said(self, blocks: Blocks | None) -> list[Shown]:
-        return [] if blocks is None else [self._taken(block) for block in _parts(blocks)]
+    def _take_blocks(self, blocks: Blocks | None) -> list[Shown]:
+        return [] if blocks is None else [self._take_block(block) for block in _parts(blocks)]
 
-    def _taken(self, block: Blocks) -> Shown:
+    def _take_block(self, block: Blocks) -> Shown:
         end, rows = float(block.end[0]) + 0.5 * stride_samples(self._rate) / self._rate, float(block.rows[0])
         if not rows:
             return NotJudged(end, "missing values", "blocks: missing values")
@@ -160,8 +160,8 @@ class LiveBalance:
             if self._woken >= WAKES:
                 self.relearn()
                 return NotJudged(end, "learning", "blocks: moves as never before", True)
-            shown = self._shown(block)
-            return shown if isinstance(shown, NotJudged) else [shown]
+            result = self._estimate_block(block)
+            return result if isinstance(result, NotJudged) else [result]
         if not block.gram[0, 0, -1, -1] > 0.0 and self._waiting is None:
             return NotJudged(end, "at standstill", "blocks: at standstill")
         self._waiting = block if self._waiting is None else Blocks.join([self._waiting, block])
@@ -169,31 +169,34 @@ class LiveBalance:
             return NotJudged(end, "learning")
         waiting, self._waiting = self._waiting, None
         for e, (known, place) in enumerate(zip(self._known, self._places, strict=True)):
-            _learns(known, np.ascontiguousarray(waiting.gram[:, e]), place, waiting.rows)
-        self._precision = float(np.median([self._says(part, adds=False)[0] for part in _parts(waiting)]))
-        parts = [self._shown(part, adds=False) for part in _parts(waiting)]
+            _learn_blocks(known, np.ascontiguousarray(waiting.gram[:, e]), place, waiting.rows)
+        self._precision = float(np.median([self._solve_block(part, adds=False)[0] for part in _parts(waiting)]))
+        parts = [self._estimate_block(part, adds=False) for part in _parts(waiting)]
         return [part for part in parts if not isinstance(part, NotJudged)] or NotJudged(end, "at standstill")
 
     def _moves(self, block: Blocks) -> float:
         """Return the motion of a block over the usual one."""
         return motion(float(block.gram[0, 0, -1, -1]), float(block.rows[0]), self._known[0].numbers)
 
-    def _says(self, block: Blocks, adds: bool = True) -> tuple[float, ...]:
-        """Return what a block says by all equations (`says`); with `adds` it is one of those known from now on."""
-        rows, each = float(block.rows[0]), zip(self._known, block.gram[0], self._places, strict=True)
-        said = [_says(known, gram, place, rows, adds) for known, gram, place in each]
-        return tuple(sum(values) for values in zip(*said, strict=True))
+    def _solve_block(self, block: Blocks, adds: bool = True) -> tuple[float, ...]:
+        """Sum the answers of all equations on a block (`says`).
 
-    def _shown(self, block: Blocks, adds: bool = True) -> BlockConductance | NotJudged:
+        With `adds` the block is one of those known from now on.
+        """
+        rows, equation_parts = float(block.rows[0]), zip(self._known, block.gram[0], self._places, strict=True)
+        answers = [_solve_block(known, gram, place, rows, adds) for known, gram, place in equation_parts]
+        return tuple(sum(values) for values in zip(*answers, strict=True))
+
+    def _estimate_block(self, block: Blocks, adds: bool = True) -> BlockConductance | NotJudged:
         half = 0.5 * stride_samples(self._rate) / self._rate
         begin, end = float(block.start[0]) - half, float(block.end[0]) + half
         at_standstill = self._moves(block) < STANDSTILL
-        precision, lead, shift, leaning = self._says(block, adds)
+        precision, lead, shift, leaning = self._solve_block(block, adds)
         if not precision > (TELLS * self._precision if at_standstill else 0.0):
             return NotJudged(end, "at standstill", "blocks: at standstill")
         total = lead / precision
         offset = math.hypot(math.sqrt(leaning) / precision, self.size_error * lead / precision)
-        pressure, rate = (max(float(of[0]), TINY) for of in (block.driving(), block.flow))
+        pressure, rate = (max(float(size[0]), TINY) for size in (block.driving(), block.flow))
         duty = math.log(pressure), math.log(rate)
         g, sd = total - shift / precision, precision**-0.5
         return BlockConductance(begin, end, g, sd, total, offset, pressure / LITRE_PER_MINUTE, duty)
@@ -206,7 +209,7 @@ class LiveBalance:
         self._precision, self._woken, self._waiting = 0.0, 0, None
 
     def state(self) -> dict[str, Any]:
-        """Return all of it as plain values that JSON holds."""
+        """Return the state as plain values for JSON."""
         waiting, stream = self._waiting, self._stream
         return {
             **saved(self, _SAVED),
@@ -245,14 +248,17 @@ def _valved(rig: Rig) -> bool:
 
 
 def size_error(rig: Rig) -> float:
-    """Return how far a flow by the rig's size is known, relative."""
+    """Return the relative error of a flow computed from the rig's size."""
     return float(priors("inference")["size"]["area" if _valved(rig) else "displacement"])
 
 
 def live_equations(rig: Rig, names: Sequence[str]) -> list[Equation]:
-    """Return a machine's balances with the terms that have a column: none has what is zero or lies beside the leak."""
+    """Return a machine's balances with the terms that have a column.
+
+    A term that is zero, or parallel to the leak, has none.
+    """
     balances = [equation for equation in equations(rig, frozenset(names)) if not equation.by_command]
     nuisances = [
         tuple(term for term in balance.terms if term.nuisance and term.name != "pump leak") for balance in balances
     ]
-    return [own._replace(terms=terms) for own, terms in zip(balances, nuisances, strict=True)]
+    return [balance._replace(terms=terms) for balance, terms in zip(balances, nuisances, strict=True)]

@@ -18,7 +18,7 @@ Duty = tuple[float, float]
 
 @dataclass(frozen=True)
 class BlockEstimate:
-    """What one block shows.
+    """Estimate of one block.
 
     `number`: blocks so far, with this one; `t`: its end [s]; `status`: "learning", "watched", "alarm", or why it is not
     judged ("at standstill", "missing values", ...); `total_lpm`: flow past pump and piston together, `leak_lpm`: beyond
@@ -36,7 +36,7 @@ class BlockEstimate:
 
     @property
     def judged(self) -> bool:
-        """Whether the block was compared with the machine before it."""
+        """True if the block was compared with the machine before it."""
         return self.status in ("learning", "watched", "alarm")
 
 
@@ -65,7 +65,7 @@ class WatchedLeak:
 
     @property
     def rarity(self) -> float:
-        """How much rarer than at the stated rate a healthy machine shows such a score, as a share of 1e-9 to 1.
+        """Share of the stated false-alarm rate at which a healthy machine shows such a score, from 1e-9 to 1.
 
         For a level by the normal tail; for a step half the score is the logarithm of an e-value (`sequential`).
         """
@@ -99,8 +99,10 @@ class WatchBaseline:
     duty_low: Duty
     duty_high: Duty
 
-    def rise(self, at: float, g: float, deviation: float, probability: float) -> StepEstimate | None:
-        """Return the rise where a mean conductance is over what warm oil makes of the baseline's least; None where not.
+    def rise(self, now: float, g: float, deviation: float, probability: float) -> StepEstimate | None:
+        """Estimate the rise of a mean conductance that warm oil cannot explain; None where there is none.
+
+        The ceiling is the least conductance of the baseline with the warmest oil.
 
         `deviation`: of `g`; `probability`: of a look at a healthy machine as warm as that.
         """
@@ -119,21 +121,21 @@ class WatchBaseline:
         healthy = max(self.level - self.low, ceiling - self.level, 0.0) / WITHIN_95
         size = g - max(self.level, 0.0)
         return StepEstimate(
-            score, (at, self.learned_s, at), size, math.hypot(deviation, healthy), "level", threshold, reason
+            score, (now, self.learned_s, now), size, math.hypot(deviation, healthy), "level", threshold, reason
         )
 
 
 def within(duty: Duty, low: Duty, high: Duty) -> bool:
-    """Return whether a duty lies between two others, give or take; a leak may take more of the pressure."""
+    """Test whether a duty lies between two others, within a margin; a leak may take more of the pressure."""
     believed = priors("live")["watch"]
     margin = believed["margin"]
     below = (low[0] - believed["damped"], low[1] - margin)
-    return all(least <= own <= most + margin for own, least, most in zip(duty, below, high, strict=True))
+    return all(least <= value <= most + margin for value, least, most in zip(duty, below, high, strict=True))
 
 
 @dataclass
 class BaselineLearning:
-    """Sums of the baseline that is being learned; what no block has shown yet is None."""
+    """Sums of the baseline during learning; None where no block gave a value yet."""
 
     blocks: int = 0
     total: float = 0.0
@@ -145,7 +147,7 @@ class BaselineLearning:
     group: list[float] = field(default_factory=list)
 
     def add(self, g: float, flow: float, duty: Duty, group: int) -> None:
-        """Take a block's conductance, flow of a unit of it [L/min] and duty; means are of `group` blocks."""
+        """Add a block's conductance, flow of a unit of it [L/min] and duty; means are of `group` blocks."""
         self.blocks += 1
         self.total += g
         self.flow += flow
@@ -158,11 +160,11 @@ class BaselineLearning:
             self.low = mean if self.low is None else min(self.low, mean)
             self.high, self.group = mean if self.high is None else max(self.high, mean), []
 
-    def frozen(self, version: int, at: float, hours: float, litres: bool) -> WatchBaseline:
+    def frozen(self, version: int, end: float, hours: float, litres: bool) -> WatchBaseline:
         """Return the baseline of one block or more."""
         assert self.duty_low is not None and self.duty_high is not None
         level = self.total / self.blocks
         low = min(self.group) if self.low is None else self.low  # shorter than one group
         high = max(self.group) if self.high is None else self.high
         lpm = level * self.flow / self.blocks if litres else None
-        return WatchBaseline(version, at, hours, level, low, high, lpm, self.duty_low, self.duty_high)
+        return WatchBaseline(version, end, hours, level, low, high, lpm, self.duty_low, self.duty_high)

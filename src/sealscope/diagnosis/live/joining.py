@@ -29,7 +29,7 @@ _CLOCKS: float = _PRIORS["rate"]
 
 
 def ways_to_watch(rig: Rig) -> tuple[tuple[str, ...], ...]:
-    """Return the sets of channels by any of which an actuator is watched, the best first.
+    """Return the sets of channels that suffice to watch an actuator, the best first.
 
     A balance of volumes reads the position; the response of the pressures needs none, but a cylinder of like areas.
     """
@@ -40,22 +40,22 @@ def ways_to_watch(rig: Rig) -> tuple[tuple[str, ...], ...]:
 
 
 def in_words(ways: Sequence[Sequence[str]]) -> str:
-    """Return what `ways_to_watch` gives, as a line names it."""
+    """Format the sets of channels of `ways_to_watch` for a message."""
     return ", or ".join(f"{', '.join(way[:-1])} and {way[-1]}" for way in ways)
 
 
 def follow(steps: Any, rate: float) -> Any:
-    """Return whether samples that are `steps` [s] apart follow each other: nearer ones are copies."""
+    """Test whether samples `steps` [s] apart follow each other; nearer ones are copies."""
     return (steps * rate > _NEAREST) & (steps * rate < _FARTHEST)
 
 
 def same_rate(rate: float, before: float) -> bool:
-    """Return whether two sampling rates [Hz] are the same, as far as clocks tell."""
+    """Test whether two sampling rates [Hz] agree within the error of clocks."""
     return abs(rate / before - 1.0) < _CLOCKS
 
 
 class SampleRun(NamedTuple):
-    """Samples without a hole: times `t` [s], `channels`, sampling `rate` [Hz], and whether they follow those before."""
+    """Samples without a hole: times `t` [s], `channels`, sampling `rate` [Hz]; `follows`: no gap before them."""
 
     t: Array
     channels: Mapping[str, Array]
@@ -108,7 +108,7 @@ class SampleJoiner:
             self.changed = False
 
     def _fits(self, samples: Recording) -> bool:
-        """Return whether the samples have the stream's channels and SI units; count them where they do not."""
+        """Test whether the samples have the stream's channels and SI units; count them otherwise."""
         names, offered = self.names, next((way for way in self.ways if samples.channels.keys() >= {*way}), ())
         if not names or ("x" in offered and "x" not in names and not self.settled):
             names = offered
@@ -117,8 +117,8 @@ class SampleJoiner:
             reason = f"samples without {in_words(self.ways)}"
         elif wrong:
             missing = [name for name in wrong if name not in samples]
-            of = f" of {wrong[0]} not in {CHANNEL_UNITS[wrong[0]]}"
-            reason = f"samples without {missing[0]}" if missing else f"samples{of}"
+            wrong_unit = f" of {wrong[0]} not in {CHANNEL_UNITS[wrong[0]]}"
+            reason = f"samples without {missing[0]}" if missing else f"samples{wrong_unit}"
         elif not 10.0 <= samples.rate <= 1e5:  # a reversal is not resolved, or a block holds too many samples
             reason = "samples at a rate outside 10 to 100000 Hz"
         else:
@@ -155,7 +155,7 @@ class SampleJoiner:
             known = known[run:]
 
     def state(self) -> dict[str, Any]:
-        """Return all of it as plain values."""
+        """Return the state as plain values."""
         return saved(self, _SAVED)
 
     def recall(self, state: Any) -> None:
@@ -169,5 +169,5 @@ _SAVED = ("settled", "names", "rate", "newest", "changed", "counters")
 
 
 def _length(true: NDArray[np.bool_]) -> int:
-    """Return how many of the first values are true."""
+    """Count the values before the first false one."""
     return int(np.argmin(true)) if not true.all() else true.size

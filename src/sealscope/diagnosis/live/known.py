@@ -56,7 +56,7 @@ def known_shapes(n: int) -> tuple[tuple[int, ...], ...]:
 
 @law
 def take(known: Any, gram: Any, place: Any) -> None:
-    """Put a block's sums (m, m) into `known.own`: of the columns `place`, the others, the leak's and the left side."""
+    """Copy a block's sums (m, m) into `known.own`, in the order `place`: nuisances, leak, left side."""
     for i in range(len(place)):
         for j in range(len(place)):
             known.own[i, j] = gram[place[i], place[j]]
@@ -64,27 +64,27 @@ def take(known: Any, gram: Any, place: Any) -> None:
 
 @large_law
 def add(known: Any, rows: float, weight: float, stepped: bool) -> None:
-    """Add the block `known.own`; forget a part of what those before said.
+    """Add the block `known.own` to the sums; forget a part of the blocks before.
 
     The leak walks between blocks by as much as a block tells of it, or any distance where it `stepped`.
     """
-    sums, own, n, leak = known.sums, known.own, len(known.own), len(known.own) - 2
-    walked = sums[leak, leak] + (0.0 if stepped else max(own[leak, leak], TINY))
+    sums, gram, n, leak = known.sums, known.own, len(known.own), len(known.own) - 2
+    walked = sums[leak, leak] + (0.0 if stepped else max(gram[leak, leak], TINY))
     for i in range(n):  # the leak's row is needed until the last
         for j in range(n):
             if leak not in (i, j):
                 less = sums[i, leak] * sums[leak, j] / walked if walked > 0.0 else 0.0
-                sums[i, j] = _KEEP * (sums[i, j] - less) + weight * own[i, j]
+                sums[i, j] = _KEEP * (sums[i, j] - less) + weight * gram[i, j]
     rest = 1.0 - sums[leak, leak] / walked if walked > 0.0 else 1.0
     for i in range(n):
         if i != leak:
-            sums[leak, i] = sums[i, leak] = _KEEP * rest * sums[i, leak] + weight * own[i, leak]
-    sums[leak, leak] = _KEEP * rest * sums[leak, leak] + weight * own[leak, leak]
+            sums[leak, i] = sums[i, leak] = _KEEP * rest * sums[i, leak] + weight * gram[i, leak]
+    sums[leak, leak] = _KEEP * rest * sums[leak, leak] + weight * gram[leak, leak]
     for i in range(leak):
-        known.along[i] = _KEEP * known.along[i] + own[i, leak]
-    known.numbers[ENERGY] = _KEEP * known.numbers[ENERGY] + own[leak, leak]
+        known.along[i] = _KEEP * known.along[i] + gram[i, leak]
+    known.numbers[ENERGY] = _KEEP * known.numbers[ENERGY] + gram[leak, leak]
     known.numbers[ROWS] = _KEEP * known.numbers[ROWS] + weight * rows
-    known.numbers[MOTION] = _KEEP * known.numbers[MOTION] + weight * own[n - 1, n - 1]
+    known.numbers[MOTION] = _KEEP * known.numbers[MOTION] + weight * gram[n - 1, n - 1]
 
 
 @large_law
@@ -100,9 +100,9 @@ def _solve(known: Any) -> None:
 
 
 @large_law
-def _left(sums: Any, right: Any) -> float:
+def _sum_residual_squares(sums: Any, right: Any) -> float:
     """Return the sum of squares that the coefficients right[:, 0] leave, whatever the leak is."""
-    n, square, along = len(right), 0.0, 0.0
+    n, square, direction = len(right), 0.0, 0.0
     for i in range(n + 2):
         rest = sums[i, n + 1]
         for j in range(n):
@@ -110,49 +110,49 @@ def _left(sums: Any, right: Any) -> float:
         if i < n:
             square -= right[i, 0] * rest
         elif i == n:
-            along = rest
+            direction = rest
         else:
             square += rest
-    return float(square - along**2 / max(sums[n, n], TINY))
+    return float(square - direction**2 / max(sums[n, n], TINY))
 
 
 @large_law
 def begin(known: Any) -> None:
-    """Take coefficients and the variance of a row from all that was added."""
+    """Compute the coefficients and the variance of a row from the sums."""
     n = len(known.matrix)
     right = known.matrix[:, n:]
     right[:] = 0.0
     _solve(known)
     for i in range(n):
         known.coefficients[i] = right[i, 0]
-    left = _left(known.sums, right)
+    left = _sum_residual_squares(known.sums, right)
     known.numbers[NOISE] = max(left, 1e-14 * known.sums[n + 1, n + 1], TINY) / known.numbers[ROWS]
 
 
 @large_law
 def says(known: Any, rows: float, adds: bool) -> tuple[float, float, float, float]:
-    """Return what the block `known.own` says, beside those before it; with `adds` it is one of them then.
+    """Estimate the leak's coefficient from the block `known.own` and those before it; with `adds`, keep the block.
 
     The precision of the leak's coefficient; that times its estimate, and times what is to be taken from it so that the
     series does not move with the other coefficients; the variance that these leave, times the precision squared.
     """
-    own, n, numbers = known.own, len(known.matrix), known.numbers
+    gram, n, numbers = known.own, len(known.matrix), known.numbers
     right = known.matrix[:, n:]
-    energy, usual = max(own[n, n], TINY), max(numbers[ENERGY], TINY)
+    energy, usual = max(gram[n, n], TINY), max(numbers[ENERGY], TINY)
     for i in range(n):
-        right[i, 1] = own[i, n]
-        right[i, 2] = own[i, n] - energy * (known.along[i] / usual)
+        right[i, 1] = gram[i, n]
+        right[i, 2] = gram[i, n] - energy * (known.along[i] / usual)
     _solve(known)
-    lead, numbers[SHIFT], turned, leaning = own[n, n + 1], _RETURNS * numbers[SHIFT], 0.0, 0.0
+    lead, numbers[SHIFT], turned, leaning = gram[n, n + 1], _RETURNS * numbers[SHIFT], 0.0, 0.0
     for i in range(n):
-        lead -= own[i, n] * right[i, 0]
+        lead -= gram[i, n] * right[i, 0]
         numbers[SHIFT] -= known.along[i] / usual * (right[i, 0] - known.coefficients[i])
-        turned += (own[i, n] - energy * (known.along[i] / usual)) * right[i, 2]
-        leaning += own[i, n] * right[i, 1]
+        turned += (gram[i, n] - energy * (known.along[i] / usual)) * right[i, 2]
+        leaning += gram[i, n] * right[i, 1]
         known.coefficients[i] = right[i, 0]
     g, weight = lead / energy, 1.0
     if adds:
-        left = max(_left(own, right), 0.0) / rows
+        left = max(_sum_residual_squares(gram, right), 0.0) / rows
         numbers[MISFIT] = left / numbers[NOISE]
         weight = min(1.0, JUMP**2 * numbers[NOISE] / max(left, TINY))
         before, information = known.sums[n, n + 1], max(known.sums[n, n], TINY)
@@ -170,7 +170,7 @@ def says(known: Any, rows: float, adds: bool) -> tuple[float, float, float, floa
 
 @law
 def motion(square: float, rows: float, numbers: Any) -> float:
-    """Return a block's motion, by the left side's sum of squares, over the usual one of as many rows.
+    """Compute a block's motion, the left side's sum of squares, over the usual one of as many rows.
 
     Infinite where none was usual.
     """

@@ -61,22 +61,22 @@ class PressureEstimator:
 
     @property
     def begun(self) -> bool:
-        """Whether the machine moved for so long that its response was fitted."""
+        """True once the machine moved long enough for its response to be fitted."""
         return self._follower is not None
 
     def take(self, run: SampleRun) -> list[Shown]:
-        """Take the next samples; return what each block shows that they complete."""
+        """Take the next samples; return the result of each block they complete."""
         before = self._kept if run.follows else self._kept[:, :0]
         if not run.follows:
             self._held[:] = math.nan
         kept = np.hstack([before, [run.t, *(run.channels[name] for name in _READ)]])
         first, length = (round(seconds * run.rate) for seconds in (_PRIORS["begins"], self.block_seconds))
-        shown: list[Shown] = []
+        results: list[Shown] = []
         while self._follower is None and run.rate >= _SLOWEST and kept.shape[1] >= first:
             beginning = _recording(kept[:, :first], run.rate)
             if reason := unusable(beginning, self._rig) or does_not_move(beginning):
                 kept = kept[:, first // 2 :]
-                shown.append(NotJudged(float(run.t[-1]), "", f"half minutes before the first block: {reason}"))
+                results.append(NotJudged(float(run.t[-1]), "", f"half minutes before the first block: {reason}"))
             else:
                 self._follower = Follower.fit_start(beginning, self._rig)
         while (self._follower is not None or run.rate < _SLOWEST) and kept.shape[1] >= length:
@@ -87,22 +87,22 @@ class PressureEstimator:
                 self._held[k - 1] = kept[k, length - 1] if hold.flags[length - 1] else math.nan
                 kept[k, :length][hold.flags[:length]] = math.nan
             block, kept = _recording(kept[:, :length], run.rate), kept[:, length:]
-            shown.append(self._shown(block))
+            results.append(self._estimate_block(block))
         self._kept = kept.copy()
-        return shown
+        return results
 
-    def _shown(self, block: Recording) -> Shown:
-        """Return what a block shows."""
+    def _estimate_block(self, block: Recording) -> Shown:
+        """Return the conductance of a block, or the reason why it is not judged."""
         begin, end = float(block.t[0]), float(block.t[-1]) + 1.0 / block.rate
         if self._follower is None or block.rate < _SLOWEST:
             return _passed_over(end, f"sampled at less than {_SLOWEST:g} Hz")
         if not all(np.isfinite(block[name]).all() for name in _READ):
             return _passed_over(end, "missing values")
-        apart = self._resume(begin - self._end, block.rate)
+        interrupted = self._resume(begin - self._end, block.rate)
         follower = self._follower
         self._end = end
-        own = follower.take(block)
-        variance = float(own.gram[0, 0]) / max(own.samples, 1.0)
+        sums = follower.take(block)
+        variance = float(sums.gram[0, 0]) / max(sums.samples, 1.0)
         settling, self._settling = self._settling > 0, max(self._settling - 1, 0)
         described = bool(np.isfinite(follower.theta).all()) and follower.excess < _PRIORS["described"]
         ratio = float(np.clip(max(variance, 1.0) / follower.variance, 0.1, 10.0)) if math.isfinite(variance) else 1.0
@@ -111,7 +111,7 @@ class PressureEstimator:
             self._lost += 1
             if self._lost < _PRIORS["lost"] and np.isfinite(follower.theta).all():
                 self._settling = self._settling if settling else _RESUMING
-                return _passed_over(end, "settling" if settling else "not described by the model", apart)
+                return _passed_over(end, "settling" if settling else "not described by the model", interrupted)
             follower.interrupt(math.inf)
             self._lost, self._settling = 0, _SETTLING
             return _passed_over(end, "not described by the model", True)
@@ -119,16 +119,16 @@ class PressureEstimator:
         width = PRIORS["response"]["G"][1]
         g, sd = float(follower.theta[G]), math.sqrt(follower.covariance[G, G]) * float(follower.priors.unit[G])
         if settling:
-            return _passed_over(end, "settling", apart)
+            return _passed_over(end, "settling", interrupted)
         if sd > width:
-            return _passed_over(end, "conductance not resolved" if moves(block["u"]) else "at standstill", apart)
+            return _passed_over(end, "conductance not resolved" if moves(block["u"]) else "at standstill", interrupted)
         dp = float(np.mean(np.abs(block["p_A"] - block["p_B"])))
         sizes = np.log(np.maximum([dp, np.sqrt(np.mean(block["u"] ** 2))], np.finfo(float).tiny))
         duty = float(sizes[0]), float(sizes[1])
         return [BlockConductance(begin, end, g, sd, g, width, dp / LITRE_PER_MINUTE, duty)]
 
     def _resume(self, gap: float, rate: float) -> bool:
-        """Prepare for a block after a gap [s]; return whether nothing before may be compared with what comes.
+        """Prepare for a block after a gap [s]; return True if it must not be compared with any before.
 
         What is known of the machine stays at another rate, but may lie elsewhere among the likely parameters there.
         """
@@ -144,17 +144,17 @@ class PressureEstimator:
         return anew or not short
 
     def relearn(self) -> None:
-        """Know the machine's parameters as little as at first."""
+        """Forget the machine's parameters: know as little as at first."""
         if self._follower is not None:
             self._follower.interrupt(math.inf)
 
     def state(self) -> dict[str, Any]:
-        """Return all of it but the rig as plain values."""
+        """Return the state without the rig as plain values."""
         state = saved(self, _SAVED)
-        if (own := self._follower) is None:
+        if (follower := self._follower) is None:
             return state | {"follower": None}
-        machine = {"rate": own.machine.rate, "law": own.machine.law, "sense": own.sense}
-        return state | {"follower": saved(own, _FOLLOWED) | machine}
+        machine = {"rate": follower.machine.rate, "law": follower.machine.law, "sense": follower.sense}
+        return state | {"follower": saved(follower, _FOLLOWED) | machine}
 
     def recall(self, state: Mapping[str, Any]) -> None:
         """Continue from a `state` with the same bits; raises InputError where it does not fit."""
@@ -179,5 +179,5 @@ def _recording(rows: Array, rate: float) -> Recording:
     return Recording(t, dict(zip(_READ, channels, strict=True)), {name: CHANNEL_UNITS[name] for name in _READ}, rate)
 
 
-def _passed_over(end: float, status: str, apart: bool = False) -> NotJudged:
-    return NotJudged(end, status, f"blocks: {status}", apart)
+def _passed_over(end: float, status: str, interrupted: bool = False) -> NotJudged:
+    return NotJudged(end, status, f"blocks: {status}", interrupted)

@@ -78,18 +78,18 @@ class StepDetector:
         self.forget()
 
     def forget(self) -> None:
-        """Compare with nothing before now; what is known of noise and walk stays."""
+        """Compare with no block before now; keep the noise and the walk learned."""
         self._last = -np.inf
         self._onsets = np.zeros((len(_FIELDS), len(WALKS), 0))
         self._places = np.zeros((0, len(_PLACES)))
 
     def resolves(self, g: float, deviation: float) -> bool:
-        """Return whether a block's numbers, in the unit of the first one, have squares that floats hold."""
+        """Test whether the squares of a block's numbers, in the unit of the first block, fit into floats."""
         unit = self._unit or deviation
         return unit > 0.0 and abs(g) < _FARTHEST * unit and unit / _FARTHEST < deviation < _FARTHEST * unit
 
     def take(self, begin: float, end: float, g: float, deviation: float) -> None:
-        """Take a block from `begin` to `end` [s]: its estimate and the deviation of this."""
+        """Add a block from `begin` to `end` [s]: its estimate `g` and the `deviation` of `g`."""
         self._unit = self._unit or deviation
         g, variance = g / self._unit, (deviation / self._unit) ** 2
         self._blocks += 1
@@ -99,24 +99,24 @@ class StepDetector:
             return
         spread = self._spread + WALKS * max(elapsed, 1.0)
         sigma, error = spread + variance, g - self._level
-        own, gain = error**2 / sigma, spread / sigma
-        begins = self._known >= 4
-        if begins:
+        square, gain = error**2 / sigma, spread / sigma
+        is_warm = self._known >= 4
+        if is_warm:
             self._begin_onset(begin, end)
-        _follow(self._onsets, self._places, error, sigma, gain, PARTS if begins else PARTS[:0])
-        self._learn(sigma, own)
+        _follow(self._onsets, self._places, error, sigma, gain, PARTS if is_warm else PARTS[:0])
+        self._learn(sigma, square)
         self._level = self._level + gain * error
         self._spread = gain * variance
 
-    def _learn(self, sigma: Array, own: Array) -> None:
-        """Learn noise and walk from an innovation of square `own` over `sigma`."""
-        own = np.maximum(own, _LEAST_SQUARE)
+    def _learn(self, sigma: Array, square: Array) -> None:
+        """Learn noise and walk from `square`, that of an innovation over its variance `sigma`."""
+        square = np.maximum(square, _LEAST_SQUARE)
         if self._known >= 4:
-            own = np.minimum(own, JUMP**2 * self._total / self._known)
+            square = np.minimum(square, JUMP**2 * self._total / self._known)
             weight = MEMORY * self._weight - 0.5 * np.log(sigma * self._total)
-            weight -= 0.5 * (self._known + 1.0) * np.log1p(own / self._total)
+            weight -= 0.5 * (self._known + 1.0) * np.log1p(square / self._total)
             self._weight = weight - np.logaddexp.reduce(weight, axis=0)
-        self._total = MEMORY * self._total + own
+        self._total = MEMORY * self._total + square
         self._known = MEMORY * self._known + 1.0
         self._widths = self._widths + np.log(sigma)
 
@@ -129,7 +129,7 @@ class StepDetector:
         self._onsets = np.concatenate([self._onsets, fresh], axis=2)
         self._places = np.concatenate([self._places, places])
         if self._blocks % 8 == 0:
-            kept = _kept(self._blocks, self._places)
+            kept = _select_onsets(self._blocks, self._places)
             self._onsets, self._places = self._onsets[:, :, kept], self._places[kept]
 
     def log_e(self, least: float = -np.inf) -> float:
@@ -146,22 +146,22 @@ class StepDetector:
 
     def _terms(self) -> Array:
         """Return log of each part of M, by size, walk and onset, shape (v, q, j)."""
-        _, along, square, total, _ = self._onsets
+        _, weighted, square, total, _ = self._onsets
         number, widest, healthy = self._places[:, 0], SIZES[:, None, None], self._healthy()
-        rising = np.maximum(along, 0.0) ** 2 / ((square + 1.0 / widest) * total)
+        rising = np.maximum(weighted, 0.0) ** 2 / ((square + 1.0 / widest) * total)
         ratio = -0.5 * (np.log1p(widest * square) + number * np.log1p(-rising))
         prior = np.logaddexp.reduce(healthy, axis=0) + np.log(len(SIZES) * len(PARTS))
-        return np.asarray(np.where(along > 0.0, ratio, -np.inf) + healthy - prior)
+        return np.asarray(np.where(weighted > 0.0, ratio, -np.inf) + healthy - prior)
 
     def rise(self) -> StepEstimate:
-        """Return the step that the blocks show: its onset and size, averaged over all that may be."""
+        """Estimate the step in the blocks: onset and size, averaged over all walks, onsets and sizes."""
         terms = self._terms()
         log_e = float(np.logaddexp.reduce(terms.ravel()))
         weights = np.exp(terms - log_e)
-        _, along, square, total, _ = self._onsets
+        _, weighted, square, total, _ = self._onsets
         precision = square + 1.0 / SIZES[:, None, None]
-        mean, freedom = along / precision, np.maximum(self._places[:, 0] - 2.0, 1.0)
-        variance = np.maximum(total - along * mean, 0.0) / freedom / precision
+        mean, freedom = weighted / precision, np.maximum(self._places[:, 0] - 2.0, 1.0)
+        variance = np.maximum(total - weighted * mean, 0.0) / freedom / precision
         value = float((weights * mean).sum())
         deviation = float(np.sqrt((weights * (variance + (mean - value) ** 2)).sum()))
         shares = weights.sum(axis=(0, 1))  # probability of each onset
@@ -169,36 +169,36 @@ class StepDetector:
         order = np.argsort(onset, kind="stable")
         low, high = np.searchsorted(np.cumsum(shares[order]), [0.025, 0.975])
         last = order[min(high, len(order) - 1)]
-        apart = float((onset - begin)[-len(PARTS)]) / len(PARTS)  # a part of a block, about
-        since = float(shares @ onset), float(onset[order[low]]) - apart, float(onset[last]) + apart
-        return StepEstimate(2.0 * log_e, since, self._unit * value, self._unit * deviation)
+        part = float((onset - begin)[-len(PARTS)]) / len(PARTS)  # a part of a block, about
+        interval = float(shares @ onset), float(onset[order[low]]) - part, float(onset[last]) + part
+        return StepEstimate(2.0 * log_e, interval, self._unit * value, self._unit * deviation)
 
     def bound(self, probability: float = 0.95) -> float:
-        """Return the rise that is exceeded with probability 1 - `probability`, given that there is one."""
+        """Compute the rise exceeded with probability 1 - `probability`, given a rise."""
         from scipy.special import ndtr
 
         if not len(self._places):
             return np.inf
-        _, along, square, total, _ = self._onsets
-        healthy, size = self._healthy(), along / square
+        _, weighted, square, total, _ = self._onsets
+        healthy, size = self._healthy(), weighted / square
         least = np.finfo(float).tiny
-        deviation = np.sqrt(np.maximum(total - along * size, least) / self._places[:, 0] / square)
+        deviation = np.sqrt(np.maximum(total - weighted * size, least) / self._places[:, 0] / square)
         positive = np.maximum(ndtr(size / deviation), 1e-300)
         above = np.exp(healthy - np.logaddexp.reduce(healthy, axis=0)) * positive
         low, high = 0.0, float(np.max(size + 8.0 * deviation))
         for _ in range(50):
             middle = 0.5 * (low + high)
-            beyond = float((above * ndtr((size - middle) / deviation) / positive).sum())
-            low, high = (middle, high) if beyond > (1.0 - probability) * above.sum() else (low, middle)
+            chance = float((above * ndtr((size - middle) / deviation) / positive).sum())
+            low, high = (middle, high) if chance > (1.0 - probability) * above.sum() else (low, middle)
         return self._unit * high
 
     @property
     def noise(self) -> float:
-        """Variance of a block's estimate over what was stated of it, beside a walk of a tenth."""
+        """Ratio of the variance of a block's estimate to the stated one, with a walk of a tenth."""
         return float((self._total[3, 0] + _PRIORS["stated"]) / (self._known + _PRIORS["stated"]))
 
     def state(self) -> dict[str, Any]:
-        """Return all of it as plain values."""
+        """Return the state as plain values."""
         return saved(self, _SAVED)
 
     def recall(self, state: Any) -> None:
@@ -210,13 +210,13 @@ class StepDetector:
 
 @kernel
 def _follow(onsets: Any, places: Any, error: Any, sigma: Any, gain: Any, fresh: Any) -> None:
-    """Take innovations (q, 1) and their variances into the sums of all onsets, of which the last begin with a part."""
-    answer, along, square, total, _ = onsets
+    """Add innovations (q, 1) and their variances to the sums of all onsets; the last begin with a part."""
+    answer, weighted, square, total, _ = onsets
     count, begun = len(places), len(places) - len(fresh)
     for q in range(len(sigma)):
         for j in range(count):
             part = fresh[j - begun] if j >= begun else 1.0 - answer[q, j]
-            along[q, j] += part / sigma[q, 0] * error[q, 0]
+            weighted[q, j] += part / sigma[q, 0] * error[q, 0]
             square[q, j] += part / sigma[q, 0] * part
             total[q, j] += error[q, 0] ** 2 / sigma[q, 0]
             answer[q, j] += gain[q, 0] * part
@@ -227,18 +227,18 @@ def _follow(onsets: Any, places: Any, error: Any, sigma: Any, gain: Any, fresh: 
 @kernel
 def _most(onsets: Any, places: Any) -> float:
     """Return the most that the logarithm of a ratio of likelihoods can be, for any size of a step."""
-    _, along, square, total, _ = onsets
+    _, weighted, square, total, _ = onsets
     most = 0.0
-    for q in range(len(along)):
+    for q in range(len(weighted)):
         for j in range(len(places)):
-            if along[q, j] > 0.0:
-                rising = min(along[q, j] ** 2 / (square[q, j] * total[q, j]), 1.0 - 1e-15)
+            if weighted[q, j] > 0.0:
+                rising = min(weighted[q, j] ** 2 / (square[q, j] * total[q, j]), 1.0 - 1e-15)
                 most = max(most, -0.5 * places[j, 0] * math.log1p(-rising))
     return most
 
 
-def _kept(now: int, places: Array) -> NDArray[np.bool_]:
-    """Return which onsets are kept of those that are old: of fewer and fewer blocks, and at their beginning only."""
+def _select_onsets(now: int, places: Array) -> NDArray[np.bool_]:
+    """Select the onsets to keep: of older blocks fewer and fewer, and at their beginning only."""
     _, born, onset, begin = places.T
     age = now - born
     step = 2.0 ** np.ceil(np.log2(np.maximum(age / RECENT, 1.0))) * 2.0

@@ -49,7 +49,7 @@ _FIGURES = ("score", "threshold", "onset_s", "onset_interval_s", "leak_lpm", "le
 #: Ways of watching, each a stream of conductances.
 Estimator = LiveBalance | PressureEstimator
 _WithInterval = tuple[float, float, float]
-_KINDS: dict[str, type[Estimator]] = {of.method: of for of in (LiveBalance, PressureEstimator)}
+_KINDS: dict[str, type[Estimator]] = {estimator.method: estimator for estimator in (LiveBalance, PressureEstimator)}
 
 
 class Watch:
@@ -104,7 +104,7 @@ class Watch:
         self._last, self._group = np.empty(0, _LAST), np.empty(0, _GROUP)
 
     def _probability(self, test: str, seconds: float) -> float:
-        """Return the probability of a false alarm of one look of a test, with so many seconds between looks.
+        """Return the false-alarm probability of one look of a test, given the seconds between looks.
 
         Raises InputError where no threshold can be set for it.
         """
@@ -131,7 +131,7 @@ class Watch:
 
     @property
     def counters(self) -> dict[str, int]:
-        """What was dropped, passed over or interrupted, by reason, in samples, blocks or events."""
+        """Counts of dropped samples, skipped blocks and interruptions, by reason."""
         return dict(self._samples.counters)
 
     @property
@@ -142,33 +142,33 @@ class Watch:
     @property
     def why_no_litres(self) -> str:
         """Why no L/min is stated, "" where it is."""
-        own = self._estimator
-        if own is None or own.litres:
+        estimator = self._estimator
+        if estimator is None or estimator.litres:
             return ""
         return "L/min is not stated: areas and displacement of the machine are not, which its file states"
 
     @property
     def evidence(self) -> Evidence:
-        """Verdict of now, with the leak that the tests show, else with the 95 % bound of one that they do not."""
-        leak, own = self.leak, self._estimator
+        """Present verdict, with the detected leak, or the 95 % bound of an undetected one."""
+        leak, estimator = self.leak, self._estimator
         if leak is not None:
             figures: dict[str, Any] = {name: getattr(leak, name) for name in _FIGURES}
             cause: Any = leak.cause
             return Evidence(decide_verdict(True, math.inf, 0.0), leak.reason, cause=cause, **figures)
-        bound = self._detector.bound() if own is not None and len(self._last) else math.inf
-        if own is None or not math.isfinite(bound):
+        bound = self._detector.bound() if estimator is not None and len(self._last) else math.inf
+        if estimator is None or not math.isfinite(bound):
             why = f": {', '.join(self.counters)}" if self.counters else ""
             return Evidence(decide_verdict(False, math.inf, 0.0), f"waits for the first blocks{why}")
         last = self._last[-1]
-        bound, pump = own.orifice * bound * float(last["flow"]), math.exp(last["motion"]) / LITRE_PER_MINUTE
-        limit = f"{bound:.2g} L/min" if own.litres else f"{100.0 * bound / pump:.2g} % of the pump's flow"
+        bound, pump = estimator.orifice * bound * float(last["flow"]), math.exp(last["motion"]) / LITRE_PER_MINUTE
+        limit = f"{bound:.2g} L/min" if estimator.litres else f"{100.0 * bound / pump:.2g} % of the pump's flow"
         verdict = decide_verdict(False, bound, bound_worth_stating(pump))
         return Evidence(
             verdict,
             text_of("bound", "none" if verdict == NO_LEAK else "hidden", limit=limit),
             score=max(2.0 * self._detector.log_e(), 0.0),
             threshold=-2.0 * math.log(self._probability("step", self.block_seconds)),
-            bound_lpm=bound if own.litres else None,
+            bound_lpm=bound if estimator.litres else None,
         )
 
     def update(self, samples: Recording, *, follows: bool = True) -> list[BlockEstimate]:
@@ -191,29 +191,32 @@ class Watch:
         return [estimate for estimate, _ in self.each(samples, follows=follows)]
 
     def each(self, samples: Recording, *, follows: bool = True) -> Iterator[tuple[BlockEstimate, WatchedLeak | None]]:
-        """Yield what `update` returns, each estimate with the leak as of that block; to be gone through to the end."""
+        """Yield the estimates of `update`, each with the leak at that block.
+
+        Iterate to the end: samples are taken on the way.
+        """
         if not follows:
             self._samples.restart("restart")
         for run in self._samples.runs(remove_dropouts(samples)):
             if self._estimator is None or self._estimator.method != self.method:  # a position came later
-                self._estimator = self._estimator_by()
+                self._estimator = self._make_estimator()
             with np.errstate(all="ignore"):  # a block whose sums overflow says nothing
-                every = self._estimator.take(run)
+                results = self._estimator.take(run)
             self._samples.settled = self._estimator.begun
-            for shown in every:
-                if isinstance(shown, NotJudged) and not shown.status:
-                    self._samples.count(shown.counted)
+            for result in results:
+                if isinstance(result, NotJudged) and not result.status:
+                    self._samples.count(result.counted)
                 else:
-                    yield self.judged(shown), self.leak
+                    yield self.judged(result), self.leak
 
-    def _estimator_by(self) -> Estimator:
+    def _make_estimator(self) -> Estimator:
         litres = self._litres.get(self.method, False)
         if self.method == PressureEstimator.method:
             return PressureEstimator(self._rig, litres)
         return LiveBalance(self._rig, self._samples.names, litres)
 
     def continue_from(self, blocks: int, baseline_version: int) -> None:
-        """Count blocks and baselines on from those of a watch before, whose settings or state were of another kind."""
+        """Continue the counts of blocks and baselines of an earlier watch with other settings or state."""
         self.blocks, self.baseline_version = blocks, baseline_version + 1
 
     def relearn(self) -> None:
@@ -225,7 +228,7 @@ class Watch:
         self.dismiss()
 
     def dismiss(self) -> None:
-        """Take the leak back and compare with nothing before now; the baseline stays."""
+        """Withdraw the leak and compare with no block before now; keep the baseline."""
         self.leak = None
         self._forget()
 
@@ -234,7 +237,7 @@ class Watch:
         self._last, self._group = self._last[:0], self._group[:0]
 
     def judged(self, shown: Shown) -> BlockEstimate:
-        """Return the estimate of a block, from what is shown of it."""
+        """Return the estimate of a block from its conductance, or from the reason why there is none."""
         self.blocks += 1
         if isinstance(shown, NotJudged):
             if shown.apart:
@@ -247,7 +250,7 @@ class Watch:
             estimate = self._judge(self._estimator, block)
         return estimate
 
-    def _judge(self, own: Estimator, block: BlockConductance) -> BlockEstimate:
+    def _judge(self, estimator: Estimator, block: BlockConductance) -> BlockEstimate:
         """Test a block by all that came before, and return its estimate."""
         numbers = (block.g, block.total, block.offset, block.flow, *block.duty)
         if not (all(abs(number) < _LARGEST for number in numbers) and self._detector.resolves(block.g, block.sd)):
@@ -261,20 +264,24 @@ class Watch:
         self._detector.take(block.begin, block.end, block.g, block.sd)
         row = np.array((block.end, block.g, block.sd, block.flow, *block.duty, block.total, block.offset), _LAST)
         self._last = np.append(self._last[1 - RECENT :], row)
-        self._test_step(own, block)
-        self._test_level(own, block)
+        self._test_step(estimator, block)
+        self._test_level(estimator, block)
         if self.baseline is None and self.leak is None:
             self._learning.add(block.g, block.flow, block.duty, GROUP)
             hours = self._learning.blocks * self.block_seconds / 3600.0
             if self._learning.blocks >= LEARNED and hours >= self.learn_hours * (1.0 - 1e-12):
                 self.baseline = self._learning.frozen(
-                    self.baseline_version, block.end, hours, own.litres and own.levels
+                    self.baseline_version, block.end, hours, estimator.litres and estimator.levels
                 )
                 self._learning = BaselineLearning()
         status = "alarm" if self.leak is not None else "learning" if self.baseline is None else "watched"
-        return self._estimate(own, status, block) if own.litres else BlockEstimate(self.blocks, block.end, status)
+        return (
+            self._estimate(estimator, status, block)
+            if estimator.litres
+            else BlockEstimate(self.blocks, block.end, status)
+        )
 
-    def _test_step(self, own: Estimator, block: BlockConductance) -> None:
+    def _test_step(self, estimator: Estimator, block: BlockConductance) -> None:
         """Test for a step; an alarm that stands is stated anew while more blocks sharpen it."""
         leak = self.leak
         if leak is not None and (leak.test != "step" or block.end - leak.raised_s > RECENT * self.block_seconds):
@@ -284,7 +291,7 @@ class Watch:
         if not self._detector.log_e(least) > least:
             return
         rise = self._detector.rise()
-        if leak is None and self._other_duty(own, rise):
+        if leak is None and self._has_duty_changed(estimator, rise):
             self._samples.count("blocks not compared: changed duty")
             self._forget()
             return
@@ -292,100 +299,107 @@ class Watch:
             f"the leakage conductance rises at {clock_text(rise.onset[0])} beyond its random walk "
             f"(score {rise.score:.1f}, threshold {2.0 * threshold:.1f})"
         )
-        self._raise(own, rise._replace(threshold=2.0 * threshold, reason=reason), block)
+        self._raise(estimator, rise._replace(threshold=2.0 * threshold, reason=reason), block)
 
-    def _other_duty(self, own: Estimator, rise: StepEstimate) -> bool:
-        """Return whether the duty changed with a rise, beyond what it was before and what a leak makes of it."""
+    def _has_duty_changed(self, estimator: Estimator, rise: StepEstimate) -> bool:
+        """Test whether the duty changed with a rise, beyond its range before and the effect of a leak."""
         pressure, motion = self._last["pressure"], self._last["motion"]
         after = self._last["end"] > rise.onset[0]
         if np.count_nonzero(~after) < _OF_NOW or not after.any():
             return False
         low, high = ((float(f(pressure[~after])), float(f(motion[~after]))) for f in (np.min, np.max))
         now = float(np.median(pressure[after])), float(np.median(motion[after]))
-        lost = 1.0 - rise.size * math.exp(now[0] - now[1]) if own.levels else 1.0
+        lost = 1.0 - rise.size * math.exp(now[0] - now[1]) if estimator.levels else 1.0
         net = now[0], now[1] + math.log(max(lost, np.finfo(float).tiny))  # the pump may give what leaks
         return not (within(now, low, high) or within(net, low, high))
 
-    def _test_level(self, own: Estimator, block: BlockConductance) -> None:
+    def _test_level(self, estimator: Estimator, block: BlockConductance) -> None:
         """Gather blocks to means, and compare these with the baseline."""
         self._group = np.append(self._group, np.array((block.end, block.g, block.sd, block.offset), _GROUP))
         if len(self._group) < GROUP:
             return
-        at, g, offset = (float(self._group[name].mean()) for name in ("end", "g", "offset"))
+        end, g, offset = (float(self._group[name].mean()) for name in ("end", "g", "offset"))
         sd = math.sqrt(sum(value**2 for value in self._group["sd"].tolist())) / GROUP
         self._group = self._group[:0]
         if self.leak is not None or self.baseline is None:
             return
         # what all conductances are off by is in the ceiling that many times
         deviation = math.hypot(sd, offset * (priors("inference")["oil"]["warmest"] - 1.0))
-        rise = self.baseline.rise(at, g, deviation, self._probability("level", GROUP * self.block_seconds))
+        rise = self.baseline.rise(end, g, deviation, self._probability("level", GROUP * self.block_seconds))
         if rise is not None:
-            self._raise(own, rise, block, self.baseline.level)
+            self._raise(estimator, rise, block, self.baseline.level)
 
-    def _raise(self, own: Estimator, rise: StepEstimate, block: BlockConductance, before: float | None = None) -> None:
+    def _raise(
+        self, estimator: Estimator, rise: StepEstimate, block: BlockConductance, before: float | None = None
+    ) -> None:
         leak, (onset, *ends) = self.leak, rise.onset
         if before is None:
             earlier = self._last["g"][self._last["end"] <= ends[0]][-GROUP:]
-            known = float(np.mean(earlier)) if earlier.size else block.g - rise.size
-            before = leak.conductance_before if leak is not None else known
-        reason = rise.reason if own.litres else f"{rise.reason}; {self.why_no_litres}"
-        half = WITHIN_95 * math.hypot(rise.deviation, own.size_error * rise.size)
-        low, high = own.inside * max(0.0, rise.size - half) * block.flow, own.orifice * (rise.size + half) * block.flow
+            mean_before = float(np.mean(earlier)) if earlier.size else block.g - rise.size
+            before = leak.conductance_before if leak is not None else mean_before
+        reason = rise.reason if estimator.litres else f"{rise.reason}; {self.why_no_litres}"
+        half = WITHIN_95 * math.hypot(rise.deviation, estimator.size_error * rise.size)
+        low, high = (
+            estimator.inside * max(0.0, rise.size - half) * block.flow,
+            estimator.orifice * (rise.size + half) * block.flow,
+        )
         self.leak = WatchedLeak(
             raised_s=block.end if leak is None else leak.raised_s,
             onset_s=onset,
             onset_interval_s=(ends[0], ends[1]),
-            leak_lpm=rise.size * block.flow if own.litres else None,
-            leak_interval_lpm=(low, high) if own.litres else None,
+            leak_lpm=rise.size * block.flow if estimator.litres else None,
+            leak_interval_lpm=(low, high) if estimator.litres else None,
             conductance_before=before,
             conductance_before_sd=rise.deviation,
             test=rise.test,
-            cause=own.cause,
+            cause=estimator.cause,
             reason=reason,
             score=rise.score,
             threshold=rise.threshold,
         )
 
-    def _estimate(self, own: Estimator, status: str, block: BlockConductance) -> BlockEstimate:
-        """Return the block's estimate: total flow, and flow beyond the baseline's, or since the onset of the leak."""
+    def _estimate(self, estimator: Estimator, status: str, block: BlockConductance) -> BlockEstimate:
+        """Return the block's estimate: total flow, and its excess over the baseline, or over that before the leak."""
         flow, sd = block.flow, block.sd * math.sqrt(self._detector.noise)
-        total = total_interval = leak = leak_interval = beyond = None
+        total = total_interval = leak = leak_interval = excess = None
         if self.leak is not None:
-            beyond = self._beyond_leak(self.leak, own, block, sd)
+            excess = self._estimate_rise(self.leak, estimator, block, sd)
         elif self.baseline is not None:
             base, half = self.baseline, WITHIN_95 * sd
-            beyond = block.g - base.level, block.g - base.high - half, block.g - base.low + half
-        if own.levels:
+            excess = block.g - base.level, block.g - base.high - half, block.g - base.low + half
+        if estimator.levels:
             half = WITHIN_95 * math.hypot(sd, block.offset)
             total = block.total * flow
             total_interval = max(0.0, block.total - half) * flow, max(0.0, block.total + half) * flow
-        if beyond is not None:
-            leak, low, high = (value * flow for value in beyond)
-            leak_interval = max(0.0, low), own.orifice * max(0.0, high)
+        if excess is not None:
+            leak, low, high = (value * flow for value in excess)
+            leak_interval = max(0.0, low), estimator.orifice * max(0.0, high)
         return BlockEstimate(self.blocks, block.end, status, total, total_interval, leak, leak_interval)
 
-    def _beyond_leak(self, leak: WatchedLeak, own: Estimator, block: BlockConductance, sd: float) -> _WithInterval:
+    def _estimate_rise(
+        self, leak: WatchedLeak, estimator: Estimator, block: BlockConductance, sd: float
+    ) -> _WithInterval:
         """Return the conductance since the onset of a leak, and its interval, in which the oil may have warmed."""
-        since = self._last["end"] - self.block_seconds >= leak.onset_interval_s[1]
-        recent = self._last["g"][since][-_OF_NOW:]
-        now, warmed = float(np.mean(recent)) if recent.size else block.g, self._warmed(leak, block.end)
+        is_after = self._last["end"] - self.block_seconds >= leak.onset_interval_s[1]
+        recent = self._last["g"][is_after][-_OF_NOW:]
+        now, warming = float(np.mean(recent)) if recent.size else block.g, self._warming_factor(leak, block.end)
         before, rise = max(leak.conductance_before, 0.0), now - leak.conductance_before
         noise = sd / math.sqrt(max(len(recent), 1))
-        spread = WITHIN_95 * math.hypot(noise, leak.conductance_before_sd, own.size_error * rise)
-        return rise, own.inside * (now - before * warmed - spread), now - before / warmed + spread
+        spread = WITHIN_95 * math.hypot(noise, leak.conductance_before_sd, estimator.size_error * rise)
+        return rise, estimator.inside * (now - before * warming - spread), now - before / warming + spread
 
     def over_cycles(self, estimate: BlockEstimate) -> BlockEstimate:
         """Return the estimate of the last block with mean flows over the cycles seen, as a recording's are.
 
         These are the last `RECENT` blocks since an interruption, of a leak those since its onset.
         """
-        own, leak = self._estimator, self.leak
-        if own is None or not (own.litres and estimate.judged and len(self._last)):
+        estimator, leak = self._estimator, self.leak
+        if estimator is None or not (estimator.litres and estimate.judged and len(self._last)):
             return estimate
         rows = self._last
         if leak is not None:
-            since = rows["end"] - self.block_seconds >= leak.onset_interval_s[1]
-            rows = rows[since] if since.any() else rows[-1:]
+            is_after = rows["end"] - self.block_seconds >= leak.onset_interval_s[1]
+            rows = rows[is_after] if is_after.any() else rows[-1:]
         flow = rows["flow"]
         noise = math.sqrt(self._detector.noise * float(np.sum((rows["sd"] * flow) ** 2))) / len(rows)
 
@@ -394,7 +408,7 @@ class Watch:
             return float(values.mean()), math.hypot(noise, spread)
 
         total = interval = None
-        if own.levels:
+        if estimator.levels:
             total, deviation = mean_of(rows["total"] * flow)
             half = WITHIN_95 * math.hypot(deviation, float(np.mean(rows["offset"] * flow)))
             interval = max(0.0, total - half), max(0.0, total + half)
@@ -402,35 +416,35 @@ class Watch:
         if leak is None and self.baseline is None:
             return estimate
         if leak is not None:
-            before, scale = leak.conductance_before, own.inside
-            warmed = self._warmed(leak, estimate.t)
-            least, most = max(before, 0.0) * warmed, before / warmed
-            known = leak.conductance_before_sd
+            before, scale = leak.conductance_before, estimator.inside
+            warming = self._warming_factor(leak, estimate.t)
+            least, most = max(before, 0.0) * warming, before / warming
+            deviation_before = leak.conductance_before_sd
         else:
             base = self.baseline
             assert base is not None
-            before, scale, least, most, known = base.level, 1.0, base.high, base.low, 0.0
+            before, scale, least, most, deviation_before = base.level, 1.0, base.high, base.low, 0.0
         unit = float(flow.mean())
         value, deviation = mean_of((rows["g"] - before) * flow)
-        half = WITHIN_95 * math.hypot(deviation, known * unit, own.size_error * value)
+        half = WITHIN_95 * math.hypot(deviation, deviation_before * unit, estimator.size_error * value)
         low = scale * (value + (before - least) * unit - half)
-        high = own.orifice * (value + (before - most) * unit + half)
+        high = estimator.orifice * (value + (before - most) * unit + half)
         return replace(estimate, leak_lpm=value, leak_interval_lpm=(max(0.0, low), max(0.0, high)))
 
     @staticmethod
-    def _warmed(leak: WatchedLeak, t: float) -> float:
-        """Return by how much warmer oil may have raised the conductance since the onset of a leak."""
+    def _warming_factor(leak: WatchedLeak, t: float) -> float:
+        """Return the factor by which warmer oil may have raised the conductance since the onset of a leak."""
         oil, hours = priors("inference")["oil"], max(0.0, t - leak.onset_s) / 3600.0
         return float(oil["warmest"] ** min(1.0, hours / oil["shift"]))
 
     def state(self) -> dict[str, Any]:
-        """Return all that the watch knows as plain values that JSON holds, its ``"version"`` that of the format."""
-        own = self._estimator if self._estimator is not None and self._estimator.method == self.method else None
+        """Return the state of the watch as plain values for JSON; its ``"version"`` is the format's."""
+        estimator = self._estimator if self._estimator is not None and self._estimator.method == self.method else None
         return {
             "version": STATE_VERSION,
             "rig": self._rig_text,
             **saved(self, ("_litres", *_SAVED)),
-            "estimator": None if own is None else own.state(),
+            "estimator": None if estimator is None else estimator.state(),
         }
 
     @classmethod
@@ -444,11 +458,11 @@ class Watch:
             raise InputError(f"saved state must have version {STATE_VERSION}, got {version}")
         rate, hours = (part_of(state, name, (float, int)) for name in ("false_alarms_per_1000_h", "learn_hours"))
         litres = restored(dict[str, bool], part_of(state, "litres", Mapping), "litres")
-        watch = cls(_rig_of(part_of(state, "rig", str)), rate, hours, litres=litres)
+        watch = cls(_parse_rig(part_of(state, "rig", str)), rate, hours, litres=litres)
         recall(watch, _SAVED, state, _KINDS_OF_SAVED)
-        if (own := part_of(state, "estimator", (Mapping, type(None)))) is not None:
-            watch._estimator = watch._estimator_by()
-            watch._estimator.recall(own)
+        if (estimator := part_of(state, "estimator", (Mapping, type(None)))) is not None:
+            watch._estimator = watch._make_estimator()
+            watch._estimator.recall(estimator)
         return watch
 
 
@@ -461,7 +475,7 @@ _KINDS_OF_SAVED = {"baseline": WatchBaseline, "leak": WatchedLeak}
 
 
 @lru_cache(maxsize=256)
-def _rig_of(text: str) -> Rig:
+def _parse_rig(text: str) -> Rig:
     """Return the rig of a saved state; raises InputError where it is none."""
     from sealscope.parameters import Rig
 

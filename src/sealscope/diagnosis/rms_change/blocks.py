@@ -63,7 +63,7 @@ class RmsBlocks:
         """Length of a block [s]."""
         return float(np.diff(self.edges).min()) if len(self.log_rms) else 0.0
 
-    def settled(self) -> RmsBlocks:
+    def without_start(self) -> RmsBlocks:
         """Return the blocks after the machine's start: without 10 s or three cycles, at most an eighth of them."""
         n, believed = len(self.log_rms), priors("rms_change")["blocks"]
         start = max(believed["settling"], believed["settling_cycles"] * (self.cycle or 0.0))
@@ -77,12 +77,12 @@ def columns_of(chambers: Sequence[str]) -> list[str]:
 
 
 def judged_chambers(recording: Recording) -> tuple[str, ...]:
-    """Return the chambers whose details are judged: those whose readings are not mostly cut off, or all."""
+    """Return the chambers to judge: those with readings not mostly clipped, or all."""
     chambers = chambers_of(recording)
     return tuple(name for name in chambers if not mostly_clipped(recording[name])) or chambers
 
 
-def whole(recording: Recording) -> tuple[Array, Array]:
+def whole_levels(recording: Recording) -> tuple[Array, Array]:
     """Return the log RMS (5 per judged chamber,) and the duty (4,) of the whole recording but its edges."""
     transformed = [details(recording[chamber]) for chamber in judged_chambers(recording)]
     inside = transformed[0].inside()
@@ -103,19 +103,19 @@ def _columns(recording: Recording, transformed: list[Details], bounds: IntArray)
         priors("rms_change")["blocks"]["standstill"] ** 2 * squares.mean(axis=1, keepdims=True), np.finfo(float).tiny
     )
     with np.errstate(divide="ignore", over="ignore"):
-        energies = np.concatenate([mean_squares(own, bounds) for own in transformed], axis=1)
+        energies = np.concatenate([mean_squares(signal, bounds) for signal in transformed], axis=1)
         log_rms, duty = 0.5 * np.log(energies), 0.5 * np.log(segment_means(squares, bounds) + rest)
     return log_rms, np.vstack([duty, segment_means(load[None], bounds) / np.exp(duty[-1:])]).T
 
 
-def cut(recording: Recording) -> RmsBlocks:
+def cut_blocks(recording: Recording) -> RmsBlocks:
     """Cut a uniformly sampled recording without missing samples into blocks, edges of the transform dropped."""
     chambers, rate, believed = judged_chambers(recording), recording.rate, priors("rms_change")["blocks"]
     transformed = [details(recording[chamber]) for chamber in chambers]
     inside, cycle = transformed[0].inside(), find_cycle(recording)
-    wanted = max(believed["seconds"], believed["samples"] / rate)
-    phases = 1 if cycle is None else max(1, round(cycle / wanted))
-    length = wanted if cycle is None else cycle / phases * max(1, round(wanted / (cycle / phases)))
+    target = max(believed["seconds"], believed["samples"] / rate)
+    phases = 1 if cycle is None else max(1, round(cycle / target))
+    length = target if cycle is None else cycle / phases * max(1, round(target / (cycle / phases)))
     samples = inside.stop - inside.start
     if samples > believed["most"] * length * rate:
         length *= phases * math.ceil(samples / (believed["most"] * phases * length * rate))

@@ -17,7 +17,14 @@ from sealscope.diagnosis.inference.observable import Observable, Observed, Ringi
 from sealscope.diagnosis.inference.onset import step_tests
 from sealscope.diagnosis.learnt import Healthy, Lesson, lessons_of
 from sealscope.diagnosis.priors import priors
-from sealscope.diagnosis.rms_change.blocks import JUDGED, RmsBlocks, columns_of, cut, judged_chambers, whole
+from sealscope.diagnosis.rms_change.blocks import (
+    JUDGED,
+    RmsBlocks,
+    columns_of,
+    cut_blocks,
+    judged_chambers,
+    whole_levels,
+)
 from sealscope.diagnosis.rms_change.ringing import information, rises
 from sealscope.recordings.chambers import CHAMBERS, chambers_of
 from sealscope.recordings.hydraulics import lack_of_chambers
@@ -42,7 +49,7 @@ class RmsChange:
         """Nothing is assumed of the machine."""
 
     def usable(self, recording: Recording) -> str | None:
-        """Return None when the recording has a chamber pressure that moves, else the reason why not."""
+        """Return None if the recording is long enough and its chamber pressures move, else the reason why not."""
         if lack := lack_of_chambers(recording):
             return lack
         if len(recording) < shortest():
@@ -51,11 +58,11 @@ class RmsChange:
         return None if still is None else f"{still} is constant"
 
     def learn(self, recording: Recording) -> Lesson:
-        """Return what a healthy recording teaches: its log RMS and duty, whose they are, and when."""
-        levels, duty = whole(recording)
+        """Return the lesson of a healthy recording: log RMS and duty, their chambers, and the start."""
+        levels, duty = whole_levels(recording)
         chambers, start = list(judged_chambers(recording)), start_seconds(recording)
-        known = {"chambers": chambers, "recorded": list(chambers_of(recording)), "rate": recording.rate}
-        return {**known, "start_s": start, "levels": levels, "duty": duty}
+        lesson_head = {"chambers": chambers, "recorded": list(chambers_of(recording)), "rate": recording.rate}
+        return {**lesson_head, "start_s": start, "levels": levels, "duty": duty}
 
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
         """Return the changes of the details' RMS, within the recording or against the healthy ones."""
@@ -65,13 +72,13 @@ class RmsChange:
             return Observed(self.name, lack=f"{least}, got {recording.rate:g} Hz: is the unit of the time right?")
         if baseline:
             return observe_against(recording, baseline)
-        blocks = cut(recording)
+        blocks = cut_blocks(recording)
         if blocks.still is not None:
             return Observed(self.name, lack=f"the pressures cannot be trusted: {blocks.still}")
         if len(blocks.log_rms) < (fewest := priors("rms_change")["blocks"]["fewest"]):
             short = f"too short to be its own baseline: {len(blocks.log_rms)} blocks, {fewest} are needed"
             return Observed(self.name, lack=f"{short}; give leak-free recordings as --baseline")
-        report = observe_within(blocks.settled(), recording.rate)
+        report = observe_within(blocks.without_start(), recording.rate)
         ringing = report.ringing and report.ringing._replace(unused=recording.unused)
         return replace(report, ringing=ringing)
 
@@ -172,12 +179,14 @@ def _sides(judged: Lesson, lessons: Sequence[Lesson], chambers: Sequence[str]) -
         return
     rows = [(QUANTITIES.index(name), len(QUANTITIES) + QUANTITIES.index(name)) for name in RINGING]
 
-    def beside(lesson: Lesson) -> float:
+    def mean_difference(lesson: Lesson) -> float:
         levels = _levels(lesson, chambers)
         return float(np.mean([levels[first] - levels[second] for first, second in rows]))
 
     error: float = priors("rms_change")["recordings"]["error"]
-    observable = difference("p_A beside p_B", "sides", beside(judged), [beside(own) for own in lessons], error)
+    observable = difference(
+        "p_A beside p_B", "sides", mean_difference(judged), [mean_difference(lesson) for lesson in lessons], error
+    )
     if observable is not None:
         filtered = priors("rms_change")["filtered"]
         away = np.log(max(abs(observable.size), error) / filtered["size"]) / filtered["spread"]

@@ -1,4 +1,4 @@
-"""What the RMS of a detail says of the machine's own part of it, within a recording and between recordings.
+"""The machine's own part in the RMS of a detail, within a recording and between recordings.
 
 Energy of a detail d_j is that of white noise, which every level holds alike (d1 holds hardly anything else), and the
 machine's own: E_j = (1 + g)^2 E_own,j + E_1. So the change g of the machine's amplitude is, to first order,
@@ -30,16 +30,16 @@ def beyond_noise(log_rms: Array, known: Array) -> tuple[Array, Array]:
         noise = np.exp(2.0 * log_rms[:, first])
         for column in range(first + 1, first + QUANTITIES.index("d3d4")):
             energy = np.exp(2.0 * known[:, [first, column]]).mean(axis=0)
-            own = max(energy[1] - energy[0], least * energy[1])
-            left[:, column] -= 0.5 * np.log(own + noise)
-            weight[:, column] = own / (own + noise)
+            signal = max(energy[1] - energy[0], least * energy[1])
+            left[:, column] -= 0.5 * np.log(signal + noise)
+            weight[:, column] = signal / (signal + noise)
         d3, d4, product = (first + QUANTITIES.index(name) for name in ("d3", "d4", "d3d4"))
         left[:, product] += left[:, d3] - log_rms[:, d3] + left[:, d4] - log_rms[:, d4]
     return left, weight
 
 
 def information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
-    """Return what the blocks say of the change g of each quantity, duty eliminated, and the mean of w of each."""
+    """Compute the information on the change g of each quantity, duty eliminated, and the mean of each w."""
     left, weight = beyond_noise(blocks.log_rms, blocks.log_rms)
     error = np.mean(np.diff(left, axis=0) ** 2, axis=0) / 2.0
     explaining = DUTY[:-1]  # the direction is that of the phase
@@ -48,21 +48,21 @@ def information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
     believed = np.array([float(exponents[name]) for name in explaining])
     time = blocks.edges[:-1] + 0.5 * blocks.seconds
     over_all = float(np.sqrt(len(time) * blocks.seconds / walks["time"]))
-    machine, stated = "duty" if blocks.cycle is None else "machine", []
+    machine, results = "duty" if blocks.cycle is None else "machine", []
     for name, y, w, variance in zip(blocks.names, left.T, weight.T, error, strict=True):
         drift = walks["noise" if name.startswith("d1 ") else machine] * over_all
         precision, vector = w**2 / variance, w * y / variance
-        along = precision[:, None] * duty
-        gain = along @ np.linalg.inv(duty.T @ along + np.diag(believed**-2))
-        precision, vector = np.diag(precision) - gain @ along.T, vector - gain @ (duty.T @ vector)
-        stated.append(Information(time, precision, vector, slope=drift, walk=drift))
-    return stated, weight.mean(axis=0)
+        weighted = precision[:, None] * duty
+        gain = weighted @ np.linalg.inv(duty.T @ weighted + np.diag(believed**-2))
+        precision, vector = np.diag(precision) - gain @ weighted.T, vector - gain @ (duty.T @ vector)
+        results.append(Information(time, precision, vector, slope=drift, walk=drift))
+    return results, weight.mean(axis=0)
 
 
 def rises(
     log_rms: Array, duty: Array, known: Array, known_duty: Array, times: Array | None = None
 ) -> tuple[list[Rise], Array]:
-    """Return the rise g of each quantity of a recording beyond n leak-free ones of the machine, duty taken out, and w.
+    """Estimate the rise g of each quantity over n leak-free recordings, duty removed; return these and w.
 
     `log_rms` (5 per chamber,), `duty` (4,); `known` (n, 5 per chamber), `known_duty` (n, 4). The quantities of healthy
     recordings are normal about a mean, what the duty explains, and a deviation that fades with the time between them,
@@ -71,20 +71,23 @@ def rises(
     """
     prior, walk, n = priors("rms_change")["recordings"], priors("rms_change")["walk"], len(known)
     exponents = np.array([float(priors("rms_change")["duty"][name]) for name in DUTY])
-    apart = (np.vstack([known_duty, duty]) - duty) * exponents
+    effects = (np.vstack([known_duty, duty]) - duty) * exponents
     quantiles = (np.arange(walk["tried"]) + 0.5) / walk["tried"]
     gained = walk["machine"] * np.tan(0.5 * np.pi * quantiles)
     rates = (gained / prior["session"]) ** 2 / (2.0 * walk["time"])
-    since, alike = np.zeros((n + 1, n + 1)), np.ones((n + 1, n + 1))
+    elapsed, same_session = np.zeros((n + 1, n + 1)), np.ones((n + 1, n + 1))
     if times is not None:
         sessions = sessions_of(list(times), prior["pause"])
-        since, alike = np.abs(np.subtract.outer(times, times)), np.equal.outer(sessions, sessions).astype(float)
-    fading = prior["session"] ** 2 * np.exp(-rates[:, None, None] * since) * alike
-    population = Population(fading + apart @ apart.T, np.zeros(len(rates)))
+        elapsed, same_session = (
+            np.abs(np.subtract.outer(times, times)),
+            np.equal.outer(sessions, sessions).astype(float),
+        )
+    fading = prior["session"] ** 2 * np.exp(-rates[:, None, None] * elapsed) * same_session
+    population = Population(fading + effects @ effects.T, np.zeros(len(rates)))
     values, weights = beyond_noise(np.vstack([log_rms, known]), known)
     weight = weights[1:].mean(axis=0)
-    stated = []
-    for own, others, w in zip(values[0] / weight, values[1:].T / weight[:, None], weight, strict=True):
+    results = []
+    for change, healthy, w in zip(values[0] / weight, values[1:].T / weight[:, None], weight, strict=True):
         scatter = float(np.hypot(prior["scatter"], prior["error"] / w))
-        stated.append(population.rise(own[None], others[None], scatter, prior["freedom"]))
-    return stated, weight
+        results.append(population.rise(change[None], healthy[None], scatter, prior["freedom"]))
+    return results, weight

@@ -1,1 +1,1 @@
-"""Trend: what recordings of a single machine, in the order of their times, say of its leakage."""
+"""Trend: the leakage of a single machine over its recordings, in the order of their times."""

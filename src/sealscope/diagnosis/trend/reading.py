@@ -1,4 +1,4 @@
-"""Readings: what a single recording states of the leakage, and the order in which those of a machine are compared."""
+"""Readings: the leakage of a single recording, and the order to compare a machine's readings in."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sealscope.diagnosis.inference.pressures.detector import PressureResponse
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.inspection import inspected
 from sealscope.diagnosis.priors import priors
-from sealscope.diagnosis.rms_change.blocks import JUDGED, whole
+from sealscope.diagnosis.rms_change.blocks import JUDGED, whole_levels
 from sealscope.diagnosis.trend.wear import DayToDay
 from sealscope.diagnosis.verdict.machine import AssumedMachine, assumed_rig
 from sealscope.errors import InputError
@@ -40,7 +40,7 @@ BASES: tuple[Basis, ...] = ("volume balance", "pressure response", "ringing")
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LeakReading:
-    """What a recording states of the leakage.
+    """Level of leakage of one recording.
 
     `start`: of its first sample [s since 1970], None where not known, and `duration` [s]; `basis`, None where nothing
     can be stated, and `problem`: why; `level`: conductance of pump and piston together [m^3/(s Pa)], or a relative
@@ -67,7 +67,7 @@ class LeakReading:
 
 
 def reading_of(recording: Recording, rig: Rig | str | os.PathLike[str] | None = None, file: str = "") -> LeakReading:
-    """Return what a recording states of the leakage.
+    """Estimate the level of leakage of a recording.
 
     `rig`: what may be assumed of the machine; None: as for `diagnose`, L/min only where the machine is known.
     """
@@ -88,17 +88,17 @@ def reading_of(recording: Recording, rig: Rig | str | os.PathLike[str] | None = 
     if reading.problem:
         return reading
     with np.errstate(all="ignore"):
-        return replace(reading, **_stated(part, known, machine))
+        return replace(reading, **_estimate_level(part, known, machine))
 
 
-def _stated(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[str, Any]:
+def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[str, Any]:
     """Return the most specific level that a recording without a defect allows, or the problem."""
     balance, response = VolumeBalance(rig), PressureResponse(rig)
     lack, lacks = unusable(balance, part), unusable(response, part)
-    own = balance.balance(part) if lack is None else None
-    if own is not None and len(own.columns) == 1:
-        size, total = own.size, own.level
-        area = machine.area if size.stated or ("x", "m") in own.units else None
+    solution = balance.balance(part) if lack is None else None
+    if solution is not None and len(solution.columns) == 1:
+        size, total = solution.size, solution.level
+        area = machine.area if size.stated or ("x", "m") in solution.units else None
         return {
             "basis": BASES[0],
             "level": total.value * size.scale,
@@ -111,7 +111,7 @@ def _stated(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[str, Any
         area = machine.area if reading.stated else None
         level, error = reading.level
         return {"basis": BASES[1], "level": level, "error": error, "states_flow": reading.stated, "area": area}
-    log_rms = whole(part)[0].reshape(-1, len(QUANTITIES))
+    log_rms = whole_levels(part)[0].reshape(-1, len(QUANTITIES))
     ringing = float(-np.mean(log_rms[:, [QUANTITIES.index(name) for name in JUDGED]]))
     if np.isfinite(ringing):
         return {"basis": BASES[2], "level": ringing, "error": priors("trend")["own"]["ringing"]}
@@ -146,7 +146,7 @@ class TrendPoint(LeakReading):
 
 
 def timeline(readings: Sequence[LeakReading], every: float | None = None) -> tuple[list[TrendPoint], tuple[str, ...]]:
-    """Return readings in the order of their times, and what sets each group of comparable ones apart from the first.
+    """Sort readings by time; return them and the difference of each comparable group from the first.
 
     `every`: time between them [s], in the order of their names. Raises InputError where the time of one is not known.
     """
@@ -171,35 +171,35 @@ def timeline(readings: Sequence[LeakReading], every: float | None = None) -> tup
     for reading, problem in zip(ordered, notes, strict=True):
         other = "" if reading.basis == basis else f"its channels allow the {reading.basis}, not the {basis}"
         note = problem or other
-        alike = (n for n, scale in enumerate(scales) if abs(_change(reading.scale, scale)) <= most)
-        group = -1 if note else next(alike, len(scales))
+        matching = (n for n, scale in enumerate(scales) if abs(_change(reading.scale, scale)) <= most)
+        group = -1 if note else next(matching, len(scales))
         if group == len(scales):
             scales.append(reading.scale)
         start = reading.start or 0.0
         day = (start - (ordered[0].start or 0.0)) / DAY
         points.append(TrendPoint(**vars(reading) | {"start": start}, day=day, group=group, note=note))
-    apart = [
+    differences = [
         f"position or angle is scaled by {100.0 * _change(scale, scales[0]):+.2g} %: a sensor exchanged, or another "
         "machine"
         for scale in scales
     ]
-    return points, ("", *apart[1:]) if scales else ()
+    return points, ("", *differences[1:]) if scales else ()
 
 
-def findings_of(points: Sequence[TrendPoint], apart: Sequence[str]) -> list[Finding]:
-    """Return findings on the clock, on what is left out, one for each reason, and on what is compared apart."""
+def findings_of(points: Sequence[TrendPoint], differences: Sequence[str]) -> list[Finding]:
+    """Return findings on the clock, on readings left out, one a reason, and on separate groups."""
     findings, count = _clock(points), len(points)
     reasons: dict[str, list[TrendPoint]] = {}
     for point in points:
         if point.note:
             reasons.setdefault(re.sub(r"\d[\d.]*", "#", point.note), []).append(point)  # alike but for its numbers
-    for own in reasons.values():
-        text = f"{len(own)} of {count} left out: {own[0].note} ({_names(own)})"
-        findings.append(Finding("left_out", "warning", None, len(own), None, text))
-    for number, difference in enumerate(apart[1:], 1):
-        own = [point for point in points if point.group == number]
-        text = f"{len(own)} of {count} compared among themselves only: {difference} ({_names(own)})"
-        findings.append(Finding("not_comparable", "note", None, len(own), None, text))
+    for left_out in reasons.values():
+        text = f"{len(left_out)} of {count} left out: {left_out[0].note} ({_names(left_out)})"
+        findings.append(Finding("left_out", "warning", None, len(left_out), None, text))
+    for number, difference in enumerate(differences[1:], 1):
+        members = [point for point in points if point.group == number]
+        text = f"{len(members)} of {count} compared among themselves only: {difference} ({_names(members)})"
+        findings.append(Finding("not_comparable", "note", None, len(members), None, text))
     return findings
 
 
@@ -212,7 +212,7 @@ def _change(scale: float | None, other: float | None) -> float:
 
 
 def _clock(ordered: Sequence[TrendPoint]) -> list[Finding]:
-    """Return what shows that a clock was set back: recordings that overlap, or numbered names against the times.
+    """Find signs of a clock set back: overlapping recordings, or numbered names against the times.
 
     Recordings of one date without times of day have the same start.
     """
@@ -226,7 +226,7 @@ def _clock(ordered: Sequence[TrendPoint]) -> list[Finding]:
         for early, late in pairwise(sorted(ordered, key=lambda reading: by_numbers(reading.file)))
         if late.start < early.start
     ]
-    alike = len({re.split(r"[\d\W_]", reading.file, maxsplit=1)[0].lower() for reading in ordered}) == 1
+    same_stem = len({re.split(r"[\d\W_]", reading.file, maxsplit=1)[0].lower() for reading in ordered}) == 1
     # numbers that fall more often are no order
-    texts = overlaps or (back if alike and len(back) <= max(2, len(ordered) // 10) else [])
+    texts = overlaps or (back if same_stem and len(back) <= max(2, len(ordered) // 10) else [])
     return [Finding("clock", "warning", None, len(texts), None, texts[0])] if texts else []

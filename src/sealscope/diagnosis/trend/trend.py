@@ -24,7 +24,7 @@ from sealscope.diagnosis.trend.reading import (
     scatter_of,
     timeline,
 )
-from sealscope.diagnosis.trend.wear import Episode, Levels, Wear, beyond, episodes
+from sealscope.diagnosis.trend.wear import Episode, Levels, Wear, episodes, outlier_excess
 from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, LEAK, NO_LEAK, Verdict
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.severity import RepairLimit
@@ -46,7 +46,7 @@ FEWEST = 3
 
 @dataclass(frozen=True)
 class Trend:
-    """What the recordings of a single machine say of its leakage over time.
+    """Leakage of a single machine over time, from its recordings.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ class Trend:
 
     @property
     def wear(self) -> Wear | None:
-        """What the last stretch says, None where there is no level."""
+        """Wear of the last stretch, None where there is no level."""
         return self.episodes[-1].wear if self.episodes else None
 
     @property
@@ -134,7 +134,7 @@ class Trend:
 
     @property
     def next_check(self) -> str:
-        """What to check next on the machine."""
+        """Next check on the machine."""
         if self.verdict == NO_LEAK:
             return "Nothing needs a check; go on recording under the same duty."
         if self.verdict == LEAK:
@@ -157,10 +157,15 @@ class Trend:
         names = ("now", "healthy", "scatter", "growth", "step", "onset", "reach")
         now, healthy, scatter, growth, step, onset, reach = (self.wear and getattr(self.wear, name) for name in names)
         points = [
-            {"file": own.file, "time": self._moment(own.day), "day": own.day}
-            | {"value": own.value, "low": own.low, "high": own.high, "group": None if own.group < 0 else own.group}
-            | {"temperature_C": own.temperature, "note": own.note}
-            for own in self.points
+            {"file": point.file, "time": self._moment(point.day), "day": point.day}
+            | {
+                "value": point.value,
+                "low": point.low,
+                "high": point.high,
+                "group": None if point.group < 0 else point.group,
+            }
+            | {"temperature_C": point.temperature, "note": point.note}
+            for point in self.points
         ]
         return plain(  # type: ignore[no-any-return]
             {
@@ -200,7 +205,7 @@ class Trend:
         )
 
     def _moment(self, day: float) -> str | float | None:
-        """Return a time as an ISO stamp, or in days where the times are not known."""
+        """Format a time as an ISO stamp, or in days if the times are not known."""
         if not math.isfinite(day) or not self.dated:
             return day
         return str(np.datetime64(round((self.points[0].start + (day - self.points[0].day) * DAY) * 1e3), "ms"))[:19]
@@ -219,7 +224,7 @@ def trend(
     years: float = 10.0,
     every: float | None = None,
 ) -> Trend:
-    """Return how the leakage of a single machine went over its recordings.
+    """Estimate the trend of a single machine's leakage over its recordings.
 
     Parameters
     ----------
@@ -266,27 +271,29 @@ def trend(
     readings = [
         recording if isinstance(recording, LeakReading) else reading_of(recording, rig) for recording in recordings
     ]
-    points, apart = timeline(readings, every)
-    return _judged(points, apart, repair=RepairLimit.of(limit), years=years, healthy=healthy, dated=every is None)
+    points, differences = timeline(readings, every)
+    return _make_trend(
+        points, differences, repair=RepairLimit.of(limit), years=years, healthy=healthy, dated=every is None
+    )
 
 
-def _judged(points: Sequence[TrendPoint], apart: tuple[str, ...], **stated: Any) -> Trend:
-    """Return the trend of readings in the order of their times; `stated`: what the caller states of it."""
+def _make_trend(points: Sequence[TrendPoint], differences: tuple[str, ...], **stated: Any) -> Trend:
+    """Make the trend of readings in the order of their times; `stated`: further fields of it."""
     rows = tuple(k for k, point in enumerate(points) if point.group >= 0)
     kept = [points[k] for k in rows]
-    flows = bool(kept) and all(own.states_flow for own in kept)
+    flows = bool(kept) and all(point.states_flow for point in kept)
     trend = Trend(
         verdict=decide_verdict(False, math.inf, 0.0),
         reason="",
         basis=kept[0].basis if kept else None,
         unit="L/min" if flows else "%",
-        pressure=float(np.median([own.pressure for own in kept])) if flows else None,
+        pressure=float(np.median([point.pressure for point in kept])) if flows else None,
         points=tuple(points),
-        groups=apart,
+        groups=differences,
         episodes=(),
         rows=rows,
         machine=points[0].machine if points else None,
-        findings=tuple(findings_of(points, apart)),
+        findings=tuple(findings_of(points, differences)),
         **stated,
     )
     if kept:
@@ -296,51 +303,54 @@ def _judged(points: Sequence[TrendPoint], apart: tuple[str, ...], **stated: Any)
 
 
 def _with_levels(trend: Trend) -> Trend:
-    """Return the trend with its levels and what they say, of one recording or more that can be compared."""
+    """Add levels and episodes to a trend of at least one comparable recording."""
     levels, allowed = _levels(trend)
-    few, points, rows = levels.merged(), [*trend.points], trend.rows
-    alone = np.flatnonzero(beyond(levels)[1])
-    apart = "apart from the recordings before and after: it counts as if it were near"
+    merged, points, rows = levels.merged(), [*trend.points], trend.rows
+    outliers = np.flatnonzero(outlier_excess(levels)[1])
+    remark = "apart from the recordings before and after: it counts as if it were near"
     findings = [*trend.findings]
-    if alone.size:
-        files = listed((points[rows[k]].file for k in alone), 3)
-        text = f"{alone.size} of {len(points)} {apart} ({files})"
-        findings.append(Finding("outlier", "warning", None, alone.size, None, text))
+    if outliers.size:
+        files = listed((points[rows[k]].file for k in outliers), 3)
+        text = f"{outliers.size} of {len(points)} {remark} ({files})"
+        findings.append(Finding("outlier", "warning", None, outliers.size, None, text))
     for k, row in enumerate(rows):
         value, half = float(levels.value[k]), WITHIN_95 * float(levels.error[k])
-        note = apart if k in alone else ""
+        note = remark if k in outliers else ""
         points[row] = replace(points[row], value=value, low=value - half, high=value + half, note=note)
-    known = max(1, _known(trend) * len(few) // len(levels))
+    healthy_count = max(1, _count_healthy(trend) * len(merged) // len(levels))
     return replace(
         trend,
         points=tuple(points),
         findings=tuple(findings),
-        episodes=tuple(episodes(few, years=trend.years, known=known, allowed=allowed)),
-        rows=tuple(rows[int(np.argmin(np.abs(levels.t - t)))] for t in few.t) if few is not levels else rows,
+        episodes=tuple(episodes(merged, years=trend.years, known=healthy_count, allowed=allowed)),
+        rows=tuple(rows[int(np.argmin(np.abs(levels.t - t)))] for t in merged.t) if merged is not levels else rows,
     )
 
 
-def _known(trend: Trend) -> int:
-    """Return how many of the compared recordings are among the first ones, known to be healthy; at least the first."""
+def _count_healthy(trend: Trend) -> int:
+    """Count the compared recordings among the first ones, known to be healthy; at least the first."""
     first = dict.fromkeys(point.digest for point in trend.points)  # a copy counts once
-    known = {*islice(first, trend.healthy)}
-    return max(1, sum(trend.points[row].digest in known for row in trend.rows))
+    healthy_digests = {*islice(first, trend.healthy)}
+    return max(1, sum(trend.points[row].digest in healthy_digests for row in trend.rows))
 
 
 def _levels(trend: Trend) -> tuple[Levels, float | None]:
     """Return the levels in the trend's unit, and the rise at which a repair is due, None where unknown."""
     kept = [trend.points[k] for k in trend.rows]
     t, group, value, error = (
-        np.array([getattr(own, name) for own in kept]) for name in ("day", "group", "level", "error")
+        np.array([getattr(point, name) for point in kept]) for name in ("day", "group", "level", "error")
     )
-    usual, pressure = float(np.mean(value[: _known(trend)])), float(np.median([own.pressure for own in kept]))
+    usual, pressure = (
+        float(np.mean(value[: _count_healthy(trend)])),
+        float(np.median([point.pressure for point in kept])),
+    )
     prior = scatter_of(trend.basis or "ringing", usual)
     warmer, slope_sd = np.zeros(t.size), 0.0
-    temperatures = [own.temperature for own in kept if own.temperature is not None]
+    temperatures = [point.temperature for point in kept if point.temperature is not None]
     if trend.basis != "ringing" and len(temperatures) == t.size:
         slope, deviation = (priors("inference")["oil"][name] for name in ("per_kelvin", "per_kelvin_deviation"))
         warmer, slope_sd = np.array(temperatures) - temperatures[0], deviation * abs(usual)
-        value, error = (own * np.exp(-slope * warmer) for own in (value, error))
+        value, error = (values * np.exp(-slope * warmer) for values in (value, error))
     flows = trend.pressure is not None
     unit = pressure / LITRE_PER_MINUTE if flows else 100.0 / max(abs(usual), float(np.finfo(float).tiny))
     if trend.basis == "ringing":

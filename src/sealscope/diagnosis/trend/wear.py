@@ -72,39 +72,41 @@ class Levels:
         return self.t.size
 
     def part(self, rows: slice) -> Levels:
-        """Return some of the recordings."""
-        t, value, error, covariate = (own[rows] for own in (self.t, self.value, self.error, self.covariate))
+        """Select some of the recordings by `rows`."""
+        t, value, error, covariate = (values[rows] for values in (self.t, self.value, self.error, self.covariate))
         return Levels(t, value, error, self.group[rows], covariate, self.prior, self.slope_sd)
 
     @property
     def interval(self) -> float:
         """Typical time between two recordings [days]."""
-        waits = np.diff(self.t)
-        return float(np.median(waits[waits > 0.0])) if np.any(waits > 0.0) else 1.0
+        steps = np.diff(self.t)
+        return float(np.median(steps[steps > 0.0])) if np.any(steps > 0.0) else 1.0
 
     @property
     def scatter(self) -> float:
         """Deviation of a recording from its neighbours: their median step, shrunk towards the prior."""
         prior = self.prior
         steps = np.abs(np.diff(self.value))[np.diff(self.group) == 0] / math.sqrt(2.0)
-        known = prior.scale**2 + (float(np.mean(self.error**2)) if len(self) else 0.0)
-        own = (1.4826 * float(np.median(steps))) ** 2 if steps.size else 0.0
-        return math.sqrt((prior.freedom * known + steps.size * own) / (prior.freedom + steps.size))
+        prior_variance = prior.scale**2 + (float(np.mean(self.error**2)) if len(self) else 0.0)
+        measured = (1.4826 * float(np.median(steps))) ** 2 if steps.size else 0.0
+        return math.sqrt((prior.freedom * prior_variance + steps.size * measured) / (prior.freedom + steps.size))
 
     def merged(self, most: int = 240) -> Levels:
-        """Return about so many levels at most: neighbours of a group are averaged where there are more."""
-        each = -(-len(self) // most)
-        if each <= 1:
+        """Reduce the levels to about `most`: average neighbours of a group where there are more."""
+        size = -(-len(self) // most)
+        if size <= 1:
             return self
         runs = np.split(np.arange(len(self)), np.flatnonzero(np.diff(self.group)) + 1)
-        rows = [run[k : k + each] for run in runs for k in range(0, run.size, each)]
-        t, value, covariate = (np.array([own[r].mean() for r in rows]) for own in (self.t, self.value, self.covariate))
+        rows = [run[k : k + size] for run in runs for k in range(0, run.size, size)]
+        t, value, covariate = (
+            np.array([values[r].mean() for r in rows]) for values in (self.t, self.value, self.covariate)
+        )
         error = np.array([math.sqrt(np.sum(self.error[r] ** 2)) / r.size for r in rows])
         return Levels(t, value, error, self.group[[r[0] for r in rows]], covariate, self.prior, self.slope_sd)
 
 
-def beyond(levels: Levels) -> tuple[Array, Array]:
-    """Return what of each value does not count while it is the last one, and what not once the next one is known.
+def outlier_excess(levels: Levels) -> tuple[Array, Array]:
+    """Return the excess of each value not counted while it is the last one, and not once the next one is known.
 
     That is what lies beyond some deviations of the three before it, unless its neighbour lies as far out.
     """
@@ -115,9 +117,9 @@ def beyond(levels: Levels) -> tuple[Array, Array]:
         before, after = levels.value[same[max(place - 3, 0) : place]], levels.value[same[place + 1 : place + 2]]
         if before.size:
             reach, middle = outlier * levels.part(slice(0, k)).scatter, float(np.median(before))
-            apart = levels.value[k] - middle
-            agree = [np.sign(apart) * (other - middle) > reach for other in (before[-1], *after)]
-            last[k] = 0.0 if agree[0] else np.sign(apart) * max(abs(apart) - reach, 0.0)
+            distance = levels.value[k] - middle
+            agree = [np.sign(distance) * (other - middle) > reach for other in (before[-1], *after)]
+            last[k] = 0.0 if agree[0] else np.sign(distance) * max(abs(distance) - reach, 0.0)
             later[k] = 0.0 if any(agree) or not after.size else last[k]
     return last, later
 
@@ -144,7 +146,9 @@ class _Changes(NamedTuple):
         begin = np.arange(max(known, 1), len(levels))
         step = (np.arange(len(levels))[:, None] >= begin).astype(float)
         growth = np.maximum(levels.t[:, None] - levels.t[begin - 1], 0.0) / DAYS_PER_MONTH
-        slopes = [] if steps_only else [DAYS_PER_MONTH / levels.interval / many for many in believed["intervals"]]
+        slopes = (
+            [] if steps_only else [DAYS_PER_MONTH / levels.interval / interval for interval in believed["intervals"]]
+        )
         steps = len(believed["steps"])
         scale = np.array([*believed["steps"], *slopes], dtype=float)[:, None]
         grows = np.arange(scale.size)[:, None] >= steps
@@ -153,11 +157,11 @@ class _Changes(NamedTuple):
             log_weight = np.log(np.clip(levels.t[begin] - levels.t[begin - 1], 0.0, believed["wait"]) / share)
         column = np.arange(begin.size) + begin.size * grows
         spread = np.broadcast_arrays(column, scale, begin, grows, log_weight)
-        return cls(np.hstack([step, growth]), *(own.ravel() for own in spread))  # type: ignore[call-arg]
+        return cls(np.hstack([step, growth]), *(values.ravel() for values in spread))  # type: ignore[call-arg]
 
     @classmethod
     def single(cls, shape: Array, scale: float) -> _Changes:
-        """Return a change of one shape (n,), whose scale is in tau."""
+        """Make a single change of one shape (n,), with its `scale` in tau."""
         first, one = np.zeros(1, dtype=np.int64), np.ones(1)
         return cls(shape[:, None], first, scale * one, first, one > 0.0, 0.0 * one)
 
@@ -183,32 +187,34 @@ def _nodes(levels: Levels, shapes: Array, *, sloping: bool = False) -> list[_Nod
     from scipy.linalg import solve_triangular
 
     believed, prior = priors("trend")["between"], levels.prior
-    last, later = beyond(levels)
+    last, later = outlier_excess(levels)
     values = levels.value - levels.value[0] - later
     reach = max(prior.scale, 0.3 * float(np.ptp(levels.value)))
-    wide = (_WIDE * reach) ** 2
-    mean = wide * (levels.group == levels.group[-1])
-    shared = wide * (levels.group[:, None] == levels.group) + levels.slope_sd**2 * np.outer(*(levels.covariate,) * 2)
+    wide_variance = (_WIDE * reach) ** 2
+    mean = wide_variance * (levels.group == levels.group[-1])
+    shared = wide_variance * (levels.group[:, None] == levels.group) + levels.slope_sd**2 * np.outer(
+        *(levels.covariate,) * 2
+    )
     if sloping:
-        grown = 10.0 * levels.scatter / levels.interval * (levels.t - levels.t[0])
-        shared += np.outer(grown, grown)
+        growth = 10.0 * levels.scatter / levels.interval * (levels.t - levels.t[0])
+        shared += np.outer(growth, growth)
     waits = np.abs(levels.t[:, None] - levels.t)
-    lasting = np.mean([np.exp(-waits / time) for time in believed["times"]], axis=0)
+    correlation = np.mean([np.exp(-waits / time) for time in believed["times"]], axis=0)
     right = np.column_stack([values, mean, shapes])
     nodes = []
     for tau in np.geomspace(0.1 * prior.scale, 10.0 * reach, believed["nodes"]):
         log_prior = -prior.freedom * (math.log(tau) + 0.5 * (prior.scale / tau) ** 2)
         for share in believed["lasts"]:
-            own = shared + tau**2 * share * lasting
-            own[np.diag_indices(len(levels))] += tau**2 * (1.0 - share + _TINY) + levels.error**2
-            L = np.linalg.cholesky(own)
+            covariance = shared + tau**2 * share * correlation
+            covariance[np.diag_indices(len(levels))] += tau**2 * (1.0 - share + _TINY) + levels.error**2
+            L = np.linalg.cholesky(covariance)
             z, u, g = np.split(solve_triangular(L, right, lower=True, check_finite=False), [1, 2], axis=1)
             held = z - ((last - later) / L.diagonal())[:, None]  # the value counts so while it is the last
             square = np.cumsum(z**2) - (z**2 - held**2)[:, 0]
             log = log_prior - np.cumsum(np.log(L.diagonal())) - 0.5 * square
             a, b = np.cumsum(g**2, axis=0), np.cumsum(g * z, axis=0) - g * (z - held)
             base = float(levels.value[0] + u[:-1, 0] @ z[:-1, 0] + u[-1, 0] * held[-1, 0])
-            nodes.append(_Node(float(tau), log, a, b, base, wide - float(u[:, 0] @ u[:, 0]), g.T @ u[:, 0]))
+            nodes.append(_Node(float(tau), log, a, b, base, wide_variance - float(u[:, 0] @ u[:, 0]), g.T @ u[:, 0]))
     return nodes
 
 
@@ -231,7 +237,7 @@ class Path(NamedTuple):
     first: IntArray
 
     def alarm(self, days: float) -> int | None:
-        """Return the first recording after which R is over a mean time to a false alarm, None where it never is."""
+        """Find the first recording with R over a mean time to a false alarm; None where there is none."""
         over = np.flatnonzero(self.log_R > math.log(days))
         return int(over[0]) if over.size else None
 
@@ -266,7 +272,7 @@ class _Draws(NamedTuple):
     base: Array
 
     @classmethod
-    def of(cls, levels: Levels, changes: _Changes, *, signed: bool = False) -> _Draws:
+    def sample(cls, levels: Levels, changes: _Changes, *, signed: bool = False) -> _Draws:
         """Return draws; `signed`: the size may be of either sign, its prior flat."""
         from scipy.special import ndtr, ndtri
 
@@ -283,14 +289,14 @@ class _Draws(NamedTuple):
         mean, deviation = (b * v)[node, change], np.sqrt(v)[node, change]
         low = np.zeros(count) if signed else ndtr(-mean / deviation)  # of a normal number that is known to be positive
         size = mean + deviation * ndtri(np.clip(low + (1.0 - low) * random.random(count), 1e-300, 1.0 - 1e-16))
-        tau, base, variance = np.array([(own.tau, own.mean, own.variance) for own in nodes])[node].T
-        yields = np.stack([own.yields[changes.column] for own in nodes])[node, change]
+        tau, base, variance = np.array([(node_of.tau, node_of.mean, node_of.variance) for node_of in nodes])[node].T
+        yields = np.stack([node_of.yields[changes.column] for node_of in nodes])[node, change]
         spread = np.sqrt(np.maximum(variance, 0.0)) * random.standard_normal(count)
         return cls(tau, change, size, base - yields * size + spread)
 
 
 class Wear(NamedTuple):
-    """What the recordings of a segment say of its course.
+    """Course of a segment of recordings.
 
     `now`: level after the last recording, without the day's own scatter; `growth`: by a month; `step`: size of a step,
     None where a growth is likelier, or nothing changed; `onset`: time of the change [days], None where there is none;
@@ -325,12 +331,12 @@ def describe(levels: Levels, allowed: float | None, alarmed: int | None) -> Wear
     spans, rises = levels.t[-1] - levels.t[0] >= 1.0, alarmed is not None
     even = (levels.t - levels.t[0]) / DAYS_PER_MONTH if spans else np.zeros(len(levels))
     changes = _Changes.after(levels, 1) if rises else _Changes.single(even, _WIDE * DAYS_PER_MONTH / levels.interval)
-    draws = _Draws.of(levels, changes, signed=not rises)
+    draws = _Draws.sample(levels, changes, signed=not rises)
     grows = changes.grows[draws.change]
     now = draws.base + draws.size * changes.shape[-1, changes.column[draws.change]]
     slope, growing = np.where(grows, draws.size, 0.0), float(np.mean(grows)) >= 0.5
     before = levels.part(slice(0, alarmed))
-    usual = _Draws.of(before, _Changes.single(np.zeros(len(before)), 1.0))
+    usual = _Draws.sample(before, _Changes.single(np.zeros(len(before)), 1.0))
     error = float(np.mean(before.error[before.group == before.group[-1]] ** 2))
     noise = np.random.default_rng(21).standard_normal(usual.tau.size)
     healthy = _interval(usual.base + np.sqrt(usual.tau**2 + error) * noise)._replace(value=float(usual.base.mean()))
@@ -354,7 +360,7 @@ def describe(levels: Levels, allowed: float | None, alarmed: int | None) -> Wear
 
 
 class Episode(NamedTuple):
-    """A stretch of recordings between two repairs: rows `begin` to `end` (exclusive) of what was judged.
+    """A stretch of recordings between two repairs: rows `begin` to `end` (exclusive) of the judged ones.
 
     `alarm`: the row after which the test alarmed, None where it did not; `wear`: what the stretch says at its end;
     `fell`: whether the stretch began with a fall of the level.

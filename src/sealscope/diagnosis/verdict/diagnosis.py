@@ -1,4 +1,4 @@
-"""Diagnosis: the fused evidence on one recording with what its reader needs beside it, as in the output contract."""
+"""Diagnosis: the fused evidence on one recording, and its context for the reader, as in the output contract."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class Diagnosis(Evidence):
     def of(
         cls, evidence: Evidence, recording: Recording, machine: AssumedMachine, *, file: str | None, **stated: Any
     ) -> Diagnosis:
-        """Return the diagnosis of a recording by its evidence, with what the file says of itself.
+        """Make the diagnosis of a recording from its evidence and the file's own statements.
 
         `file`: name of the recording, by default that of its file; `stated`: the other fields.
         """
@@ -117,7 +117,7 @@ class Diagnosis(Evidence):
 
     @property
     def severity(self) -> Severity | None:
-        """How bad the leak is; None where there is none, or nothing is known of its size."""
+        """Severity of the leak; None where there is none, or nothing is known of its size."""
         return severity(self, self.limit)
 
     @property
@@ -149,14 +149,14 @@ class Diagnosis(Evidence):
     @property
     def measured_ratio(self) -> tuple[float, tuple[float, float]] | None:
         """Displacement over area as measured, over the assumed one, and its interval; None where not measured."""
-        for own in (self, *self.parts):
-            if own.ratio is not None and own.ratio_interval is not None:
-                return own.ratio, own.ratio_interval
+        for decision in (self, *self.parts):
+            if decision.ratio is not None and decision.ratio_interval is not None:
+                return decision.ratio, decision.ratio_interval
         return None
 
     @property
     def machine_name(self) -> str | None:
-        """What the file calls the machine; None where it does not say."""
+        """The machine's name in the file; None where there is none."""
         return machine_name_of(self.about)
 
     @property
@@ -175,12 +175,12 @@ class Diagnosis(Evidence):
 
     @property
     def named_cause(self) -> str | None:
-        """The cause that the verdict names: a leak's for `leak`, else another event's; None where it names none."""
+        """Cause named by the verdict: a leak's for `leak`, else another event's; None where it names none."""
         return self.cause if (self.verdict == LEAK) == (self.cause in LEAKS) else None
 
     @property
     def next_check(self) -> str:
-        """What to check next on the machine, in one or two sentences."""
+        """Next check on the machine, in one or two sentences."""
         with_bypass = self.machine is not None and self.machine.bypass
         return action_of(self._condition, self.named_cause, ("bypass",) if with_bypass else ())
 
@@ -196,13 +196,13 @@ class Diagnosis(Evidence):
 
     @property
     def known_healthy(self) -> bool:
-        """Whether leak-free recordings or the rig show that the level is that of a healthy machine."""
+        """True if leak-free recordings or the rig show that the level is that of a healthy machine."""
         by_rig = self.total_leakage is not None and self.total_leakage.healthy
         return self.verdict == NO_LEAK and (self.baselines > 0 or by_rig)
 
     @property
     def is_baseline(self) -> bool:
-        """Whether it may serve as a baseline: its total is shown to be like that of the healthy recordings."""
+        """True if the recording may serve as a baseline: its total is shown to be like the healthy recordings'."""
         against = self._question(AGAINST)
         if self.verdict != NO_LEAK or self.cause is not None or against is None or not _is_usual(against):
             return False
@@ -213,14 +213,14 @@ class Diagnosis(Evidence):
 
     @property
     def rises_within(self) -> bool:
-        """Whether the leakage probably rose within the recording, of which no onset is stated."""
+        """True if the leakage probably rose within the recording, though no onset is stated."""
         within = self._question(WITHIN)
         return self.onset_s is None and within is not None and not _is_usual(within)
 
     def _question(self, name: str) -> Evidence | None:
-        """Return what the judging detector answers to one of its questions; None where it was not asked."""
+        """Return the judging detector's answer to one of its questions; None where it was not asked."""
         judge = self.parts[0].parts if self.parts else ()
-        return next((own for own in judge if own.detector == name), None)
+        return next((part for part in judge if part.detector == name), None)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the diagnosis as plain JSON values, keys in the order of the output contract.
@@ -240,7 +240,7 @@ class Diagnosis(Evidence):
             {
                 **{name: getattr(self, name) for name in _FIRST},
                 "methods": methods,
-                "quality": [{name: getattr(own, name) for name in names} for own in self.quality],
+                "quality": [{name: getattr(warning, name) for name in names} for warning in self.quality],
                 "cause": self.cause,
                 "next_check": self.next_check,
                 "total_leakage": total,
@@ -266,7 +266,7 @@ class Diagnosis(Evidence):
         )
 
     def to_frame(self) -> pandas.DataFrame:
-        """Return the figures as one row of a table, intervals as two columns; `pandas.concat` joins those of several.
+        """Return the figures as one row of a table, intervals as two columns; `pandas.concat` joins several.
 
         Raises MissingExtra where pandas is not installed.
         """
@@ -319,28 +319,28 @@ class Diagnosis(Evidence):
         return axes
 
     def __str__(self) -> str:
-        since = "" if self.onset_s is None else f" since {self.onset_s:.1f} s"
-        return f"{self.file}: {self.verdict}{since} ({self.reason})"
+        onset_text = "" if self.onset_s is None else f" since {self.onset_s:.1f} s"
+        return f"{self.file}: {self.verdict}{onset_text} ({self.reason})"
 
     def __repr__(self) -> str:
         figures = {"onset_s": self.onset_s, "leak_lpm": self.leak_lpm, "score": self.score, "threshold": self.threshold}
-        stated = "".join(f", {name}={value:.4g}" for name, value in figures.items() if value is not None)
-        return f"Diagnosis({self.verdict!r}, file={self.file!r}{stated})"
+        figures_text = "".join(f", {name}={value:.4g}" for name, value in figures.items() if value is not None)
+        return f"Diagnosis({self.verdict!r}, file={self.file!r}{figures_text})"
 
     def _repr_html_(self) -> str:
         """Return the diagnosis as a table for notebooks."""
 
-        def shown(value: float | None, interval: tuple[float, float] | None = None) -> str:
+        def format_figure(value: float | None, interval: tuple[float, float] | None = None) -> str:
             ends = "" if interval is None else f" ({interval[0]:.4g} to {interval[1]:.4g})"
             return "" if value is None else f"{value:.4g}{ends}"
 
         rows = [
             ("reason", self.reason),
-            ("onset [s]", shown(self.onset_s, self.onset_interval_s)),
-            ("leak [L/min]", shown(self.leak_lpm, self.leak_interval_lpm)),
+            ("onset [s]", format_figure(self.onset_s, self.onset_interval_s)),
+            ("leak [L/min]", format_figure(self.leak_lpm, self.leak_interval_lpm)),
             ("cause", self.cause),
-            ("score", shown(self.score)),
-            ("threshold", shown(self.threshold)),
+            ("score", format_figure(self.score)),
+            ("threshold", format_figure(self.threshold)),
             ("odds", self.odds),
             ("false-alarm probability", f"{self.false_alarm_probability:g}"),
             *((finding.severity, finding.text) for finding in self.quality),
@@ -352,11 +352,11 @@ class Diagnosis(Evidence):
 
 
 def _is_usual(question: Evidence) -> bool:
-    """Return whether a question's chance is that of 19 of 20 healthy recordings."""
+    """Test whether a question's chance is that of 19 of 20 healthy recordings."""
     return question.chance is None or question.chance >= 0.05
 
 
-def machine_name_of(about: Mapping[str, str]) -> str | None:
-    """Return what the preamble of a file calls the machine; None where it does not say."""
-    names = {name.lower(): text for name, text in about.items()}
+def machine_name_of(preamble: Mapping[str, str]) -> str | None:
+    """Return the machine's name in the preamble of a file; None where there is none."""
+    names = {name.lower(): text for name, text in preamble.items()}
     return next((names[name] for name in _MACHINES if name in names), None)

@@ -55,7 +55,7 @@ class LeakCourse:
 
 @dataclass(frozen=True)
 class TotalLeakage:
-    """What pump and piston together pass over a whole recording, a leak included that was there from the start.
+    """Flow past pump and piston together over a whole recording, with any leak that was there from the start.
 
     `lpm`: mean flow, and its 95 % interval [L/min], None where the machine's size is not known; `pressure`: mean size
     of the pressure difference at which it flows [Pa]; `findable_lpm`: smallest step of that flow that would have been
@@ -74,14 +74,14 @@ class TotalLeakage:
 
     @property
     def healthy(self) -> bool:
-        """Whether it is surely no more than a healthy machine passes."""
-        known = self.healthy_lpm is not None and self.interval_lpm is not None
-        return known and self.interval_lpm[1] <= self.healthy_lpm  # type: ignore[index,operator]
+        """True if the flow is surely no more than a healthy machine's."""
+        is_known = self.healthy_lpm is not None and self.interval_lpm is not None
+        return is_known and self.interval_lpm[1] <= self.healthy_lpm  # type: ignore[index,operator]
 
 
 @dataclass(frozen=True)
 class RelativeLeak:
-    """A leak beside what the recording itself measures: known without area and displacement.
+    """A leak relative to the recording's own measurements: known without area and displacement.
 
     `pump_share`: leak over the pump's mean flow, None where the pump's motion is not recorded; `creep`: leak over the
     piston's area, the speed at which it would creep with its lines shut [m/s], None where the position has no unit;
@@ -96,7 +96,7 @@ class RelativeLeak:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Verdict on one recording and the figures it rests on; what is not known is None.
+    """Verdict on one recording and the figures it rests on; unknown figures are None.
 
     Parameters
     ----------
@@ -161,12 +161,12 @@ class Evidence:
 
     @property
     def alarmed(self) -> bool:
-        """Whether the score exceeds the threshold."""
+        """True if the score exceeds the threshold."""
         return self.score is not None and self.threshold is not None and self.score > self.threshold
 
     @property
     def abstains(self) -> bool:
-        """Whether the next detector judges: `cannot tell`, and no change was seen."""
+        """True if the next detector judges: `cannot tell`, and no change was seen."""
         return self.verdict == CANNOT_TELL and self.cause is None and not self.alarmed
 
     @property
@@ -185,7 +185,7 @@ class Evidence:
 
     @property
     def odds(self) -> str | None:
-        """How many healthy recordings look like this one, in words; None where that is not stated."""
+        """Share of healthy recordings that look like this one, in words; None where it is not stated."""
         if self.stated_chance is None:
             return None
         if self.stated_chance >= 0.2:

@@ -1,4 +1,4 @@
-"""The machine that a diagnosis assumes: what every L/min rests on, and whether it was stated or merely assumed."""
+"""The machine assumed by a diagnosis: the sizes behind every L/min, stated or merely assumed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _DEFAULT, _REASON = "thesis", "no rig was stated"
 
 @dataclass(frozen=True)
 class AssumedMachine:
-    """What a diagnosis assumes of the machine.
+    """Assumptions of a diagnosis about the machine.
 
     `rig`: its name; `stated_by` the call (`--rig` or a Rig), the provenance of a recording of our own, or nobody;
     `area` of the piston, the mean of both sides [m^2], and `displacement` of the pump [m^3/rev]; `area_stated`,
@@ -42,7 +42,7 @@ class AssumedMachine:
 
     @property
     def stated(self) -> bool:
-        """Whether area and displacement are both stated."""
+        """True if area and displacement are both stated."""
         return self.area_stated and self.displacement_stated
 
     def as_dict(self) -> dict[str, Any]:
@@ -60,64 +60,64 @@ class AssumedMachine:
 
 
 def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) -> tuple[Rig, AssumedMachine]:
-    """Return the rig that detectors assume, and what it states of the machine.
+    """Return the rig assumed by detectors, and its statements about the machine.
 
     Without a `rig` it is that of the thesis: stated where the recording's own provenance says that it was made with the
     same area and displacement, else each of its values is a mere assumption (`Rig.states`).
     """
-    known = load_rig(_DEFAULT if rig is None else rig)
+    used_rig = load_rig(_DEFAULT if rig is None else rig)
     stated_by: StatedBy = "call"
     if rig is None:
-        stated_by = "recording" if _made_with(recording.provenance, known) else "nobody"
-        known = known if stated_by == "recording" else unstated()
-    elif not states_rig(known):
+        stated_by = "recording" if _is_simulated_with(recording.provenance, used_rig) else "nobody"
+        used_rig = used_rig if stated_by == "recording" else unstated()
+    elif not states_rig(used_rig):
         stated_by = "nobody"
-    return known, AssumedMachine(
-        known.name,
+    return used_rig, AssumedMachine(
+        used_rig.name,
         stated_by,
-        area=0.5 * (known.cylinder.A_A + known.cylinder.A_B),
-        displacement=known.pump.q_b,
-        area_stated=known.states("cylinder.A_A", "cylinder.A_B"),
-        displacement_stated=known.states("pump.q_b"),
+        area=0.5 * (used_rig.cylinder.A_A + used_rig.cylinder.A_B),
+        displacement=used_rig.pump.q_b,
+        area_stated=used_rig.states("cylinder.A_A", "cylinder.A_B"),
+        displacement_stated=used_rig.states("pump.q_b"),
         flow_meter=measures_flow(recording.units),
-        areas=(known.cylinder.A_A, known.cylinder.A_B),
+        areas=(used_rig.cylinder.A_A, used_rig.cylinder.A_B),
         bypass="q_leak" in recording.units,
     )
 
 
 def states_rig(rig: Rig) -> bool:
-    """Whether a rig is somebody's, and not the default one of which area or displacement alone is stated."""
+    """Test whether a rig is somebody's, not the default one with only area or displacement stated."""
     return rig.entry("cylinder.M_eq").source != f"{ASSUMED} {_REASON}"
 
 
 def measures_flow(units: Mapping[str, str]) -> bool:
-    """Whether the flow to the cylinder is read by a meter in its unit, and neither angle nor speed of a pump is."""
+    """Test whether a meter reads the flow to the cylinder in its unit, and no angle or speed of a pump is read."""
     return flow_source(units) == "q_pump" and units["q_pump"] == "m^3/s"
 
 
 def healthy_leakage(rig: Rig) -> float:
-    """Return the most that a healthy pump leaks, `pump.G_healthy` [m^3/(s Pa)]; 0 where it is not that of this pump.
+    """Return the largest leakage of a healthy pump, `pump.G_healthy` [m^3/(s Pa)]; 0 if stated for another pump.
 
     What a file assumes of its own pump counts; not what is left of another rig's where only the displacement is stated.
     """
     healthy, pump = rig.entry("pump.G_healthy"), rig.entry("pump.q_b")
     assumed_of_it = states_rig(rig) and rig.states("pump.q_b") and healthy.place == pump.place
-    own = rig.states("pump.G_healthy") or assumed_of_it
-    return rig.pump.G_healthy if own else 0.0
+    is_known = rig.states("pump.G_healthy") or assumed_of_it
+    return rig.pump.G_healthy if is_known else 0.0
 
 
 def unstated() -> Rig:
-    """Return the default rig, each value of which is a mere assumption."""
+    """Return the default rig, with each value marked as an assumption."""
     return load_rig(_DEFAULT).as_assumed(_REASON)
 
 
-def _made_with(provenance: Mapping[str, Any], rig: Rig) -> bool:
-    """Return whether a simulated recording's own rig has the area and displacement of this one."""
+def _is_simulated_with(provenance: Mapping[str, Any], rig: Rig) -> bool:
+    """Test whether the rig of a simulated recording has the area and displacement of this one."""
     experiment = provenance.get("experiment")
     if provenance.get("origin") != "simulation" or not isinstance(experiment, Mapping):
         return False
     name, overrides = experiment.get("rig"), experiment.get("overrides")
     if name not in rig_names() or not isinstance(overrides, Mapping) or set(_GEOMETRY) & set(overrides):
         return False
-    own = load_rig(name)
-    return all(own[parameter] == rig[parameter] for parameter in _GEOMETRY)
+    stated_rig = load_rig(name)
+    return all(stated_rig[parameter] == rig[parameter] for parameter in _GEOMETRY)

@@ -1,4 +1,4 @@
-"""How bad a leak is: as a flow, beside the pump's flow, as a speed of the piston, and against a repair limit."""
+"""Severity of a leak: as a flow, relative to the pump's flow, as a piston speed, and against a repair limit."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class RepairLimit:
 
     @classmethod
     def of(cls, text: str | None) -> RepairLimit:
-        """Return the limit that a text states as a flow or a speed with its unit, the default one for None."""
+        """Parse a repair limit, a flow or a speed with its unit; the default one for None."""
         if text is None:
             return cls(priors("verdict")["repair"]["creep"] * MM_PER_MINUTE, "creep", stated=False)
         for kind, unit in (("flow", "m^3/s"), ("creep", "m/s")):
@@ -56,7 +56,7 @@ class RepairLimit:
         return f"{self.value / MM_PER_MINUTE:.3g} mm/min of creep"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the limit as plain JSON values; the one that it does not state is null."""
+        """Return the limit as plain JSON values; the kind not stated is null."""
         return {
             "mL_per_min": self.value / ML_PER_MINUTE if self.kind == "flow" else None,
             "creep_mm_per_min": self.value / MM_PER_MINUTE if self.kind == "creep" else None,
@@ -66,7 +66,7 @@ class RepairLimit:
 
 @dataclass(frozen=True)
 class Severity:
-    """How bad a leak is, as far as the recording and what is known of the machine tell.
+    """Severity of a leak, as far as recording and machine tell.
 
     Each figure is None, where it is not known, or the figure and its 95 % interval: `mL_per_min`, mean flow while the
     leak is open; `pump_share`, that flow over the pump's mean flow; `creep_mm_per_min`, the speed at which the piston
@@ -80,7 +80,7 @@ class Severity:
 
     @property
     def level(self) -> Level | None:
-        """Level by the interval: `repair` where it is all over the limit, `monitor` where it is all under half of it.
+        """Level by the interval: `repair` if all over the limit, `monitor` if all under half of it.
 
         Else `plan`; None where the leak cannot be held against the limit.
         """
@@ -90,7 +90,7 @@ class Severity:
         return "repair" if low > 1.0 else "monitor" if high < 0.5 else "plan"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the severity as plain JSON values: each figure with `_interval` beside it, and the level."""
+        """Return the severity as plain JSON values: each figure, its `_interval`, and the level."""
         plain: dict[str, Any] = {"level": self.level}
         for name in ("mL_per_min", "pump_share", "creep_mm_per_min", "of_limit"):
             figure = getattr(self, name)
@@ -100,7 +100,7 @@ class Severity:
 
 
 def severity(evidence: Evidence, limit: RepairLimit) -> Severity | None:
-    """Return how bad the leak is that the evidence states; None where it states none, or nothing of its size."""
+    """Compute the severity of the leak in the evidence; None without a leak, or without its size."""
     if evidence.verdict != LEAK or (evidence.leak_lpm is None and evidence.relative is None):
         return None
     relative = evidence.relative or RelativeLeak()
@@ -115,7 +115,7 @@ def severity(evidence: Evidence, limit: RepairLimit) -> Severity | None:
 
 
 def beside_the_pump(evidence: Evidence, recording: Recording, machine: AssumedMachine) -> RelativeLeak | None:
-    """Return a leak of a stated L/min beside the flow of the assumed pump, and as a speed of the assumed piston.
+    """Compare a leak of a stated L/min with the assumed pump's flow; compute its speed of the assumed piston.
 
     None where no L/min is stated; without the share of the pump where neither its speed nor its angle is recorded.
     """
@@ -138,7 +138,7 @@ def _mean_speed(recording: Recording) -> float:
 
 
 def _figure(value: float | None, interval: tuple[float, float] | None, factor: float = 1.0) -> _Figure:
-    """Return a figure with its interval, without one where the interval is not stated."""
+    """Return a figure with its interval, times a factor; None where a number is missing or infinite."""
     if value is None or interval is None or not all(math.isfinite(number) for number in (value, *interval)):
         return None
     return factor * value, factor * interval[0], factor * interval[1]

@@ -1,4 +1,4 @@
-"""States of a machine as NAMUR NE 107 names them, from what a recording or a watched actuator shows.
+"""States of a machine by NAMUR NE 107, for a recording or a watched actuator.
 
 The tables are in `states.toml`: the states, the conditions that lead to them, the causes, and what is to be done.
 
@@ -53,7 +53,7 @@ def _tables() -> Mapping[str, Mapping[str, Any]]:
 def state_of(
     condition: str, cause: str | None = None, *, since_s: float | None = None, action: str | None = None
 ) -> MachineState:
-    """Return the state of a machine under a condition of `states.toml`; KeyError where the table has none of that name.
+    """Return the state of a machine under a condition of `states.toml`; KeyError for an unknown condition.
 
     `cause`: of the change, which proposes the action, and decides the state unless the machine leaks past piston or
     pump; `since_s`: clock [s]; `action`: in place of the table's.
@@ -68,7 +68,7 @@ def state_of(
 
 
 def action_of(condition: str, cause: str | None = None, parts: Sequence[str] = ()) -> str:
-    """Return what is to be done under a condition, or for the cause of a change; KeyError as for `state_of`.
+    """Return the action for a condition, or for the cause of a change; KeyError as for `state_of`.
 
     `parts`: what the machine has that leaks like a worn seal, and is looked at before its leak.
     """
