@@ -1,7 +1,4 @@
-"""Names and first lines of the rooms that read plainly: a variable is a noun, a function is a verb or a noun.
-
-A room that is made plain joins `ROOMS`, and stays so.
-"""
+"""Names and first lines read plainly: a variable is a noun, a function is a verb or a noun."""
 
 from __future__ import annotations
 
@@ -13,11 +10,7 @@ from pathlib import Path
 import pytest
 
 SOURCE = Path(__file__).resolve().parents[1] / "src" / "sealscope"
-ROOMS = (
-    *("physics", "signals", "control", "simulation", "evaluation", "campaigns", "fmu", "thesis", "parameters"),
-    *("storage", "calls.py", "units.py", "compiled.py", "numba_private.py", "numba_pipeline.py", "paragraphs.py"),
-)
-FILES = sorted(path for room in ROOMS for path in [*(SOURCE / room).rglob("*.py")] or [SOURCE / room])
+FILES = sorted(SOURCE.rglob("*.py"))
 #: Pronouns, prepositions and participles that say nothing of what a variable holds.
 VARIABLE = re.compile(
     r"about|alike|along|another|apart|aside|asked|at|beside|beyond|each|given|made|of|others|own|said|says|seen|settled"
@@ -29,9 +22,39 @@ FUNCTION = re.compile(
     r"|judged|kept|known|left|lent|listed|lost|moved|named|now|one|other|put|same|shown|some|stated|than|that|then|there"
     r"|these|this|those|together|too|what|which|whole|whose|within|written"
 )
-#: Public names and entries of users' files, which keep theirs.
+#: Names of public or saved fields and of methods that others call, which keep theirs.
 KEPT = {
+    ("__init__.py", "own"),
+    ("cli/options.py", "of"),
+    ("demo.py", "_judged"),
+    ("diagnosis/inference/blocks.py", "along"),
+    ("diagnosis/inference/blocks.py", "at"),
+    ("diagnosis/inference/pressures/evidence.py", "others"),
+    ("diagnosis/inference/pressures/response.py", "apart"),
+    ("diagnosis/learnt.py", "about"),
+    ("diagnosis/live/balance.py", "apart"),
+    ("diagnosis/live/estimates.py", "judged"),
+    ("diagnosis/live/estimates.py", "within"),
+    ("diagnosis/live/joining.py", "settled"),
+    ("diagnosis/live/known.py", "along"),
+    ("diagnosis/live/known.py", "own"),
+    ("diagnosis/live/known.py", "says"),
+    ("diagnosis/live/pressures.py", "begun"),
+    ("diagnosis/live/watch.py", "each"),
+    ("diagnosis/live/watch.py", "judged"),
+    ("diagnosis/verdict/diagnosis.py", "about"),
+    ("diagnosis/verdict/diagnosis.py", "of"),
+    ("diagnosis/verdict/machine.py", "stated"),
+    ("diagnosis/verdict/severity.py", "of"),
+    ("monitor/actuators.py", "taken"),
+    ("monitor/sources/sparkplug_host.py", "of"),
+    ("monitor/waiting.py", "put"),
     ("parameters/rig.py", "given"),
+    ("recordings/formats/columns.py", "counted"),
+    ("recordings/formats/columns.py", "listed"),
+    ("recordings/formats/text_layout.py", "about"),
+    ("recordings/formats/text_layout.py", "own"),
+    ("reporting/campaign/page_tables.py", "about"),
     ("simulation/bench/profile.py", "each"),
     ("simulation/experiment.py", "of"),
     ("simulation/faults.py", "at"),
@@ -74,7 +97,7 @@ def faults_of(tree: ast.AST, file: str) -> list[str]:
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.relative_to(SOURCE).as_posix())
-def test_a_room_reads_plainly(path: Path):
+def test_a_file_reads_plainly(path: Path):
     assert faults_of(ast.parse(path.read_text("utf-8")), path.relative_to(SOURCE).as_posix()) == []
 
 

@@ -83,7 +83,7 @@ def run(
 
 @campaign.command()
 def status(plan: PlanArgument, folder: FolderOption = None) -> None:
-    """Say how far a campaign is, and what is left."""
+    """Print the progress of a campaign, and what is left."""
     from sealscope.campaigns.execution.store import progress_of
     from sealscope.campaigns.plans.model import SimulatedPlan
     from sealscope.campaigns.plans.reader import load_plan

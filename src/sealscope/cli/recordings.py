@@ -54,7 +54,7 @@ def diagnose(
     quiet: Annotated[bool, Option("--quiet", "-q", help="Print the first line of each verdict only.")] = False,
     fail_on: Annotated[list[FailOn] | None, Option("--fail-on", metavar="VERDICT|LEVEL", help=_FAIL_ON)] = None,
 ) -> None:
-    """Say for each file whether oil bypasses the piston; with -v by every method.
+    """State for each file whether oil bypasses the piston; with -v by every method.
 
     With --machine also of folders, a line a recording. Exit status 1 where a file could not be read.
     """

@@ -35,7 +35,7 @@ class _Part(BaseModel):
 
 
 class WatchSettings(_Part):
-    """How an actuator is watched."""
+    """Settings of a watched actuator."""
 
     rig: Annotated[_Text, AfterValidator(_in_folder)] = "thesis"
     false_alarms_per_1000_h: float = Field(default=1.0, gt=0)
