@@ -224,7 +224,7 @@ def test_foreign_logs_without_times_may_be_of_another_day(call, strokes):
     done = call("diagnose", *files, "--baseline", *sorted(strokes.glob("healthy_*")), *FOREIGN, "--format", "jsonl")
     assert (done.status, done.err) == (0, "")
     for item in done.objects:
-        assert "maybe of another session or machine" in item["reason"]
+        assert "of which the sessions are not known" in item["reason"]
 
 
 def test_foreign_logs_with_a_map_and_a_rate(call, strokes, tmp_path):

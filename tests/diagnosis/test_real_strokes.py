@@ -94,17 +94,20 @@ def test_another_healthy_specimen_is_no_leak(sessions: dict[str, list[Recording]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("gain", "share"), [(1.0, 0.0), (1.5, 0.9)])
-def test_a_change_within_a_session_is_found(
-    gain: float, share: float, sessions: dict[str, list[Recording]], strokes: ModuleType
+@pytest.mark.parametrize("gain", [0.6, 1.0, 1.5])
+def test_a_change_within_a_session_is_named(
+    gain: float, sessions: dict[str, list[Recording]], strokes: ModuleType
 ) -> None:
-    """Pairs in turn as baseline; what is faster than d5 is scaled in the others of the session's second half."""
+    """Pairs in turn as baseline; what is faster than d5 is scaled in the others of the session's second half.
+
+    A fall of the ringing is stated beside what else makes it, without a position never as a leak; a rise is no leak.
+    """
     session = sessions["session_act_1_healthy"]
     baseline = [stroke for k, stroke in enumerate(session) if (k // 2) % 2 == 0]
-    later = [stroke for k, stroke in enumerate(session) if (k // 2) % 2 and k > len(session) // 2]
+    later = [stroke for k, stroke in enumerate(session) if (k // 2) % 2 and k > len(session) // 2][::3]
     verdicts = Counter(diagnose(strokes.louder(stroke, gain), baseline).verdict for stroke in later)
-    assert verdicts["leak"] >= share * len(later)
-    assert gain > 1.0 or verdicts["leak"] == 0
+    assert verdicts["cannot tell" if gain < 1.0 else "no leak"] >= 0.9 * len(later)
+    assert verdicts["leak"] == 0
 
 
 @pytest.mark.slow

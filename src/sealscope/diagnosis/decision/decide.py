@@ -120,7 +120,7 @@ def _sizes(leak: LeakMeasure, flow: Flow | None) -> dict[str, Any]:
 
 
 def _bound(case: Case, alarm: Question | None) -> float:
-    """Return the 95 % upper bound [m^3/s] of a leak over all explanations."""
+    """Return the 95 % upper bound [m^3/s] of a leak over all explanations; inf where it is more than the pump gives."""
     leak = case.leak
     if leak is None:
         return np.inf
@@ -130,7 +130,7 @@ def _bound(case: Case, alarm: Question | None) -> float:
         if flow is not None:
             deviation = np.hypot(flow.deviation, flow.value * leak.size_deviation)
             bound = max(bound, flow.value + WITHIN_95 * float(deviation))
-    return bound
+    return bound if bound < leak.pump_flow[0] or not leak.pump_flow[0] > 0.0 else np.inf
 
 
 def _bound_and_worth(case: Case, bound: float) -> tuple[float, float]:

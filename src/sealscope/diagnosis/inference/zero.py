@@ -11,7 +11,8 @@ coefficient, a random walk w of unknown size q, and a drift of the flow's zero,
 F (level and slope) and B (level, slope and curvature) are projected out. z maximises the restricted likelihood, over
 onsets and (q, kappa), times what is believed: a normal density of good sensors, and at small odds one of those far off.
 The walk is no larger than without z, or z and a walk that is free in every block explain what no leak does. Where the
-leak does not change nothing is known of z, it stays near zero, and nothing depends on it.
+leak does not change nothing is known of z, it stays near zero, and nothing depends on it. Of the two chambers behind a
+servo valve each tells of the same leak, step and zero: their whitened rows stand below each other.
 
 Source: D. A. Harville, J. Am. Statist. Assoc. 72 (1977) 320 (restricted likelihood).
 """
@@ -35,16 +36,21 @@ TRIED = 21
 def about_zero(blocks: Blocks, columns: Sequence[Columns]) -> Blocks:
     """Return the blocks with their sums taken about the zero of p_A - p_B that a change of the leak shows.
 
-    They are returned as they are where the balance has no offset of the flow, or too few blocks.
+    They are returned as they are where a balance has no offset of the flow, or too few blocks.
     """
     from scipy.optimize import minimize_scalar
 
-    if len(blocks) < FEWEST or len(columns) != 1 or columns[0].bias is None:
+    if len(blocks) < FEWEST or any(equation.bias is None for equation in columns):
         return blocks
-    effects = _effects(blocks.merged(priors("inference")["blocks"]["coarse"]), columns[0])
-    if effects is None:
+    coarse = blocks.merged(priors("inference")["blocks"]["coarse"])
+    known = [
+        effects
+        for k, equation in enumerate(columns)
+        if (effects := _effects(replace(coarse, gram=coarse.gram[:, k : k + 1]), equation)) is not None
+    ]
+    if not known:
         return blocks
-    within, offset, z = effects
+    within, offset, z = (np.concatenate(parts) for parts in zip(*known, strict=True))
     usual, far = (priors("inference")["zero"][name] for name in ("pressure", "far"))
     width = columns[0].zero_deviation(columns[0].leak, blocks)
     walks = WALKS[: int(_likelihoods(within, z, WALKS).argmax()) + 1]
@@ -61,10 +67,11 @@ def about_zero(blocks: Blocks, columns: Sequence[Columns]) -> Blocks:
     ends = [(positions[max(start - 1, 0)], positions[min(start + 1, TRIED - 1)]) for start in starts]
     fits = [minimize_scalar(cost, bounds=end, method="bounded", options={"xatol": 1e-3}) for end in ends]
     position = min(fits, key=lambda fit: fit.fun).x
-    zero, equation = width * float(np.sinh(position)), columns[0]
-    gram = blocks.gram.copy()
-    gram[:, 0, equation.leak] -= zero * gram[:, 0, equation.bias]
-    gram[:, 0, :, equation.leak] -= zero * gram[:, 0, :, equation.bias]
+    zero, gram = width * float(np.sinh(position)), blocks.gram.copy()
+    for k, equation in enumerate(columns):
+        assert equation.bias is not None
+        gram[:, k, equation.leak] -= zero * gram[:, k, equation.bias]
+        gram[:, k, :, equation.leak] -= zero * gram[:, k, :, equation.bias]
     return replace(blocks, gram=gram, zero=blocks.zero + zero)
 
 

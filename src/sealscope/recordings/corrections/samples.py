@@ -11,7 +11,7 @@ from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.corrections.clock import even_clock
 from sealscope.recordings.corrections.gaps import bridge, filled, holes, remove_dropouts, remove_impossible
 from sealscope.recordings.corrections.spikes import without_spikes
-from sealscope.recordings.corrections.stale import MOST_STUCK, stuck_rows, without_stale_samples
+from sealscope.recordings.corrections.stale import MOST_STUCK, frozen_rows, stuck_rows, without_stale_samples
 from sealscope.recordings.corrections.unsigned import with_signed_speed
 from sealscope.recordings.formats.columns import counted
 from sealscope.recordings.motion import runs_of
@@ -36,6 +36,9 @@ class CorrectedSamples(NamedTuple):
 def correct_samples(recording: Recording) -> CorrectedSamples:
     """Correct what loggers do to samples: spikes, stale samples, uneven clocks, missing signs, gaps."""
     part, findings = remove_dropouts(remove_impossible(recording)), list[Finding]()
+    if (frozen := frozen_rows(part)).any():
+        channels = {name: np.where(frozen, np.nan, values) for name, values in part.channels.items()}
+        part = replace(part, channels=channels)
     chambers = chambers_of(part)
     known = [name for name in part.channels if name in chambers or np.any(np.isfinite(part[name]))]
     part = part.only(known) if len(known) < len(part.channels) else part  # the pressures can do without

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.channels import SLOW, Array
-from sealscope.recordings.motion import quantum, stuck
+from sealscope.recordings.motion import find_holds, quantum, runs_of, stuck
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
 from sealscope.storage.toml_file import priors_of
@@ -69,6 +69,32 @@ def stuck_rows(recording: Recording, name: str) -> NDArray[np.bool_]:
         if not at_an_end and (not references or any(_moves_in(other, held) for other in references)):
             rows[held] = True
     return rows
+
+
+def frozen_rows(recording: Recording) -> NDArray[np.bool_]:
+    """Return the rows (n,) in which a logger repeats its last row: all channels stay the same for long.
+
+    Both chamber pressures stop together and go on together, for longer than a reading may be held
+    (`motion.find_holds`). A machine at rest behind a coarse converter settles, one pressure before the other.
+    """
+    rows = np.zeros(len(recording), dtype=bool)
+    pressures = [recording[name] for name in CHAMBERS if name in recording]
+    if len(pressures) < len(CHAMBERS) or len(recording) < _PRIORS["runs"]:
+        return rows
+    holds = [runs_of(find_holds(values, recording.rate).flags) for values in pressures]
+    moving = [values for name, values in recording.channels.items() if name not in CHAMBERS]
+    for first, length in holds[0].tolist():
+        stop = first + length
+        begins, ends = holds[1][:, 0], holds[1].sum(axis=1)
+        together = np.any((np.abs(begins - first) <= _LONGEST_REPEAT) & (np.abs(ends - stop) <= _LONGEST_REPEAT))
+        inner = slice(first + _LONGEST_REPEAT, stop - _LONGEST_REPEAT)
+        if together and first > 1 and stop < len(recording) and all(_same(values[inner]) for values in moving):
+            rows[first:stop] = True
+    return rows
+
+
+def _same(values: Array) -> bool:
+    return bool(np.isnan(values).all() or np.ptp(values) == 0.0)
 
 
 def _moves_in(values: Array, rows: NDArray[np.intp]) -> bool:
