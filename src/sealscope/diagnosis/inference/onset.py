@@ -261,12 +261,93 @@ def step_tests(information: Information, signs: Sequence[float], shape: Array | 
     shape : array of float, shape (K,), optional
         What a step of one adds to the coefficient in each block while it lasts, by default one.
     """
+    readings = _whiten(information)
+    if readings is None:
+        return []
+    steps = readings.turn @ readings.step_shapes(readings.positions, shape)
+    return [
+        _scan(sign * readings.z, steps, readings.eigen, readings.onsets, readings.unit, readings.believed)
+        for sign in signs
+    ]
+
+
+class StepSizes(NamedTuple):
+    """Steps at given onsets (o,): log-likelihood of each, its size and the size's standard deviation."""
+
+    likelihood: Array
+    size: Array
+    deviation: Array
+
+
+def step_sizes(information: Information, onsets: NDArray[np.intp], shape: Array, growth: float) -> StepSizes:
+    """Fit steps up at some of the onsets that a test tried, each with the walk that is likeliest beside it.
+
+    Parameters
+    ----------
+    information : Information
+    onsets : array of int, shape (o,)
+        Indices of `StepTest.onsets`.
+    shape : array of float, shape (K,)
+        What a step of one adds to the coefficient in each block while it lasts.
+    growth : float
+        How much larger, as a share, the step is at the end than at its onset.
+    """
+    readings = _whiten(information)
+    assert readings is not None
+    z, n = readings.z, len(readings.z)
+    steps = readings.turn @ readings.step_shapes(readings.positions[onsets], shape, growth)
+    weight = 1.0 / (1.0 + WALKS[:, None] * readings.eigen)
+    total = np.maximum((weight * z**2).sum(axis=1), np.finfo(float).tiny)
+    lead, square = (weight * z) @ steps, np.maximum(weight @ steps**2, np.finfo(float).tiny)
+    rest = np.maximum(total[:, None] - np.maximum(lead, 0.0) ** 2 / square, 1e-12 * total[:, None])
+    likelihoods = 0.5 * np.log(weight).sum(axis=1)[:, None] + readings.believed[:, None] - 0.5 * n * np.log(rest / n)
+    chosen = likelihoods.argmax(axis=0), np.arange(len(onsets))
+    return StepSizes(likelihoods[chosen], (lead / square)[chosen], np.sqrt(rest / n / square)[chosen])
+
+
+class _Whitened(NamedTuple):
+    """Readings z (n,) of a coefficient, its level and slope set aside, in the walk's eigenvectors.
+
+    `turn` (n, K) makes of a coefficient's blocks what it adds to z; `eigen` (n,) of the walk, times `unit`;
+    `positions` (o,) of onsets in blocks, at times `onsets` (o,); `believed`: logarithm of the density of each of
+    `WALKS`.
+    """
+
+    z: Array
+    turn: Array
+    eigen: Array
+    unit: float
+    positions: Array
+    onsets: Array
+    believed: Array
+
+    def step_shapes(self, positions: Array, shape: Array | None = None, growth: float = 0.0) -> Array:
+        """Compute steps at positions (o,) over the blocks, (K, o), times a `shape` (K,)."""
+        count = self.turn.shape[1]
+        steps = step_shapes(count, positions, growth)
+        if shape is not None:
+            steps[count - len(shape) :] *= shape[:, None]
+        return steps
+
+
+def step_shapes(count: int, positions: Array, growth: float = 0.0) -> Array:
+    """Compute steps of one at positions (o,) over K blocks, (K, o), that grow evenly by a share up to the end.
+
+    An onset within a block is a part of a step there.
+    """
+    since = np.arange(count)[:, None] + 1.0 - positions
+    steps = np.clip(since, 0.0, 1.0)
+    return np.asarray(steps * (1.0 + growth * np.clip((since - 0.5) / np.maximum(count - positions, 1.0), 0.0, 1.0)))
+
+
+def _whiten(information: Information) -> _Whitened | None:
+    """Return readings of a coefficient with its level and slope set aside; None where too few blocks say anything."""
     time, precision, vector = _with_level(information)
     count = len(time)
     values, vectors = np.linalg.eigh(precision)
     kept = values > RANK * max(float(values[-1]), 0.0)
     if count < FEWEST or np.count_nonzero(kept) < FEWEST:
-        return []
+        return None
     root = np.sqrt(values[kept])
     design = (vectors[:, kept] * root).T
     z = (vectors[:, kept].T @ vector) / root
@@ -281,12 +362,16 @@ def step_tests(information: Information, signs: Sequence[float], shape: Array | 
     unit = len(free) / max(float(np.trace(covariance)), np.finfo(float).tiny)
     eigen, basis = np.linalg.eigh(unit * covariance)
     positions = np.arange(EDGE, count - EDGE + 1e-9, 1.0 / PARTS)
-    steps = np.clip(index[:, None] + 1.0 - positions, 0.0, 1.0)
-    if shape is not None:
-        steps[count - len(shape) :] *= shape[:, None]
-    z, steps, eigen = basis.T @ (free @ z), basis.T @ (inner @ steps), np.maximum(eigen, 0.0)
-    onsets, believed = _onset_times(time, positions), -np.log1p(WALKS * unit * count / information.walk**2)
-    return [_scan(sign * z, steps, eigen, onsets, unit, believed) for sign in signs]
+    believed = -np.log1p(WALKS * unit * count / information.walk**2)
+    return _Whitened(
+        basis.T @ (free @ z),
+        basis.T @ inner,
+        np.maximum(eigen, 0.0),
+        unit,
+        positions,
+        _onset_times(time, positions),
+        believed,
+    )
 
 
 def two_sided(information: Information) -> StepTest | None:

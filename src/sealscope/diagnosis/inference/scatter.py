@@ -35,6 +35,7 @@ import numpy as np
 
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, solve, total
 from sealscope.diagnosis.inference.rows.weak_form import LARGEST
+from sealscope.diagnosis.inference.terms import ORIFICE
 from sealscope.diagnosis.priors import priors
 from sealscope.recordings.recording import Array
 
@@ -436,6 +437,59 @@ def _about_own(sums: Array, columns: Sequence[Columns]) -> Array:
     return reduced
 
 
+class LawFit(NamedTuple):
+    """How the law of an orifice describes a rise, beside the laminar one.
+
+    `regression` of its flow on p_A - p_B [Pa^-0.5], all else eliminated; `log_ratio` of the likelihoods a row, by the
+    residuals that either leaves.
+    """
+
+    regression: float
+    log_ratio: float
+
+
+def compare_laws(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[Columns]) -> LawFit | None:
+    """Compare the law of an orifice with the laminar one by what a recording leaves of the healthy ones' balance.
+
+    None where the columns hold no such law, or nothing tells.
+    """
+    if any(ORIFICE not in column.names for column in columns):
+        return None
+    reference = np.sum([recording.sums for recording in baseline], axis=0)
+    grams, leads, square = np.zeros((2, 2)), np.zeros(2), 0.0
+    for e, column in enumerate(columns):
+        sums, tests = judged.sums[e], [column.leak, column.names.index(ORIFICE)]
+        residual, nuisance, prior = _left_over(sums, reference[e], column)
+        tied = sums[np.ix_(nuisance, nuisance)] + np.diag(prior)
+        solved = solve(tied, np.column_stack([sums[np.ix_(nuisance, tests)], residual[nuisance]]))
+        grams += sums[np.ix_(tests, tests)] - sums[np.ix_(tests, nuisance)] @ solved[:, :2]
+        leads += residual[tests] - sums[np.ix_(tests, nuisance)] @ solved[:, 2]
+        square += float(residual[-1] - residual[nuisance] @ solved[:, 2])
+    energy = np.diag(grams)
+    if not energy.min() > 0.0 or not grams[0, 1] > 0.0:
+        return None
+    left = np.maximum(square - leads**2 / energy, 1e-9 * abs(square) + TINY)
+    return LawFit(float(grams[0, 1] / energy[0]), float(-0.5 * np.log(left[1] / left[0])))
+
+
+def _left_over(sums: Array, reference: Array, column: Columns) -> tuple[Array, list[int], Array]:
+    """Return what a recording's left side leaves of the others' balance, as products with all columns, itself last.
+
+    With the columns that may differ, and the precision of what is believed of their differences.
+    """
+    chosen = [k for k in column.compared if k == column.leak or np.isfinite(column.between[k])]
+    coefficients = np.zeros(len(sums))
+    coefficients[chosen] = -solve(reference[np.ix_(chosen, chosen)], reference[chosen, column.left])
+    nuisance = [k for k in chosen if k != column.leak]
+    size = np.abs(coefficients[nuisance])
+    with np.errstate(divide="ignore", over="ignore"):
+        prior = 1.0 / (size * column.between[nuisance]) ** 2
+    coefficients[column.left] = 1.0
+    residual = sums @ coefficients
+    residual[column.left] = coefficients @ residual
+    return residual, nuisance, np.minimum(prior, 1e9 * np.diag(sums)[nuisance])
+
+
 def _rises(sums: Array, reference: Array, columns: Sequence[Columns], widths: Array) -> tuple[Array, Array]:
     """Return the rise (s,) of the leak's coefficient in one recording's sums (E, m, m) beyond others', and its error.
 
@@ -444,13 +498,7 @@ def _rises(sums: Array, reference: Array, columns: Sequence[Columns], widths: Ar
     """
     precision, vector = np.zeros((2, len(widths)))
     for e, column in enumerate(columns):
-        chosen = [k for k in column.compared if k == column.leak or np.isfinite(column.between[k])]
-        coefficients = solve(reference[e][np.ix_(chosen, chosen)], reference[e][chosen, column.left])
-        residual = sums[e][:, column.left] - sums[e][:, chosen] @ coefficients
-        nuisance = [k for k in chosen if k != column.leak]
-        size = np.abs(coefficients[[chosen.index(k) for k in nuisance]])
-        with np.errstate(divide="ignore", over="ignore"):
-            prior = 1.0 / (size * column.between[nuisance]) ** 2
+        residual, nuisance, prior = _left_over(sums[e], reference[e], column)
         matrix, cross = sums[e][np.ix_(nuisance, nuisance)], sums[e][nuisance, column.leak]
         right = np.column_stack([cross, residual[nuisance]])
         for s, width in enumerate(widths):

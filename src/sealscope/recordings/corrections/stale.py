@@ -28,6 +28,8 @@ _JUMP = 1.5
 _TOLD = 2**18
 #: Longest run of repeated rows.
 _LONGEST_REPEAT = 3
+#: Share of a channel's changes that a leap exceeds.
+_LEAP = 0.99
 
 
 def without_stale_samples(recording: Recording) -> tuple[Recording, list[Finding]]:
@@ -75,26 +77,40 @@ def frozen_rows(recording: Recording) -> NDArray[np.bool_]:
     """Return the rows (n,) in which a logger repeats its last row: all channels stay the same for long.
 
     Both chamber pressures stop together and go on together, for longer than a reading may be held
-    (`motion.find_holds`). A machine at rest behind a coarse converter settles, one pressure before the other.
+    (`motion.find_holds`), at what they were, and something leaps at the end. A machine at rest goes on from there.
     """
     rows = np.zeros(len(recording), dtype=bool)
     pressures = [recording[name] for name in CHAMBERS if name in recording]
     if len(pressures) < len(CHAMBERS) or len(recording) < _PRIORS["runs"]:
         return rows
     holds = [runs_of(find_holds(values, recording.rate).flags) for values in pressures]
-    moving = [values for name, values in recording.channels.items() if name not in CHAMBERS]
+    channels = list(recording.channels.values())
     for first, length in holds[0].tolist():
         stop = first + length
         begins, ends = holds[1][:, 0], holds[1].sum(axis=1)
         together = np.any((np.abs(begins - first) <= _LONGEST_REPEAT) & (np.abs(ends - stop) <= _LONGEST_REPEAT))
         inner = slice(first + _LONGEST_REPEAT, stop - _LONGEST_REPEAT)
-        if together and first > 1 and stop < len(recording) and all(_same(values[inner]) for values in moving):
+        if (
+            together
+            and first > 1
+            and stop < len(recording)
+            and all(_is_constant(values[inner]) for values in channels)
+            and not any(_leaps(values, first) for values in channels)
+            and any(_leaps(values, stop) for values in channels)
+        ):
             rows[first:stop] = True
     return rows
 
 
-def _same(values: Array) -> bool:
+def _is_constant(values: Array) -> bool:
     return bool(np.isnan(values).all() or np.ptp(values) == 0.0)
+
+
+def _leaps(values: Array, row: int) -> bool:
+    """Test whether a channel changes about a sample by more than it does elsewhere between samples."""
+    change = np.abs(values[min(row + _LONGEST_REPEAT, len(values) - 1)] - values[max(row - _LONGEST_REPEAT - 1, 0)])
+    usual = np.nanquantile(np.abs(values[2 * _LONGEST_REPEAT + 1 :] - values[: -2 * _LONGEST_REPEAT - 1]), _LEAP)
+    return bool(change > usual)
 
 
 def _moves_in(values: Array, rows: NDArray[np.intp]) -> bool:

@@ -8,9 +8,10 @@ from functools import cached_property
 
 import numpy as np
 
+from sealscope.diagnosis.inference.leak_law import EXPONENTS, rise_flow, step_flow
 from sealscope.diagnosis.inference.observable import Flow, Remark
 from sealscope.diagnosis.inference.onset import BELOW_95, WITHIN_95, Interval, StepTest
-from sealscope.diagnosis.inference.scatter import RecordingSums, Rise, conditions_beyond, rise
+from sealscope.diagnosis.inference.scatter import RecordingSums, Rise, compare_laws, conditions_beyond, rise
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak, TotalLeakage
@@ -47,20 +48,11 @@ class BalanceLeak:
 
     @cached_property
     def step_flow(self) -> Flow:
-        """Mean flow of the step while it lasts, its law between laminar and an orifice's, by their likelihoods."""
-        balance, laws = self.balance, self.balance.laws
-        if balance.test is None or not laws:
+        """Mean flow of the step while it lasts, over laws, growths and onsets by their likelihoods."""
+        balance, test = self.balance, self.balance.test
+        if test is None:
             return Flow(0.0, np.inf)
-        onset = balance.test.onset().value
-        driving = [balance.mean_of_blocks(law.driving, onset) for law in laws]
-        flows, deviations = (
-            np.array([law.test.fitted[k] * mean for law, mean in zip(laws, driving, strict=True)]) for k in (0, 1)
-        )
-        weights = np.exp(0.5 * np.array([law.test.score - max(law.test.score for law in laws) for law in laws]))
-        weights /= weights.sum()
-        value = float(weights @ flows)
-        spread = float(np.sqrt(weights @ (deviations**2 + (flows - value) ** 2)))
-        return self._with_law(Flow(value, spread))
+        return self._with_law(step_flow(balance.blocks, balance.columns, balance.leak, test))
 
     @property
     def step_driving(self) -> float:
@@ -79,12 +71,35 @@ class BalanceLeak:
             return None
         return rise(self.balance.recording_sums, self.healthy, self.balance.columns)
 
-    @property
+    @cached_property
     def rise_flow(self) -> Flow:
-        """The rise, or without healthy recordings the leakage in all, as a mean flow."""
-        interval = self.balance.level if self.rise is None else Interval(self.rise.value, *self.rise.interval())
-        value, low, high = (self.balance.mean_pressure() * end for end in interval)
-        return self._with_law(Flow(value, (high - low) / (2.0 * WITHIN_95)))
+        """The rise while it lasts, over laws and onsets, or without healthy recordings the leakage in all."""
+        balance = self.balance
+        if self.rise is None:
+            value, low, high = (balance.mean_pressure() * end for end in balance.level)
+            return self._with_law(Flow(value, (high - low) / (2.0 * WITHIN_95)))
+        low, high = self.rise.interval()
+        flow = rise_flow(
+            balance.blocks,
+            balance.columns,
+            balance.leak,
+            self.step,
+            (self.rise.value, (high - low) / (2.0 * WITHIN_95)),
+            self._rise_laws(),
+            balance.moving,
+        )
+        return self._with_law(flow)
+
+    def _rise_laws(self) -> list[tuple[float, float]]:
+        """Return the mean flow of a rise of one under each of `EXPONENTS`, and the logarithm of the law's weight."""
+        balance, pressure = self.balance, self.balance.mean_pressure()
+        law = compare_laws(balance.recording_sums, self.healthy, balance.columns)
+        if law is None:
+            return [(pressure, 0.0)] * len(EXPONENTS)
+        root = balance.mean_of_blocks(balance.blocks.driving(root=True)) / law.regression
+        readings: float = priors("inference")["size"]["readings"]
+        shares = 2.0 * (1.0 - np.array(EXPONENTS))
+        return [(pressure ** (1.0 - share) * root**share, share * readings * law.log_ratio) for share in shares]
 
     @property
     def excess(self) -> float | None:

@@ -11,7 +11,6 @@ import numpy as np
 
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, information, mean_of, zero_of
 from sealscope.diagnosis.inference.changes.volumes import volume_observables
-from sealscope.diagnosis.inference.leak_law import LeakLaw, leak_laws
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import WITHIN_95, Course, Information, Interval, StepTest, course, step_test
 from sealscope.diagnosis.inference.scatter import RecordingSums
@@ -76,11 +75,6 @@ class RecordedBalance:
     def test(self) -> StepTest | None:
         """Test of a step of the leak's coefficient."""
         return step_test(self.leak)
-
-    @cached_property
-    def laws(self) -> tuple[LeakLaw, ...]:
-        """Tests of a step of the leak under each law of its flow over the pressure difference."""
-        return leak_laws(self.blocks, self.columns, self.leak)
 
     @cached_property
     def observables(self) -> tuple[Observable, ...]:
