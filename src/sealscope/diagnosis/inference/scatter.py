@@ -438,7 +438,7 @@ def _about_own(sums: Array, columns: Sequence[Columns]) -> Array:
 
 
 class LawFit(NamedTuple):
-    """How the law of an orifice describes a rise, beside the laminar one.
+    """Fit of an orifice's law to a rise, beside the laminar law.
 
     `regression` of its flow on p_A - p_B [Pa^-0.5], all else eliminated; `log_ratio` of the likelihoods a row, by the
     residuals that either leaves.
@@ -468,14 +468,14 @@ def compare_laws(judged: RecordingSums, baseline: Sequence[RecordingSums], colum
     energy = np.diag(grams)
     if not energy.min() > 0.0 or not grams[0, 1] > 0.0:
         return None
-    left = np.maximum(square - leads**2 / energy, 1e-9 * abs(square) + TINY)
-    return LawFit(float(grams[0, 1] / energy[0]), float(-0.5 * np.log(left[1] / left[0])))
+    unexplained = np.maximum(square - leads**2 / energy, 1e-9 * abs(square) + TINY)
+    return LawFit(float(grams[0, 1] / energy[0]), float(-0.5 * np.log(unexplained[1] / unexplained[0])))
 
 
 def _left_over(sums: Array, reference: Array, column: Columns) -> tuple[Array, list[int], Array]:
-    """Return what a recording's left side leaves of the others' balance, as products with all columns, itself last.
+    """Compute the residual of a recording under the others' balance, as products with all columns, itself last.
 
-    With the columns that may differ, and the precision of what is believed of their differences.
+    Returned with the columns that may differ, and the prior precision of their differences.
     """
     chosen = [k for k in column.compared if k == column.leak or np.isfinite(column.between[k])]
     coefficients = np.zeros(len(sums))

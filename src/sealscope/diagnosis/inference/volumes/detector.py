@@ -92,11 +92,12 @@ class VolumeBalance:
                 return f"{name} is constant or missing"
         return None
 
-    def balance(self, recording: Recording, odds: float = 0.0) -> RecordedBalance | None:
+    def balance(self, recording: Recording, odds: float | None = None) -> RecordedBalance | None:
         """Return the recording's balance; None if it has none.
 
         Of several it is the one with the smallest bound. Without a recorded position a balance says nothing, unless
-        the pump surely makes good its loss. `odds`: log odds by other recordings that the pump is cut off at rest.
+        the pump surely makes good its loss. `odds`: log odds by healthy recordings that the pump is cut off at rest, by
+        default its own.
         """
         balances = equations(self.rig, frozenset(recording.channels))
         if not balances:
@@ -119,7 +120,9 @@ class VolumeBalance:
             ]
             return min(answering, key=lambda candidate: BalanceLeak(self.name, candidate).bound_flow, default=None)
         recorded = self._recorded(recording)
-        return None if recorded is None else self._balance(recording, recorded.regime(recorded.odds + odds))
+        if recorded is None:
+            return None
+        return self._balance(recording, recorded.regime(recorded.odds if odds is None else odds))
 
     def _recorded(self, recording: Recording) -> RecordedBlocks | None:
         return remembered(recording, (self.name, self.rig), lambda samples: recorded_blocks(samples, self.rig), _READ)
@@ -151,7 +154,7 @@ class VolumeBalance:
 
     def next_rise(self, lessons: Sequence[Lesson], channels: frozenset[str], repeated: int = 1) -> Rise:
         """Return the rise of a healthy recording like these on a later day, as after `repeated` times as many days."""
-        shut = self._odds_of(lessons, channels) > 0.0
+        shut = (self._odds_of(lessons, channels) or 0.0) > 0.0
         healthy = [_sums_of(lesson, shut) for lesson in lessons]
         later = [sums._replace(start_s=_later(sums, k)) for k in range(repeated) for sums in healthy]
         flow, pressure = (float(np.median([lesson[name] for lesson in lessons])) for name in ("flow", "pressure"))
@@ -159,22 +162,25 @@ class VolumeBalance:
         dated = next((sums for sums in healthy if sums.start_s is not None), middle)
         return rise(middle._replace(start_s=_later(dated, repeated)), later, self._columns(channels, shut))
 
-    def _odds_of(self, lessons: Sequence[Lesson], channels: frozenset[str]) -> float:
-        """Compute the log odds, by healthy recordings, that the pump is cut off at rest.
+    def _odds_of(self, lessons: Sequence[Lesson], channels: frozenset[str]) -> float | None:
+        """Compute the log odds, by healthy recordings, that the pump is cut off at rest; None where none of them rests.
 
-        Of enough recordings by how far their leakage scatters under either hypothesis, the ratio of the likelihoods of
-        an unknown scale: that under which healthy recordings agree also shows the smaller leak. Of fewer by the sum of
-        what each says of itself.
+        What each says of itself counts once, as its errors are those of the others. Of enough recordings so does how
+        far their leakage scatters under either hypothesis, the ratio of the likelihoods of an unknown scale. A judged
+        recording has no say: a leak past the piston makes rests like motion.
         """
         known = [lesson for lesson in lessons if "shut_sums" in lesson]
+        if not known:
+            return None
+        recorded_odds = float(np.mean([lesson.get("shut_odds", 0.0) for lesson in known]))
         if len(known) < FEWEST_THAT_SCATTER:
-            return float(sum(lesson.get("shut_odds", 0.0) for lesson in lessons))
+            return recorded_odds
         scatter = []
         for shut in (False, True):
             sums = [_sums_of(lesson, shut) for lesson in known]
             values = leave_one_out(sums, self._columns(channels, shut))
             scatter.append(max(float(values.std(ddof=1)), np.finfo(float).tiny))
-        return (len(known) - 1) * float(np.log(scatter[0] / scatter[1]))
+        return recorded_odds + (len(known) - 1) * float(np.log(scatter[0] / scatter[1]))
 
     def _columns(self, channels: frozenset[str], shut: bool) -> list[Columns]:
         balances = equations(self.rig, channels)
