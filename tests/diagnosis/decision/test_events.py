@@ -20,7 +20,8 @@ from sealscope.diagnosis.inference.changes.levels import PATTERNS
 from sealscope.diagnosis.inference.changes.signals import observe_signals
 from sealscope.diagnosis.inference.changes.volumes import OUTSIDE, SCALE
 from sealscope.diagnosis.inference.pressures.response import PARAMETERS
-from sealscope.diagnosis.inference.terms import AIR, BIAS, circulation, equations, locked
+from sealscope.diagnosis.inference.terms import AIR, BIAS, TURNING, circulation, equations, locked
+from sealscope.diagnosis.inference.volumes.rivals import TURNING_DATA
 from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.rms_change.blocks import JUDGED
 from sealscope.diagnosis.verdict.evidence import Cause
@@ -52,7 +53,7 @@ def known_names() -> frozenset[str]:
     """Collect what providers report, as "data: name"."""
     names = {f"volumes: {name}" for name in volume_names()} | {f"response: {name}" for name in PARAMETERS}
     names |= {f"levels: {name}" for name, _ in PATTERNS} | {"levels: what feeds both chambers"}
-    names |= {"motion: motion", "sides: p_A beside p_B"}
+    names |= {"motion: motion", "sides: p_A beside p_B", f"{TURNING_DATA}: {TURNING}"}
     names |= {f"rise: {name}" for name in volume_names() if name == AIR or name.startswith("external leak")}
     names |= {f"levels: scale of {chamber}" for chamber in ("p_A", "p_B")}
     names |= {f"hum: hum of {hertz:g} Hz" for hertz in priors("inference.changes")["features"]["mains"]}

@@ -20,6 +20,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, FailFast, Field, create_model
 
+from sealscope.diagnosis.inference.circuit.locked_holds import HeldLeaks
 from sealscope.diagnosis.inference.terms import LEAK
 from sealscope.diagnosis.learnt import Learnt
 from sealscope.diagnosis.rms_change.blocks import DUTY
@@ -100,6 +101,8 @@ def _check_sums(lesson: Any) -> Any:
     shut = lesson.shut_sums
     if shut is not None and shut.shape != (1, size + 1, size + 1):
         raise ValueError(f"shut_sums must be of the shape (1, {size + 1}, {size + 1}), got {shut.shape}")
+    if lesson.held is not None and lesson.held.shape != (len(HeldLeaks._fields),):
+        raise ValueError(f"held must hold {len(HeldLeaks._fields)} numbers, got the shape {lesson.held.shape}")
     if LEAK not in lesson.terms:
         raise ValueError(f"terms must have {LEAK!r}, got {', '.join(lesson.terms)}")
     leak = lesson.terms.index(LEAK)
@@ -133,6 +136,7 @@ _BALANCE = make_table(
     scale=_Size,
     sums=_Array,
     shut_sums=(_Array, None),
+    held=(_Array, None),
     shut_odds=(_Number, None),
     flow=_Size,
     pressure=_Size,

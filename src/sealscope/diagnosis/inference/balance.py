@@ -10,7 +10,6 @@ import numpy as np
 
 from sealscope.control.drive import Drive
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, Weighting, solve
-from sealscope.diagnosis.inference.circuit.oil_column import with_oil_readings
 from sealscope.diagnosis.inference.onset import FEWEST
 from sealscope.diagnosis.inference.regimes import apply_regime, has_rests, shut_odds
 from sealscope.diagnosis.inference.rows.distribution import distribution
@@ -39,7 +38,7 @@ from sealscope.diagnosis.inference.terms import (
 )
 from sealscope.diagnosis.inference.zero import about_zero
 from sealscope.diagnosis.priors import priors
-from sealscope.recordings.channels import COUNTS, flow_source
+from sealscope.recordings.channels import flow_source
 from sealscope.recordings.corrections.gaps import holes
 from sealscope.recordings.quality import clipped
 from sealscope.recordings.recording import Array, Recording
@@ -196,7 +195,7 @@ class BlockStream:
         if self._finds_rests and self._still[0] < 0.0:
             signals = Signals(samples, self._rate, self._zeros)
             left, moved = self._balances[0].left(signals), signals.step("x")
-            self._still = _still_rate(left, self._rate), _still_rate(moved, self._rate)
+            self._still = still_rate(left, self._rate), still_rate(moved, self._rate)
         batch = max(1, AT_ONCE // length)
         cuts = [self._cut_rows(samples, k, min(k + batch, end)) for k in range(first, end, batch)]
         weights = np.concatenate([cut.weights for cut in cuts])
@@ -279,7 +278,7 @@ def _leaks(gram: Array, columns: Columns, count: int) -> float:
     return lead / max(float(np.sqrt(variance * energy)), np.finfo(float).tiny)
 
 
-def _still_rate(increments: Array, rate: float) -> float:
+def still_rate(increments: Array, rate: float) -> float:
     """Compute the largest mean rate at rest of what moves by increments: a share of that in motion, or its noise."""
     flow = increments[np.isfinite(increments)] * rate
     size = np.abs(flow)
@@ -404,10 +403,9 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
     if not pumped:
         return RecordedBlocks(_in_regime(recorded, balances, close, shut=None), None, 0.0)
     odds = shut_odds(recorded[0], recorded[1][0])
-    x = recording["x"] if recording.units["p_A"] != COUNTS else None
     return RecordedBlocks(
         _in_regime(recorded, balances, close, shut=False),
-        _in_regime(recorded, balances, close, True, x) if has_rests(recorded[0], recorded[1][0]) else None,
+        _in_regime(recorded, balances, close, shut=True) if has_rests(recorded[0], recorded[1][0]) else None,
         odds,
     )
 
@@ -417,20 +415,13 @@ def _in_regime(
     balances: tuple[Equation, ...],
     close: Callable[[float], tuple[Blocks, tuple[Columns, ...]] | None],
     shut: bool | None,
-    x: Array | None = None,
 ) -> RegimeBlocks:
-    """Return recorded blocks by a hypothesis, about their zero; None: the only one.
-
-    `x`: the position, if what is believed of the oil that valves shut in is to count.
-    """
+    """Return recorded blocks by a hypothesis, about their zero; None: the only one."""
     balances = tuple(shut_at_rest(balance) for balance in balances) if shut else balances
     columns = tuple(Columns(balance) for balance in balances)
 
     def turned(blocks: Blocks, streamed: tuple[Columns, ...]) -> Blocks:
-        if shut is None:
-            return blocks
-        applied = apply_regime(blocks, streamed[0], shut)
-        return applied if x is None else with_oil_readings(applied, columns, x)
+        return blocks if shut is None else apply_regime(blocks, streamed[0], shut)
 
     plain = turned(*recorded)
     blocks = about_zero(plain, columns)

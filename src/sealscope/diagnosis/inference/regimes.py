@@ -16,12 +16,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, solve
-from sealscope.diagnosis.inference.terms import BIAS, LEAK, REST_BIAS, REST_LEAK, RESTS, TURNING
+from sealscope.diagnosis.inference.terms import BIAS, LEAK, REST_BIAS, REST_LEAK, RESTS
 from sealscope.diagnosis.priors import priors
 from sealscope.recordings.recording import Array
 
@@ -82,34 +81,6 @@ def shut_odds(blocks: Blocks, columns: Columns) -> float:
     open_ = _log_normal(more, differing + (believed["open"] * motion) ** 2)
     most: float = believed["most"]
     return float(np.clip(shut - open_, -most, most))
-
-
-class HoldLeaks(NamedTuple):
-    """Leakage in the rests of a machine whose valves shut: conductances with standard deviations [m^3/(s Pa)].
-
-    `loaded`: what the side that carries loses, past the piston or to the outside; `pump`: what only motion tells.
-    """
-
-    loaded: tuple[float, float]
-    pump: tuple[float, float]
-
-
-def hold_leaks(blocks: Blocks, columns: Columns) -> HoldLeaks | None:
-    """Estimate what the seal passes while valves shut the pump out, from the blocks of `terms.shut_at_rest`.
-
-    Compliances and areas are those of the motion, of the same fit; deviations are of blocks whose errors differ. None
-    where the columns are of a pump that stays in the circuit.
-    """
-    if TURNING not in columns.names or len(blocks) < 2:
-        return None
-    gram, chosen = blocks.gram[:, 0], list(columns.nuisance)
-    coefficients, covariance = _sandwich(gram[:, chosen][:, :, chosen], gram[:, chosen, columns.left])
-    deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    loaded, pump = (
-        (float(coefficients[place]), float(deviations[place]))
-        for place in map(chosen.index, (columns.leak, columns.names.index(TURNING)))
-    )
-    return HoldLeaks(loaded, pump)
 
 
 def _sandwich(grams: Array, left: Array) -> tuple[Array, Array]:

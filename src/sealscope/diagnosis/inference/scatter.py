@@ -77,13 +77,15 @@ class Mixture(NamedTuple):
 class Rise(NamedTuple):
     """The leak's coefficient beyond the baseline's: `value` and its `deviation`, with `freedom` degrees of freedom.
 
-    `parts`: the mixture that it follows, where that is no single Student's law.
+    `parts`: the mixture that it follows, where that is no single Student's law; `at_most`: a leak that begins within
+    the recording raises it by anything up to its mean.
     """
 
     value: float
     deviation: float
     freedom: float
     parts: Mixture | None = None
+    at_most: bool = False
 
     @property
     def score(self) -> float:
@@ -113,6 +115,11 @@ class Rise(NamedTuple):
 
     def log_ratio(self, rise: float) -> float:
         """Return the logarithm of the likelihood of a true rise over that of none."""
+        if self.at_most and rise > 0.0:
+            densities = [self._log_density(self.value - part) for part in np.linspace(0.0, rise, NODES)]
+            if 0.0 < self.value < rise:
+                densities.append(self._log_density(0.0))
+            return float(np.logaddexp.reduce(densities) - np.log(len(densities))) - self._log_density(self.value)
         return self._log_density(self.value - rise) - self._log_density(self.value)
 
     def _log_density(self, value: float) -> float:
@@ -139,8 +146,8 @@ class RecordingSums(NamedTuple):
     """Sums over a recording of one machine, to be added to those of other recordings.
 
     `sums` (E, m, m) of its rows, the zero of its flow set aside; `flow` of the pump and `pressure`, mean sizes
-    [m^3/s], [Pa]; `start_s`: its date [s since 1970], and `oil_degC`, its oil's temperature, None where
-    they are not known.
+    [m^3/s], [Pa]; `start_s`: its date [s since 1970], `oil_degC`, its oil's temperature, and `held`, what its holds
+    leak (`locked_holds.HeldLeaks`), None where they are not known.
     """
 
     sums: Array
@@ -148,6 +155,7 @@ class RecordingSums(NamedTuple):
     pressure: float
     start_s: float | None = None
     oil_degC: float | None = None
+    held: Array | None = None
 
     @classmethod
     def from_blocks(
@@ -180,6 +188,47 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
     level, level_error = _level(everything, columns)
     errors = believed["own"] * np.median(np.column_stack([error, own_errors]), axis=1)
     errors = np.maximum(errors, max(believed["finest"] * by_flow, 1.0 / LARGEST))
+    return _compare_levels(judged, baseline, _Estimates(values, rises, errors, level, level_error))
+
+
+def held_rise(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> Rise | None:
+    """Estimate the rise of what passes the piston while valves shut the chambers; None where one of them holds nothing.
+
+    A leak that begins within the recording raises it by anything between nothing and its mean.
+    """
+    known = [recording.held for recording in baseline if recording.held is not None]
+    if judged.held is None or not known or len(known) < len(baseline):
+        return None
+    count, by_flow = len(known), judged.flow / judged.pressure if judged.pressure > 0.0 else 0.0
+    healthy = np.array(known)
+    level = float(healthy[:, 0].mean())
+    least = max(priors("inference")["scatter"]["finest"] * by_flow, 1.0 / LARGEST)
+    errors = np.maximum(np.median(np.append(healthy[:, 1], judged.held[1])), least)
+    values, rises = np.array([judged.held[0] - level]), (healthy[:, 0] - level)[None]
+    shown = _compare_levels(
+        judged, baseline, _Estimates(values, rises, errors[None], max(level, 0.0), errors / np.sqrt(count))
+    )
+    return shown._replace(at_most=True)
+
+
+class _Estimates(NamedTuple):
+    """Rises `values` (s,) of the judged recording, and `rises` (s, n) of the healthy ones, by each of s ways.
+
+    `errors` (s,) of one; `level` of all healthy ones, with its error.
+    """
+
+    values: Array
+    rises: Array
+    errors: Array
+    level: float
+    level_error: float
+
+
+def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], estimates: _Estimates) -> Rise:
+    """Compare rises with what healthy recordings let expect, their levels in logarithms."""
+    values, rises, errors, level, level_error = estimates
+    believed, by_flow = priors("inference")["scatter"], judged.flow / judged.pressure if judged.pressure > 0.0 else 0.0
+    decades = np.linspace(-FARTHEST, FARTHEST, SCALES) if len(values) == SCALES else np.zeros(len(values))
     starts, pause = (
         [recording.start_s for recording in (*baseline, judged)],
         3600.0 * priors("inference")["oil"]["shift"],

@@ -603,11 +603,7 @@ TURNING = "pump leak while it turns"
 
 
 def with_rests(equation: Equation) -> Equation:
-    """Add to a pump's balance the columns that count at rest, before those of the leak.
-
-    At rest the oil of the side that carries gives, and no other: valves may shut the sides from each other, and then
-    what a leak brings to the other side raises its pressure.
-    """
+    """Add to a pump's balance the columns that count at rest, before those of the leak."""
     left = equation.left
 
     def term(name: str, formula: str, unit: str, increments: Callable[[Signals], Array]) -> Term:
@@ -617,21 +613,7 @@ def with_rests(equation: Equation) -> Equation:
         term(REST_LEAK, "(p_A - p_B) dt", "m^3/(s Pa)", lambda s: s.stands(left) * s.pressure_difference * s.dt),
         term(REST_BIAS, "dt", "m^3/s", lambda s: s.stands(left) * s.dt),
     )
-    return equation._replace(terms=tuple(_where_loaded(term, left) for term in _before_leaks(equation, rests)))
-
-
-def _where_loaded(term: Term, left: Callable[[Signals], Array]) -> Term:
-    """Let a term of one side's oil count at rest only while that side carries; return other terms unchanged."""
-    sides = [name for name in ("p_A", "p_B") if name in term.needs]
-    if term.drift not in ("compliance", "air") or len(sides) != 1:
-        return term
-
-    def loaded(s: Signals) -> Array:
-        by_A = _middle(s.carried_by_A)
-        idle = s.stands(left) * ((1.0 - by_A) if sides == ["p_A"] else by_A)
-        return np.asarray((1.0 - idle) * term.increments(s))
-
-    return term._replace(increments=loaded)
+    return equation._replace(terms=_before_leaks(equation, rests))
 
 
 def shut_at_rest(equation: Equation) -> Equation:

@@ -8,10 +8,10 @@ from functools import cached_property
 
 import numpy as np
 
-from sealscope.diagnosis.inference.leak_law import EXPONENTS, rise_flow, step_flow
+from sealscope.diagnosis.inference.leak_law import EXPONENTS, mixed_flow, rise_flow, step_flow
 from sealscope.diagnosis.inference.observable import Flow, Remark
 from sealscope.diagnosis.inference.onset import BELOW_95, WITHIN_95, Interval, StepTest
-from sealscope.diagnosis.inference.scatter import RecordingSums, Rise, compare_laws, conditions_beyond, rise
+from sealscope.diagnosis.inference.scatter import RecordingSums, Rise, compare_laws, conditions_beyond, held_rise, rise
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak, TotalLeakage
@@ -66,10 +66,18 @@ class BalanceLeak:
 
     @cached_property
     def rise(self) -> Rise | None:
-        """Rise of the mean leakage beyond the healthy recordings, None without any."""
+        """Rise of the mean leakage beyond the healthy recordings, None without any; of holds alone where they tell."""
+        return self._swept_rise if self._held_rise is None else self._held_rise
+
+    @cached_property
+    def _swept_rise(self) -> Rise | None:
         if not self.healthy:
             return None
         return rise(self.balance.recording_sums, self.healthy, self.balance.columns)
+
+    @cached_property
+    def _held_rise(self) -> Rise | None:
+        return held_rise(self.balance.recording_sums, self.healthy) if self.balance.shut else None
 
     @cached_property
     def rise_flow(self) -> Flow:
@@ -78,17 +86,45 @@ class BalanceLeak:
         if self.rise is None:
             value, low, high = (balance.mean_pressure() * end for end in balance.level)
             return self._with_law(Flow(value, (high - low) / (2.0 * WITHIN_95)))
-        low, high = self.rise.interval()
+        swept = self._swept_rise
+        assert swept is not None
+        low, high = swept.interval()
         flow = rise_flow(
             balance.blocks,
             balance.columns,
             balance.leak,
             self.step,
-            (self.rise.value, (high - low) / (2.0 * WITHIN_95)),
+            (swept.value, (high - low) / (2.0 * WITHIN_95)),
             self._rise_laws(),
             balance.moving,
         )
+        held, believed = self._held_rise, priors("inference")["held_oil"]
+        if held is not None and held.chance < believed["rare"]:  # two ways that need not agree: it lies between them
+            flows = flow, self._held_flow(held)
+            flow = mixed_flow(np.array([1.0 - believed["right"], believed["right"]]), *np.array(flows).T)
         return self._with_law(flow)
+
+    def _held_flow(self, rise: Rise) -> Flow:
+        """Return the mean flow of what the holds show, over laws by their likelihoods."""
+        balance, held = self.balance, self.balance.chambers
+        assert held is not None
+        recording, (shape, zero) = balance.recording, held.piston
+        difference = np.abs(recording["p_A"] - recording["p_B"] - zero)[recording.t >= shape.onset]
+        units = [float(np.nanmean(difference**exponent)) for exponent in EXPONENTS]
+        levels = [held.level(shape._replace(exponent=exponent), zero) for exponent in EXPONENTS]
+        likelihoods = np.array([level.likelihood for level in levels])
+        low, high = rise.interval()
+        scatter = (high - low) / (2.0 * WITHIN_95) * units[0]
+        return mixed_flow(
+            np.exp(likelihoods - likelihoods.max()),
+            np.array([level.value * unit for level, unit in zip(levels, units, strict=True)]),
+            np.array(
+                [
+                    np.hypot(scatter, np.hypot(level.deviation, level.by_oil) * unit)
+                    for level, unit in zip(levels, units, strict=True)
+                ]
+            ),
+        )
 
     def _rise_laws(self) -> list[tuple[float, float]]:
         """Return the mean flow of a rise of one under each of `EXPONENTS`, and the logarithm of the law's weight."""
@@ -117,7 +153,7 @@ class BalanceLeak:
     @property
     def bound_flow(self) -> float:
         """95 % upper bound of the mean flow of a leak that began, or came since the healthy recordings [m^3/s]."""
-        test = self.step if self.rise is None else self.rise
+        test = self.step if self.rise is None else self._swept_rise
         if test is None:
             return np.inf
         size = float(np.hypot(self.balance.size.deviation, priors("inference")["size"]["law"]))

@@ -139,7 +139,8 @@ class VolumeBalance:
         """Return the lesson of a healthy recording (`scatter.RecordingSums`), by the terms of its balance.
 
         `scale` makes flows by the rig's displacement the machine's, 0 where its size is not stated. Where the machine
-        rests, `shut_sums` are those of a pump that is cut off then, `shut_odds` the log odds that it is.
+        rests, `shut_sums` are those of a pump that is cut off then, `held` what its holds leak, `shut_odds` the log
+        odds that it is.
         """
         recorded = self._recorded(recording) if equations(self.rig, frozenset(recording.channels)) else None
         balance = self.balance(recording) if recorded is None else self._balance(recording, recorded.open)
@@ -148,8 +149,9 @@ class VolumeBalance:
         scale = balance.size.scale if balance.size.stated else 0.0
         known = {name: value for name, value in balance.recording_sums._asdict().items() if value is not None}
         if recorded is not None and recorded.shut is not None:
-            shut = self._balance(recording, recorded.shut)
-            known |= {"shut_sums": shut.recording_sums.sums, "shut_odds": recorded.odds}
+            sums = self._balance(recording, recorded.shut).recording_sums
+            known |= {"shut_sums": sums.sums, "shut_odds": recorded.odds}
+            known |= {} if sums.held is None else {"held": sums.held}
         return {"terms": list(balance.columns[0].names), "scale": scale, **known}
 
     def next_rise(self, lessons: Sequence[Lesson], channels: frozenset[str], repeated: int = 1) -> Rise:
@@ -239,4 +241,5 @@ def _sums_of(lesson: Lesson, shut: bool = False) -> RecordingSums:
     sums = np.asarray(lesson["sums"], dtype=float)
     if shut:
         sums = np.asarray(lesson["shut_sums"]) if "shut_sums" in lesson else shut_without_rests(sums, lesson["terms"])
-    return RecordingSums(sums, lesson["flow"], lesson["pressure"], lesson.get("start_s"), lesson.get("oil_degC"))
+    held = np.asarray(lesson["held"], dtype=float) if shut and "held" in lesson else None
+    return RecordingSums(sums, lesson["flow"], lesson["pressure"], lesson.get("start_s"), lesson.get("oil_degC"), held)

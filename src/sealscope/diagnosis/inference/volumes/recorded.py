@@ -9,22 +9,28 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.blocks import Blocks, Columns, information, mean_of, zero_of
+from sealscope.diagnosis.inference.balance import still_rate
+from sealscope.diagnosis.inference.blocks import Blocks, Columns, information, mean_of, solve, zero_of
 from sealscope.diagnosis.inference.changes.volumes import volume_observables
+from sealscope.diagnosis.inference.circuit.locked_holds import CylinderSides, HeldChambers, find_holds
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import WITHIN_95, Course, Information, Interval, StepTest, course, step_test
 from sealscope.diagnosis.inference.scatter import RecordingSums
-from sealscope.diagnosis.inference.terms import LAG, PUMP, Equation
+from sealscope.diagnosis.inference.terms import LAG, LEAST_ABSOLUTE, PUMP, Equation, Signals, find_rests
 from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.evidence import RAREST
 from sealscope.diagnosis.verdict.machine import measures_flow
-from sealscope.recordings.channels import flow_source
+from sealscope.recordings.channels import COUNTS, flow_source
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.oil import oil_temperature
 from sealscope.recordings.recording import Array, Recording
+from sealscope.units import P_ATM
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
+
+#: Share of samples below which a pressure is that of the charge, and beyond which a position is an end of the stroke.
+CHARGED = 0.02
 
 
 class Size(NamedTuple):
@@ -85,7 +91,50 @@ class RecordedBalance:
     def recording_sums(self) -> RecordingSums:
         """Sums of the recording, for comparison with other recordings."""
         dated, oil = start_seconds(self.recording), oil_temperature(self.recording)
-        return RecordingSums.from_blocks(self.blocks, self.columns, dated, oil)
+        sums = RecordingSums.from_blocks(self.blocks, self.columns, dated, oil)
+        return sums if self.chambers is None else sums._replace(held=np.array(self.chambers.leaks))
+
+    @cached_property
+    def chambers(self) -> HeldChambers | None:
+        """The chambers while valves shut them from a resting pump; None where they do not, or too little is held."""
+        sides = self._sides() if self.shut and self.recording.units["p_A"] != COUNTS else None
+        if sides is None:
+            return None
+        recording, balance = self.recording, self.equations[0]
+        pressures = {name: recording[name] for name in ("p_A", "p_B")}
+        left = balance.left(Signals(dict(recording.channels), recording.rate, {}))
+        rests = find_rests(left, recording.rate, still_rate(left, recording.rate))
+        lowest = np.minimum(pressures["p_A"], pressures["p_B"])
+        least = float(np.nanquantile(lowest, CHARGED))
+        to_absolute = max(P_ATM, LEAST_ABSOLUTE - float(np.nanmin(lowest)))
+        channels = (recording.t, *(values + to_absolute for values in pressures.values()), recording["x"])
+        holds = find_holds(channels, rests, recording.rate)
+        ends = float(recording.t[0]), float(recording.t[-1])
+        return HeldChambers(holds, sides, *ends, least + to_absolute) if holds else None
+
+    def _sides(self) -> CylinderSides | None:
+        """Return the areas of both sides, with the sign of x, and the recorded stroke; None where motion shows none."""
+        column, total = self.columns[0], self.blocks.gram[:, 0].sum(axis=0)
+        chosen = list(column.nuisance)
+        found = dict(zip(chosen, solve(total[np.ix_(chosen, chosen)], total[chosen, column.left]), strict=True))
+        areas, energies = [], []
+        for side in "AB":
+            motion = [k for k in column.motion if column.names[k].endswith(f"{side} carries")]
+            energy = np.diag(total)[motion]
+            energies.append(float(energy.sum()))
+            areas.append(float(energy @ [found[k] for k in motion]) / max(energies[-1], np.finfo(float).tiny))
+        main = int(np.argmax(energies))
+        if self.rig.states("cylinder.A_A", "cylinder.A_B") and self.size.stated:
+            sign = np.sign(areas[main])
+            areas = [sign * area / self.size.scale for area in (self.rig.cylinder.A_A, self.rig.cylinder.A_B)]
+        if areas[0] * areas[1] <= 0.0:  # the other side never carries
+            areas[1 - main] = areas[main]
+        x = self.recording["x"][np.isfinite(self.recording["x"])]
+        low, high = (float(end) for end in np.quantile(x, (CHARGED, 1.0 - CHARGED))) if x.size else (0.0, 0.0)
+        unlike: float = priors("inference")["held_oil"]["unlike"]
+        if not (areas[main] and high > low and 1.0 / unlike < areas[0] / areas[1] < unlike):
+            return None
+        return CylinderSides(areas[0], areas[1], low, high)
 
     @cached_property
     def zero(self) -> float:

@@ -15,17 +15,22 @@ from sealscope.diagnosis.inference.blocks import Columns, solve
 from sealscope.diagnosis.inference.differences import difference
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.scatter import RISE, RecordingSums
-from sealscope.diagnosis.inference.terms import AIR, LEAK
+from sealscope.diagnosis.inference.terms import AIR, LEAK, TURNING
 from sealscope.diagnosis.priors import priors
 from sealscope.recordings.recording import Array
+
+#: Name of the data that what the turning pump loses is, where rests tell of the piston alone.
+TURNING_DATA = "turning"
 
 
 def rival_rises(
     judged: RecordingSums, healthy: Sequence[RecordingSums], columns: Sequence[Columns]
 ) -> tuple[Observable, ...]:
     """Compare each rival's coefficient in a recording with the healthy recordings'."""
-    names = columns[0].names
-    tested = [k for k, name in enumerate(names) if name == AIR or name.startswith("external leak")]
+    names, held = columns[0].names, held_rivals(judged, healthy)
+    tested = [k for k, name in enumerate(names) if name in (AIR, TURNING) or name.startswith("external leak")]
+    if held is not None:
+        tested = [k for k in tested if not names[k].startswith("external leak")]
     everything = np.sum([recording.sums for recording in healthy], axis=0)
     observables = []
     for k in tested:
@@ -33,7 +38,23 @@ def rival_rises(
             _shift(subject.sums, everything - subject.sums if subject is not judged else everything, columns, k)
             for subject in (judged, *healthy)
         ]
-        observable = difference(names[k], RISE, values[0], values[1:], above=names[k] != AIR)
+        data = TURNING_DATA if names[k] == TURNING else RISE
+        observable = difference(names[k], data, values[0], values[1:], above=names[k] != AIR)
+        observables += [] if observable is None else [observable]
+    return (*observables, *(held or ()))
+
+
+def held_rivals(judged: RecordingSums, healthy: Sequence[RecordingSums]) -> tuple[Observable, ...] | None:
+    """Compare what either side loses to the outside while valves shut the chambers; None where one holds nothing."""
+    known = [recording.held for recording in healthy if recording.held is not None]
+    if judged.held is None or len(known) < len(healthy):
+        return None
+    by_flow = judged.flow / judged.pressure if judged.pressure > 0.0 else 0.0
+    least, observables = priors("inference")["scatter"]["finest"] * by_flow, list[Observable]()
+    for k, side in ((2, "A"), (4, "B")):
+        numbers = [float(held[k]) for held in known]
+        error = max(float(np.median([judged.held[k + 1], *(held[k + 1] for held in known)])), least)
+        observable = difference(f"external leak {side}", RISE, float(judged.held[k]), numbers, error, above=True)
         observables += [] if observable is None else [observable]
     return tuple(observables)
 

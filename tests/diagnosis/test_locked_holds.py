@@ -1,0 +1,120 @@
+"""Chambers that valves shut: a piston leak moves oil from one to the other, a rod seal takes it from one alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sealscope.diagnosis.inference.circuit.locked_holds import (
+    CylinderSides,
+    HeldChambers,
+    LeakShape,
+    find_holds,
+)
+from sealscope.recordings.recording import Array
+from sealscope.units import P_ATM
+
+RATE, CYCLE, HELD = 100.0, 20.0, (4.0, 16.0)
+AREA_A, AREA_B, STROKE, FRAME = 9e-3, 4.6e-3, 0.2, 3e8
+KAPPA, CHARGE, DEAD = 7e-10, 5e5, 0.25
+LOADED = 1.5e7
+#: A conductance past the piston whose time constant is about that of a hold.
+SEAL = 2e-13
+
+
+def held_press(
+    seed: int = 0,
+    piston: float = 0.0,
+    outside: float = 0.0,
+    since: float = 0.0,
+    exponent: float = 1.0,
+    zero: float = 0.0,
+) -> HeldChambers:
+    """Record four cycles of a press whose frame gives and whose valves shut for twelve seconds of each.
+
+    A_A dx + V_A kappa dp_A = -q - e p_A and -A_B dx + V_B kappa dp_B = q, x as the frame gives; check valves keep both
+    chambers at the charge pressure at least.
+    """
+    random, count = np.random.default_rng(seed), round(4 * CYCLE * RATE)
+    t = np.arange(count) / RATE
+    phase = t % CYCLE
+    rests = (phase > HELD[0]) & (phase < HELD[1])
+    p_A, p_B, x = np.empty((3, count))
+    middle = 0.9 * STROKE
+    volumes = AREA_A * (middle + DEAD * STROKE), AREA_B * (STROKE - middle + DEAD * STROKE)
+    for k in range(count):
+        if not k or not rests[k]:
+            p_A[k], p_B[k] = (LOADED, CHARGE) if HELD[0] - 1.0 < phase[k] < HELD[1] else (CHARGE, CHARGE)
+            x[k] = middle + (p_A[k] * AREA_A - p_B[k] * AREA_B) / FRAME if phase[k] < HELD[1] else 0.05 * STROKE
+            continue
+        a, b, leaks = p_A[k - 1], p_B[k - 1], t[k] >= since
+        for _ in range(20):
+            difference = a - b
+            flow = leaks * piston * np.sign(difference) * abs(difference) ** exponent * 1e7 ** (1.0 - exponent)
+            lost = leaks * outside * a
+            matrix = np.array(
+                [
+                    [AREA_A**2 / FRAME + volumes[0] * KAPPA, -AREA_A * AREA_B / FRAME],
+                    [-AREA_A * AREA_B / FRAME, AREA_B**2 / FRAME + volumes[1] * KAPPA],
+                ]
+            )
+            step = np.linalg.solve(matrix, [-flow - lost, flow]) / (20.0 * RATE)
+            a, b = max(a + step[0], CHARGE), max(b + step[1], CHARGE)
+        p_A[k], p_B[k] = a, b
+        x[k] = middle + (a * AREA_A - b * AREA_B) / FRAME
+    noise = random.standard_normal((3, count))
+    channels = (t, p_A + zero + P_ATM + 3e3 * noise[0], p_B + P_ATM + 3e3 * noise[1], x + 2e-6 * noise[2])
+    holds = find_holds(channels, rests[1:], RATE)
+    sides = CylinderSides(AREA_A, AREA_B, 0.05 * STROKE, float(x.max()))
+    return HeldChambers(holds, sides, float(t[0]), float(t[-1]), CHARGE + P_ATM)
+
+
+def test_a_hold_of_twelve_seconds_sees_no_leak_where_there_is_none() -> None:
+    for seed in range(3):
+        leaks = held_press(seed).leaks
+        assert leaks.piston < 1e-3 * SEAL
+        assert max(leaks.outside_A, leaks.outside_B) < 1e-3 * SEAL
+
+
+@pytest.mark.parametrize("size", [0.1, 1.0])
+@pytest.mark.parametrize("zero", [-2e5, 0.0, 2e5])
+def test_the_piston_takes_from_one_side_what_it_brings_to_the_other(size: float, zero: float) -> None:
+    """The zero of p_A - p_B shows where the pressures have become equal."""
+    chambers = held_press(piston=size * SEAL, zero=zero)
+    assert chambers.leaks.piston == pytest.approx(size * SEAL, rel=0.25)
+    assert max(chambers.leaks.outside_A, chambers.leaks.outside_B) < 0.05 * size * SEAL
+    if size == 1.0:
+        assert chambers.piston[1] == pytest.approx(zero, abs=6e4)
+
+
+def test_a_rod_seal_takes_from_one_side_alone() -> None:
+    """Side B stays at the charge pressure: a check valve feeds it as the piston gives way."""
+    leaks = held_press(outside=SEAL).leaks
+    assert leaks.outside_A == pytest.approx(SEAL, rel=0.35)
+    assert max(leaks.piston, leaks.outside_B) < 0.05 * SEAL
+
+
+def test_a_leak_that_begins_within_the_recording_is_dated_by_the_holds() -> None:
+    chambers = held_press(piston=SEAL, since=47.0)
+    shape, _ = chambers.piston
+    assert shape.onset == pytest.approx(47.0, abs=3.0)
+    assert chambers.level(shape, 0.0).value == pytest.approx(SEAL, rel=0.3)
+
+
+def test_pressures_that_decay_tell_the_law_of_the_leak() -> None:
+    for exponent, other in ((1.0, 0.5), (0.5, 1.0)):
+        chambers = held_press(piston=SEAL, exponent=exponent)
+        likelihoods = {tried: chambers.level(LeakShape(0.0, tried), 0.0).likelihood for tried in (1.0, 0.5)}
+        assert likelihoods[exponent] > likelihoods[other] + 5.0
+
+
+def test_a_hold_with_a_missing_sample_and_one_that_is_short_are_left_out() -> None:
+    t: Array = np.arange(3000) / RATE
+    p = np.full(3000, 1e6)
+    x = np.full(3000, 0.1)
+    rests = ((t > 2.0) & (t < 6.0)) | ((t > 10.0) & (t < 10.5)) | ((t > 15.0) & (t < 20.0))
+    holds = find_holds((t, p, p, x), rests[1:], RATE)
+    assert [round(float(hold.t[0])) for hold in holds] == [2, 15]
+    p = p.copy()
+    p[400] = np.nan
+    assert len(find_holds((t, p, x, x), rests[1:], RATE)) == 1
