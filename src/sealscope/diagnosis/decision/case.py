@@ -116,9 +116,9 @@ class Case:
     @cached_property
     def other_event(self) -> OtherEvent | None:
         """The event other than a leak that surely explains the rarest change it can; None where none does."""
-        allowed = self.context.false_alarm_probability / max(
-            len({observable.data for observable in self.observables}), 1
-        )
+        share: float = _PRIORS["explanation"]["heading"]
+        allowed = share * self.context.false_alarm_probability
+        allowed /= max(len({observable.data for observable in self.observables}), 1)
         chances = {id(observable): self.null.chance(observable) for observable in self.observables}
         for observable in sorted(self.observables, key=lambda candidate: chances[id(candidate)]):
             if chances[id(observable)] >= allowed:

@@ -397,8 +397,9 @@ def _made_up(side: str) -> Term:
 LAG = "lag"
 _LAG = Term(LAG, "dv", "m^2 s", lambda s: s.acceleration_step(), "sensor fault", "motion", needs=("x",))
 #: What a pump loses the more, the faster it turns: its filling, and slip that no recorded pressure drives.
+SPEED_LOSS = "loss over speed"
 _SPEED_LOSS = Term(
-    "loss over speed",
+    SPEED_LOSS,
     "abs(v) dx",
     "m s",
     lambda s: _middle(np.abs(s.speed)) * s.step("x"),

@@ -15,7 +15,7 @@ from sealscope.diagnosis.inference.blocks import Columns, solve
 from sealscope.diagnosis.inference.differences import difference
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.scatter import RISE, RecordingSums
-from sealscope.diagnosis.inference.terms import AIR, LEAK, TURNING
+from sealscope.diagnosis.inference.terms import AIR, LEAK, SPEED_LOSS, TURNING
 from sealscope.diagnosis.priors import priors
 from sealscope.recordings.recording import Array
 
@@ -28,7 +28,8 @@ def rival_rises(
 ) -> tuple[Observable, ...]:
     """Compare each rival's coefficient in a recording with the healthy recordings'."""
     names, held = columns[0].names, held_rivals(judged, healthy)
-    tested = [k for k, name in enumerate(names) if name in (AIR, TURNING) or name.startswith("external leak")]
+    turns = (TURNING,) if SPEED_LOSS in names else ()  # what a meter reads has left the pump
+    tested = [k for k, name in enumerate(names) if name in (AIR, *turns) or name.startswith("external leak")]
     if held is not None:
         tested = [k for k in tested if not names[k].startswith("external leak")]
     everything = np.sum([recording.sums for recording in healthy], axis=0)
