@@ -122,7 +122,10 @@ class VolumeBalance:
         recorded = self._recorded(recording)
         if recorded is None:
             return None
-        return self._balance(recording, recorded.regime(recorded.odds if odds is None else odds))
+        believed = priors("inference")["rest"]
+        if odds is None or odds < believed["locked"]:  # a leak past the piston makes rests like motion
+            odds = (odds or 0.0) + float(np.clip(recorded.odds, -believed["alone"], believed["alone"]))
+        return self._balance(recording, recorded.regime(odds))
 
     def _recorded(self, recording: Recording) -> RecordedBlocks | None:
         return remembered(recording, (self.name, self.rig), lambda samples: recorded_blocks(samples, self.rig), _READ)
@@ -167,22 +170,25 @@ class VolumeBalance:
     def _odds_of(self, lessons: Sequence[Lesson], channels: frozenset[str]) -> float | None:
         """Compute the log odds, by healthy recordings, that the pump is cut off at rest; None where none of them rests.
 
-        What each says of itself counts once, as its errors are those of the others. Of enough recordings so does how
-        far their leakage scatters under either hypothesis, the ratio of the likelihoods of an unknown scale. A judged
-        recording has no say: a leak past the piston makes rests like motion.
+        Where each says by itself that pressures are held, they are: then a judged recording has no say, as a leak past
+        the piston makes its rests like motion. Else enough recordings tell by how far their leakage scatters under
+        either hypothesis, the ratio of the likelihoods of an unknown scale; fewer by the sum of what they say.
         """
         known = [lesson for lesson in lessons if "shut_sums" in lesson]
         if not known:
             return None
-        recorded_odds = float(np.mean([lesson.get("shut_odds", 0.0) for lesson in known]))
+        alone = [lesson.get("shut_odds", 0.0) for lesson in known]
+        if np.mean(alone) > priors("inference")["rest"]["locked"]:
+            return float(np.sum(alone))
         if len(known) < FEWEST_THAT_SCATTER:
-            return recorded_odds
+            most: float = priors("inference")["rest"]["alone"]
+            return float(np.sum(np.clip(alone, -most, most)))
         scatter = []
         for shut in (False, True):
             sums = [_sums_of(lesson, shut) for lesson in known]
             values = leave_one_out(sums, self._columns(channels, shut))
             scatter.append(max(float(values.std(ddof=1)), np.finfo(float).tiny))
-        return recorded_odds + (len(known) - 1) * float(np.log(scatter[0] / scatter[1]))
+        return (len(known) - 1) * float(np.log(scatter[0] / scatter[1]))
 
     def _columns(self, channels: frozenset[str], shut: bool) -> list[Columns]:
         balances = equations(self.rig, channels)
@@ -191,11 +197,14 @@ class VolumeBalance:
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
         """Return the steps of the balance's terms, and the leak against healthy recordings."""
         lessons = lessons_of(self, baseline)
-        balance = self.balance(recording, self._odds_of(lessons, frozenset(recording.channels)))
+        odds = self._odds_of(lessons, frozenset(recording.channels))
+        balance = self.balance(recording, odds)
         if balance is None:
             return Observed(self.name, lack=_NO_BALANCE["x" in recording].format(recording.duration))
         names = [name for name in balance.columns[0].names if name != TURNING]
-        return self._report(balance, [_sums_of(lesson, balance.shut) for lesson in lessons if lesson["terms"] == names])
+        locked = balance.shut and odds is not None and odds > priors("inference")["rest"]["locked"]
+        known = [_sums_of(lesson, balance.shut) for lesson in lessons if lesson["terms"] == names]
+        return self._report(balance, known if locked else [sums._replace(held=None) for sums in known])
 
     def observe_regimes(self, recording: Recording) -> Mapping[bool, Observed]:
         """Observe a recording by itself, with the pump in the circuit at rest (False) or cut off (True)."""
