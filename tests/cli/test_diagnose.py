@@ -306,9 +306,10 @@ def test_side_by_side_says_what_one_after_the_other_says(form, tmp_path, monkeyp
     assert beside.stdout.count(".nc") >= 4
 
 
-def test_five_lines_by_default_all_with_v_one_when_quiet(call, shell, recordings):
+@pytest.mark.usefixtures("verbose")
+def test_five_lines_by_default_all_with_v_one_when_quiet(call, recordings):
     short = call("diagnose", recordings / "leak.nc")
-    whole = shell("sealscope", "-v", "diagnose", recordings / "leak.nc")
+    whole = call("-v", "diagnose", recordings / "leak.nc")
     line = call("diagnose", "--quiet", recordings / "leak.nc")
     labels = [text[2:12].strip() for text in short.out.splitlines()[1:] if text[2:12].strip()]
     assert labels[:2] == ["state", "since"]

@@ -174,14 +174,14 @@ def write_for_ever(machines: list[ss.CommissionedMachine], path: Path) -> None:
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="kills as POSIX does")
 def test_a_file_is_whole_whenever_its_writer_is_killed(machine, folder, tmp_path):
-    """Each of 30 kills and more leaves one of the two machines, and so does each file that was kept."""
+    """Each of 10 kills and more leaves one of the two machines, and so does each file that was kept."""
     path = tmp_path / "actuator7.toml"
     machines = [machine, replace(machine, name="other", healthy=machine.healthy[:2])]
     for own in machines:
         ss.write_machine(own, path)
     draw, known = random.Random(7), {(own.name, len(own.healthy)) for own in machines}
     kills = 0
-    while kills < 30 or (kills < 300 and not any(tmp_path.glob(".*.part"))):
+    while kills < 10 or (kills < 300 and not any(tmp_path.glob(".*.part"))):
         kills += 1
         writer = get_context("fork").Process(target=write_for_ever, args=(machines, path))
         writer.start()
