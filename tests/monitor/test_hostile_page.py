@@ -265,6 +265,7 @@ def test_a_page_whose_server_ends_begins_again(server: PageServer):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="descriptors are counted in /proc")  # noqa: PTH112
 def test_eleven_hundred_silent_connections(tmp_path: Path):
     """A monitor with 1024 descriptors: its metrics are there, and its log stays small."""
