@@ -85,7 +85,7 @@ def fleet(random: np.random.Generator, days: Sequence[int], viscosity: float, wi
     ]
 
 
-@pytest.mark.parametrize("draws", [25, pytest.param(100, marks=[pytest.mark.slow, pytest.mark.long])])
+@pytest.mark.parametrize("draws", [16, pytest.param(100, marks=[pytest.mark.slow, pytest.mark.long])])
 @pytest.mark.parametrize("days", [(1, 1, 1, 2), (1, 1, 2, 2, 3, 3, 3, 4), (1, 1, 2, 2, 2, 2)])
 def test_a_day_of_other_oil_is_no_leak(days: Sequence[int], draws: int) -> None:
     """Between two days the viscosity differs as far as it is believed to."""
@@ -130,7 +130,7 @@ def test_days_that_are_known_narrow_what_another_day_may_be() -> None:
     random = np.random.default_rng(4)
 
     def deviation(days: int) -> float:
-        made = [fleet(random, [*np.repeat(range(days), 2), days], 0.01, PRIORS) for _ in range(10)]
+        made = [fleet(random, [*np.repeat(range(days), 2), days], 0.01, PRIORS) for _ in range(5)]
         return float(np.median([rise(judged, healthy, (COLUMNS,)).deviation for *healthy, judged in made]))
 
     assert deviation(1) > 1.5 * deviation(6) > 1.5 * deviation(30)
@@ -311,7 +311,7 @@ def warm_days(random: np.random.Generator, slope: float, judged: float, logged: 
     return rise(day(9, judged), [day(k, oil) for k, oil in enumerate(random.uniform(33.0, 52.0, 7))], (COLUMNS,))
 
 
-@pytest.mark.parametrize("draws", [10, pytest.param(40, marks=[pytest.mark.slow, pytest.mark.long])])
+@pytest.mark.parametrize("draws", [6, pytest.param(40, marks=[pytest.mark.slow, pytest.mark.long])])
 @pytest.mark.parametrize("logged", [True, False])
 def test_warm_oil_is_no_leak_and_its_interval_holds(logged: bool, draws: int) -> None:
     random = np.random.default_rng(9)

@@ -58,11 +58,11 @@ def test_the_predicted_smallest_leak_is_what_is_found(machine):
                 ss.simulate(command="3 sin(4t)", duration="20 s", leak=f"{share * smallest:.6g} L/min", seed=seed),
             ).verdict
             == "leak"
-            for seed in range(50, 56)
+            for seed in range(50, 54)
         ]
         for share in (0.2, 1.4)
     }
-    assert sum(result[1.4]) >= 5
+    assert sum(result[1.4]) >= 3
     assert sum(result[0.2]) <= 1
 
 
@@ -261,14 +261,17 @@ def test_another_actuator_is_named_and_is_no_leak(machine):
 def test_what_would_not_be_read_again_is_not_written(machine, tmp_path):
     """Marks grow a text up to the limit that all its readers have, within ten times its size in memory."""
     path = ss.write_machine(machine, tmp_path / "press.toml")
-    marks = tuple(JudgedAlarm(f"press-{k}", "repaired", 1.7e9 + k, 1.7e9 + k) for k in range(9000))
+    long = JudgedAlarm("press-0", "repaired", 1.7e9, 1.7e9, reason="x" * 9000)
     with pytest.raises(InputError, match="must be at most 1000000 bytes, got more"):
-        ss.write_machine(replace(machine, alarms=marks), path)
+        ss.write_machine(replace(machine, alarms=(long,) * 111), path)
     assert ss.read_machine(path).alarms == ()
-    ss.write_machine(replace(machine, alarms=marks[:7000]), path)
+    ss.write_machine(replace(machine, alarms=(long,) * 105), path)
+    assert len(ss.read_machine(path).alarms) == 105
+    marks = tuple(JudgedAlarm(f"press-{k}", "repaired", 1.7e9 + k, 1.7e9 + k) for k in range(1500))
+    ss.write_machine(replace(machine, alarms=marks), path)
     tracemalloc.start()
     try:
-        assert len(ss.read_machine(path).alarms) == 7000
+        assert len(ss.read_machine(path).alarms) == 1500
         assert ss.load_rig(path) == machine.rig
         assert tracemalloc.get_traced_memory()[1] < 10 * path.stat().st_size
     finally:
