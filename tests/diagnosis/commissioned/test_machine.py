@@ -27,7 +27,7 @@ def figures(diagnosis: ss.Diagnosis) -> tuple:
     return diagnosis.verdict, diagnosis.score, diagnosis.leak_lpm, diagnosis.bound_lpm, diagnosis.cause
 
 
-@settings(max_examples=3, deadline=None)
+@settings(max_examples=2, deadline=None)
 @given(
     leak=st.sampled_from(["none", "0.002 L/min", "0.02 L/min", "0.05 L/min from 10 s"]),
     channels=st.sampled_from([None, ("u", "p_A", "p_B")]),
