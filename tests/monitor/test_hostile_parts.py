@@ -181,7 +181,7 @@ def test_a_file_that_fails_is_read_twice_at_most(tmp_path: Path, monkeypatch):
     monkeypatch.setattr("sealscope.monitor.sources.folder.read_of_machine", read)
     (tmp_path / "a.csv").write_text("a")
     blocks = watched_folder(tmp_path, 0.05)
-    deadline, handed = time.monotonic() + 2.0, []
+    deadline, handed = time.monotonic() + 20.0, []
     while not handed and time.monotonic() < deadline:
         handed = blocks()
     refused, block = handed
