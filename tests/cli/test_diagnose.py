@@ -280,7 +280,7 @@ def test_every_real_stroke_gets_a_verdict(call, every):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("form", ["jsonl", "text"])
+@pytest.mark.parametrize("form", ["jsonl", pytest.param("text", marks=pytest.mark.long)])
 def test_side_by_side_says_what_one_after_the_other_says(form, tmp_path, monkeypatch):
     """In the order given, a bad file among them, to the byte, on both streams."""
     from typer.testing import CliRunner

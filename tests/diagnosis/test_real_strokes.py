@@ -78,7 +78,7 @@ def sessions() -> dict[str, list[Recording]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SESSIONS)
+@pytest.mark.parametrize("name", [SESSIONS[0], pytest.param(SESSIONS[1], marks=pytest.mark.long)])
 def test_later_strokes_of_a_session_are_no_leak(name: str, sessions: dict[str, list[Recording]]) -> None:
     """The first 20 strokes as baseline; at most 3 % of all later ones."""
     verdicts = Counter(within(stroke, sessions[name][:20]) for stroke in sessions[name][20::6])
@@ -113,6 +113,7 @@ def test_a_change_within_a_session_is_named(
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_healthy_against_its_own_other_half(healthy: list[Recording]) -> None:
     """Pairs of strokes (one of each direction) in turn: none of 30 alarms at 1 %."""
     halves = [[one for k, one in enumerate(healthy) if (k // 2) % 2 == half] for half in (0, 1)]

@@ -43,8 +43,8 @@ def rms_of(details_of):
     [  # each pair is compiled of its own, a law in each of them is in one of the first two
         pytest.param("fixed", False, id="fixed-free"),
         pytest.param("position", True, id="position-throttled"),
-        pytest.param("position", False, id="position-free", marks=pytest.mark.slow),
-        pytest.param("fixed", True, id="fixed-throttled", marks=pytest.mark.slow),
+        pytest.param("position", False, id="position-free", marks=[pytest.mark.slow, pytest.mark.long]),
+        pytest.param("fixed", True, id="fixed-throttled", marks=[pytest.mark.slow, pytest.mark.long]),
     ],
 )
 def test_each_run_is_what_it_is_by_itself(check_rig, rms_of, throttled, volumes):
