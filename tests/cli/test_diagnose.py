@@ -280,7 +280,7 @@ def test_every_real_stroke_gets_a_verdict(call, every):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("form", ["jsonl", "text"])
+@pytest.mark.parametrize("form", ["jsonl", pytest.param("text", marks=pytest.mark.long)])
 def test_side_by_side_says_what_one_after_the_other_says(form, tmp_path, monkeypatch):
     """In the order given, a bad file among them, to the byte, on both streams."""
     from typer.testing import CliRunner
@@ -306,9 +306,10 @@ def test_side_by_side_says_what_one_after_the_other_says(form, tmp_path, monkeyp
     assert beside.stdout.count(".nc") >= 4
 
 
-def test_five_lines_by_default_all_with_v_one_when_quiet(call, shell, recordings):
+@pytest.mark.usefixtures("verbose")
+def test_five_lines_by_default_all_with_v_one_when_quiet(call, recordings):
     short = call("diagnose", recordings / "leak.nc")
-    whole = shell("sealscope", "-v", "diagnose", recordings / "leak.nc")
+    whole = call("-v", "diagnose", recordings / "leak.nc")
     line = call("diagnose", "--quiet", recordings / "leak.nc")
     labels = [text[2:12].strip() for text in short.out.splitlines()[1:] if text[2:12].strip()]
     assert labels[:2] == ["state", "since"]

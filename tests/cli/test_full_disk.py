@@ -123,11 +123,11 @@ def test_a_clock_that_runs_backwards_changes_no_byte(
     assert result_of(plan, tmp_path / "back") == expected
 
 
-def test_a_home_and_a_cache_that_cannot_be_written(shell, recordings: Path) -> None:
+def test_a_home_and_a_cache_that_cannot_be_written(call, shell, recordings: Path) -> None:
     """The folders lie below a file, which root cannot write either."""
     nowhere = "/dev/null/home"
     away = {"HOME": nowhere, "XDG_CACHE_HOME": f"{nowhere}/cache", "XDG_CONFIG_HOME": nowhere, "MPLCONFIGDIR": nowhere}
     words = ("inspect", recordings / "healthy_1.nc")
     done = shell("sealscope", *words, **away)
     assert (done.status, done.err) == (0, "")
-    assert done.out == shell("sealscope", *words).out
+    assert done.out == call(*words).out

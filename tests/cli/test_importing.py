@@ -32,7 +32,6 @@ SHOW = "import json, sys; print(json.dumps(sorted({name.split('.')[0] for name i
 @pytest.mark.parametrize(
     ("first", "allowed"),
     [
-        ("import sealscope", set()),
         ("import sealscope; sealscope.Recording, sealscope.read, sealscope.write, dir(sealscope)", set()),
         ("import sealscope.cli", {"typer", "rich", "pydantic"}),
     ],
@@ -67,7 +66,7 @@ except SystemExit as ended:
 @pytest.fixture(scope="module")
 def run_files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
-    recording = ss.simulate(duration="20 s", seed=1)
+    recording = ss.simulate(duration="10 s", seed=1)
     for name in ("run.nc", "run.csv"):
         ss.write(recording, folder / name)
     return folder

@@ -55,11 +55,12 @@ def test_diagnose_goes_on_after_a_workbook_that_ends_its_reader(batch, call):
     assert str(batch / "corner.xlsx") in done.refused(1)
 
 
-def test_the_original_error_is_logged_on_demand(batch, shell):
-    quiet = shell("sealscope", "diagnose", batch / "bad.nc")
+@pytest.mark.usefixtures("verbose")
+def test_the_original_error_is_logged_on_demand(batch, call):
+    quiet = call("diagnose", batch / "bad.nc")
     assert "Traceback" not in quiet.err
     for words in (("-v", "diagnose"), ("diagnose", "--verbose")):
-        loud = shell("sealscope", *words, batch / "bad.nc")
+        loud = call(*words, batch / "bad.nc")
         assert (loud.status, loud.out) == (1, "")
         assert "Traceback" in loud.err
         assert "h5py" in loud.err

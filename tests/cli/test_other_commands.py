@@ -138,16 +138,19 @@ def test_version_and_help(call, shell):
         ("sealscope diagnose --format js", {"jsonl"}),
     ],
 )
-def test_the_shell_completes(words, offered, shell):
+def test_the_shell_completes(words, offered, call, monkeypatch):
     position = len(words.split()) - 1
     asked = {"COMP_WORDS": words, "COMP_CWORD": str(position), "_SEALSCOPE_COMPLETE": "complete_bash"}
-    done = shell("sealscope", **asked)
+    for name, value in asked.items():
+        monkeypatch.setenv(name, value)
+    done = call()
     assert offered <= set(done.out.split())
     assert done.err == ""
 
 
-def test_the_shell_s_script_calls_the_command_back(shell):
-    done = shell("sealscope", _SEALSCOPE_COMPLETE="source_bash")
+def test_the_shell_s_script_calls_the_command_back(call, monkeypatch):
+    monkeypatch.setenv("_SEALSCOPE_COMPLETE", "source_bash")
+    done = call()
     assert "complete_bash" in done.out
     assert re.search(r"^complete .* sealscope$", done.out, re.MULTILINE)
 
@@ -178,9 +181,11 @@ def test_bash_completes_with_the_script_that_is_shown(shell, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["zsh", "fish"])
-def test_other_shells_are_answered(kind, shell):
-    asked = {"_TYPER_COMPLETE_ARGS": "sealscope dem", "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
-    done = shell("sealscope", _SEALSCOPE_COMPLETE=f"complete_{kind}", **asked)
+def test_other_shells_are_answered(kind, call, monkeypatch):
+    monkeypatch.setenv("_TYPER_COMPLETE_ARGS", "sealscope dem")
+    monkeypatch.setenv("_TYPER_COMPLETE_FISH_ACTION", "get-args")
+    monkeypatch.setenv("_SEALSCOPE_COMPLETE", f"complete_{kind}")
+    done = call()
     assert done.err == ""
     assert "demo" in done.out
     assert "diagnose" not in done.out

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import shutil
 from pathlib import Path
 
@@ -29,9 +28,6 @@ def folder(recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         shutil.copy(recordings / name, tmp_path / name)
         shutil.copy(recordings / name, tmp_path / "days" / f"press_2024-05-0{k + 1}.nc")
     monkeypatch.chdir(tmp_path)
-    log = logging.getLogger("sealscope")  # -v adds a handler
-    monkeypatch.setattr(log, "handlers", list(log.handlers))
-    monkeypatch.setattr(log, "level", log.level)
     return tmp_path
 
 
@@ -39,7 +35,7 @@ def widest(text: str) -> str:
     return max(text.splitlines(), key=len, default="")
 
 
-@pytest.mark.usefixtures("folder")
+@pytest.mark.usefixtures("folder", "verbose")
 @pytest.mark.parametrize("words", CALLS)
 def test_what_is_printed_fits_a_terminal(words: str, call) -> None:
     faults = ["sensor p_A offset 2 psi from 10 s"] if words.endswith("--fault") else []

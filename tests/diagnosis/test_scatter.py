@@ -85,10 +85,11 @@ def fleet(random: np.random.Generator, days: Sequence[int], viscosity: float, wi
     ]
 
 
+@pytest.mark.parametrize("draws", [16, pytest.param(100, marks=[pytest.mark.slow, pytest.mark.long])])
 @pytest.mark.parametrize("days", [(1, 1, 1, 2), (1, 1, 2, 2, 3, 3, 3, 4), (1, 1, 2, 2, 2, 2)])
-def test_a_day_of_other_oil_is_no_leak(days: Sequence[int]) -> None:
+def test_a_day_of_other_oil_is_no_leak(days: Sequence[int], draws: int) -> None:
     """Between two days the viscosity differs as far as it is believed to."""
-    random, draws = np.random.default_rng(len(days)), 100
+    random = np.random.default_rng(len(days))
     viscosity = 0.5 * np.log(priors("inference")["oil"]["warmest"]) / np.sqrt(2.0)
     chances = []
     for _ in range(draws):
@@ -129,7 +130,7 @@ def test_days_that_are_known_narrow_what_another_day_may_be() -> None:
     random = np.random.default_rng(4)
 
     def deviation(days: int) -> float:
-        made = [fleet(random, [*np.repeat(range(days), 2), days], 0.01, PRIORS) for _ in range(10)]
+        made = [fleet(random, [*np.repeat(range(days), 2), days], 0.01, PRIORS) for _ in range(5)]
         return float(np.median([rise(judged, healthy, (COLUMNS,)).deviation for *healthy, judged in made]))
 
     assert deviation(1) > 1.5 * deviation(6) > 1.5 * deviation(30)
@@ -152,14 +153,14 @@ def test_the_chance_is_uniform_over_machines_as_they_are_believed(count: int) ->
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [1, 2, 3, 6, 12])
-@pytest.mark.parametrize("scatter", [0.2, 1.0, 6.0])
+@pytest.mark.parametrize("count", [1, 2, 3, 6, pytest.param(12, marks=pytest.mark.long)])
+@pytest.mark.parametrize("scatter", [pytest.param(0.2, marks=pytest.mark.long), 1.0, 6.0])
 def test_level_at_a_scatter_that_was_not_expected(count: int, scatter: float) -> None:
     """A machine that scatters six times as much as believed: the prior counts as one degree of freedom, no more, so
     the level is at most that of Student's t with one degree less at a score sqrt(n / (n - 1)) smaller."""
     from scipy.stats import t
 
-    draws, level = 400, 0.01
+    draws, level = 200, 0.01
     random = np.random.default_rng(count)
     made = sum(risen(random, count, scatter * PRIORS).chance < level for _ in range(draws))
     freedom = count - 1.0
@@ -310,16 +311,17 @@ def warm_days(random: np.random.Generator, slope: float, judged: float, logged: 
     return rise(day(9, judged), [day(k, oil) for k, oil in enumerate(random.uniform(33.0, 52.0, 7))], (COLUMNS,))
 
 
+@pytest.mark.parametrize("draws", [6, pytest.param(40, marks=[pytest.mark.slow, pytest.mark.long])])
 @pytest.mark.parametrize("logged", [True, False])
-def test_warm_oil_is_no_leak_and_its_interval_holds(logged: bool) -> None:
-    random, draws = np.random.default_rng(9), 40
+def test_warm_oil_is_no_leak_and_its_interval_holds(logged: bool, draws: int) -> None:
+    random = np.random.default_rng(9)
     for judged in (60.0, 70.0):
         slopes = random.normal(0.04, 0.012 if logged else 0.003, draws)
         made = [warm_days(random, slope, judged, logged) for slope in slopes]
         assert sum(own.chance < 0.0075 for own in made) <= 2
         held = sum(low <= 0.0 <= high for low, high in (own.interval() for own in made))
         assert held >= binom.ppf(0.01, draws, 0.95) or (judged == 70.0 and not logged)
-    near, far = (np.median([warm_days(random, 0.04, oil).deviation for _ in range(9)]) for oil in (45.0, 70.0))
+    near, far = (np.median([warm_days(random, 0.04, oil).deviation for _ in range(5)]) for oil in (45.0, 70.0))
     assert far > 2.0 * near
 
 

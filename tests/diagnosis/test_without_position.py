@@ -121,7 +121,9 @@ def test_an_open_loop_delivers_nothing_of_what_leaks() -> None:
     ("rig", "command", "load", "leak"),
     [
         (DOUBLE, "position 40 mm sin(1.6t)", "1.2 kN", "0.0042"),
-        (SINGLE, "position trapezoid 45 mm within 1.1 s every 5.3 s", "0 N", "0.002"),
+        pytest.param(
+            SINGLE, "position trapezoid 45 mm within 1.1 s every 5.3 s", "0 N", "0.002", marks=pytest.mark.slow
+        ),
     ],
 )
 def test_a_closed_loop_delivers_what_leaks(

@@ -96,7 +96,7 @@ UNITS = ("Pa", "m^3/(s Pa)", "N m/A", "cm3/rev", "rad/s/V", "kelvin", "bar(a)", 
 FORMULAS = ("p_A=PG_1*0.0625-0.625 bar", "x=0.5*(#4 - `Pos`/2) mm")
 MAPS = ("p_A=PG_1[psi]", "p_B=#3", "x=#4[mm]", "t=Time", "p_A=p (port A)[bar]", *FORMULAS)
 SETS = ("V_1=50[cm^3]", "orifices=present", "sensors.p_A.noise=1[psi]", "K_oil=689 MPa", "sample_rate=1 kHz")
-LABELS = [Label.parse(text) for text in ("Time", "PG_1", "PG_2 [psi]", "Pos", "p (port A)")]
+LABELS = ("Time", "PG_1", "PG_2 [psi]", "Pos", "p (port A)")
 T = np.linspace(0.0, 10.0, 50)
 
 
@@ -125,7 +125,7 @@ def _fault(text: str) -> None:
 def _columns(text: str) -> None:
     channel, column = split_map_option(text)
     check_call({channel: column}, None)
-    choose_columns(LABELS, Wanted({channel: column}, 500.0))
+    choose_columns([Label.parse(text) for text in LABELS], Wanted({channel: column}, 500.0))
 
 
 def _experiment(key: str, text: str) -> None:

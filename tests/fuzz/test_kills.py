@@ -11,10 +11,9 @@ from .kills import CALLS, attack
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="kills as POSIX does")
-@pytest.mark.parametrize(
-    "call", ["campaign", *(pytest.param(call, marks=pytest.mark.long) for call in CALLS if call != "campaign")]
-)
+@pytest.mark.parametrize("call", CALLS)
 def test_killed_at_random_instants(call: str, tmp_path: Path) -> None:
     count = attack(call, tmp_path, 3, 13)
     assert (count.kills, count.differences) == (3, [])

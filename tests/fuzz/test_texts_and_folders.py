@@ -20,7 +20,7 @@ FEW = {
     "campaign folders": 15,
     "kept files": 60,
 }
-FEW |= {"machines": 60, "monitor messages": 400, "CBOR messages": 4000, "Sparkplug messages": 400}
+FEW |= {"machines": 25, "monitor messages": 400, "CBOR messages": 2500, "Sparkplug messages": 400}
 MANY = {
     "options": 6000,
     "rigs": 2000,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -42,11 +43,13 @@ def truth_lpm(recording: Recording) -> float:
     return LEAK * float(np.mean(np.abs(late["p_A"] - late["p_B"]))) * 60_000.0
 
 
-WHOLE = run(WORN, [len(WORN)])
+@cache
+def whole() -> tuple[Watch, list[BlockEstimate]]:
+    return run(WORN, [len(WORN)])
 
 
 def test_a_leak_is_stated_in_litres_per_minute_with_its_onset():
-    watch, estimates = WHOLE
+    watch, estimates = whole()
     assert watch.leak is not None and watch.baseline is not None
     low, high = watch.leak.onset_interval_s
     assert low <= OPENS <= high
@@ -69,8 +72,8 @@ def test_a_leak_is_stated_in_litres_per_minute_with_its_onset():
 @given(sizes=st.lists(st.integers(7, 4000), min_size=1, max_size=4))
 def test_results_do_not_depend_on_the_cuts(sizes: list[int]):
     watch, estimates = run(WORN, sizes)
-    assert estimates == WHOLE[1]
-    assert json.dumps(watch.state()) == json.dumps(WHOLE[0].state())
+    assert estimates == whole()[1]
+    assert json.dumps(watch.state()) == json.dumps(whole()[0].state())
 
 
 @pytest.mark.parametrize("stop", [1000, 5700])
@@ -78,9 +81,9 @@ def test_a_restart_continues_with_the_same_bits(stop: int):
     first, before = run(WORN.samples(slice(0, stop)), [700])
     again = Watch.from_state(json.loads(json.dumps(first.state(), allow_nan=False)))
     _, after = run(WORN.samples(slice(stop, len(WORN))), [700], again)
-    assert before + after == WHOLE[1]
-    assert again.leak == WHOLE[0].leak
-    assert json.dumps(again.state()) == json.dumps(WHOLE[0].state())
+    assert before + after == whole()[1]
+    assert again.leak == whole()[0].leak
+    assert json.dumps(again.state()) == json.dumps(whole()[0].state())
 
 
 def changed(recording: Recording, **channels: Any) -> Recording:
@@ -93,7 +96,7 @@ def test_repeated_and_late_samples_are_dropped():
     for start in range(0, len(WORN), 500):
         estimates += watch.update(WORN.samples(slice(start, start + 500)))
         estimates += watch.update(WORN.samples(slice(max(0, start - 700), start + 100)))
-    assert estimates == WHOLE[1]
+    assert estimates == whole()[1]
     assert watch.counters["late or repeated samples"] > 10_000
 
 
@@ -186,7 +189,7 @@ def test_a_machine_at_standstill_is_not_judged():
 
 
 def test_a_repair_begins_a_new_baseline():
-    watch = Watch.from_state(WHOLE[0].state())
+    watch = Watch.from_state(whole()[0].state())
     watch.relearn()
     assert watch.leak is None and watch.baseline is None
     healthy = machine(5, duration=90.0, rate=50.0)
@@ -197,12 +200,12 @@ def test_a_repair_begins_a_new_baseline():
 
 
 def test_a_dismissed_leak_is_compared_with_nothing_before():
-    watch = Watch.from_state(WHOLE[0].state())
+    watch = Watch.from_state(whole()[0].state())
     watch.dismiss()
     more = machine(1, G=LEAK, duration=100.0, rate=50.0)
     run(moved(more, 300.0), [900], watch)
     assert watch.leak is None
-    assert watch.baseline == WHOLE[0].baseline
+    assert watch.baseline == whole()[0].baseline
 
 
 @pytest.mark.parametrize(
@@ -222,7 +225,7 @@ def test_a_dismissed_leak_is_compared_with_nothing_before():
 )
 def test_a_damaged_state_is_refused_in_one_line(damage: dict[str, Any]):
     with pytest.raises(InputError) as raised:
-        Watch.from_state({**WHOLE[0].state(), **damage})
+        Watch.from_state({**whole()[0].state(), **damage})
     assert "\n" not in str(raised.value)
 
 

@@ -172,14 +172,14 @@ def test_a_rig_is_its_own_rig_and_another_type_is_refused():
 
 
 HEAVY = {
-    "tables": "".join(f"[a{k}]\n" for k in range(100_000)),
-    "rows": "[[healthy]]\n" * 80_000,
-    "empty lists": "a = [" + "[]," * 300_000 + "]\n",
-    "keys": "".join(f"k{k}=1\n" for k in range(90_000)),
-    "dots": "".join(f"a.b{k}.c.d.e=1\n" for k in range(50_000)),
-    "inline tables": "".join(f"k{k}={{a.b.c=1}}\n" for k in range(50_000)),
-    "a long text": f'a = "{"x" * 990_000}"\n',
-    "blanks in brackets": "[" + " " * 900_000 + "\n",
+    "tables": "".join(f"[a{k}]\n" for k in range(25_000)),
+    "rows": "[[healthy]]\n" * 20_000,
+    "empty lists": "a = [" + "[]," * 75_000 + "]\n",
+    "keys": "".join(f"k{k}=1\n" for k in range(22_500)),
+    "dots": "".join(f"a.b{k}.c.d.e=1\n" for k in range(12_500)),
+    "inline tables": "".join(f"k{k}={{a.b.c=1}}\n" for k in range(12_500)),
+    "a long text": f'a = "{"x" * 250_000}"\n',
+    "blanks in brackets": "[" + " " * 225_000 + "\n",
 }
 
 

@@ -93,6 +93,7 @@ def test_an_edited_law_in_another_file_is_seen_and_the_old_code_comes_back_with_
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_solver_sees_an_edit_of_friction(copy, tmp_path):
     before, _, _ = ask(copy, WHOLE, tmp_path / "cache")
     assert ask(copy, WHOLE, tmp_path / "cache")[:2] == (before, 1)
@@ -160,7 +161,7 @@ def test_the_folders_of_compiled_code_are_the_user_s_alone(copy, tmp_path):
     assert not Path(ask(copy, SMALL, tmp_path / "open")[2]).is_relative_to(tmp_path / "open")
 
 
-@pytest.mark.parametrize(("suffix", "left"), [pytest.param("nbi", 7, marks=pytest.mark.slow), ("nbc", 0)])
+@pytest.mark.parametrize(("suffix", "left"), [("nbi", 7), pytest.param("nbc", 0, marks=pytest.mark.long)])
 @pytest.mark.slow
 def test_a_cut_off_file_of_the_cache_is_a_miss(copy, tmp_path, suffix, left):
     before = ask(copy, SMALL, tmp_path)

@@ -150,7 +150,9 @@ def test_karnopps_piston_stands_still_until_it_breaks_away():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("throttled", [False, True], ids=["free", "throttled"])
+@pytest.mark.parametrize(
+    "throttled", [pytest.param(False, id="free"), pytest.param(True, id="throttled", marks=pytest.mark.long)]
+)
 @pytest.mark.parametrize(
     "values", [{"friction.law": "karnopp", "v_th": 0.004}, {**LUGRE, "backward": 1.3}], ids=["karnopp", "lugre"]
 )

@@ -106,6 +106,7 @@ def test_an_unknown_version_compiles_by_the_documented_way(tmp_path: Path):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_runs_by_the_documented_way_are_the_same(tmp_path: Path):
     known, unknown = (run(SIMULATION, version, str(tmp_path / "cache")) for version in (numba.__version__, "99.0.0"))
     assert known.stdout == unknown.stdout

@@ -33,10 +33,8 @@ def test_a_crash_and_a_loop_end_there(capfd: pytest.CaptureFixture[str]) -> None
     with pytest.raises(CrashedApartError, match="crashed"):
         run_apart(os.abort, limit=10.0)
     run_apart(operator.add, 1, 1, limit=10.0)  # the start is over
-    begin = time.perf_counter()
     with pytest.raises(CrashedApartError, match=r"took over 0\.3 s"):
         run_apart(time.sleep, 60.0, limit=0.3)
-    assert time.perf_counter() - begin < 20.0
     assert run_apart(operator.mul, 2, 3, limit=10.0) == 6
     assert run_apart(print, "noise", limit=10.0) is None
     output = capfd.readouterr()
@@ -107,7 +105,7 @@ def test_work_whose_program_was_killed_ends_at_its_limit(tmp_path: Path) -> None
         status = Path(f"/proc/{int(program.stdout.readline())}/status")
         time.sleep(0.2)
         program.kill()
-    end = time.monotonic() + 5.0
+    end = time.monotonic() + 30.0
     while status.exists() and "State:\tZ" not in status.read_text():
         assert time.monotonic() < end
         time.sleep(0.05)

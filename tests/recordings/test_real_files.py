@@ -1,6 +1,5 @@
 """Real strokes of a rotary actuator (public data set vtnsi/actuator_dataset), and what is found in them."""
 
-import time
 from collections import Counter
 from functools import cache
 from pathlib import Path
@@ -23,7 +22,6 @@ def stroke(path: Path) -> Recording:
 
 
 def test_every_twelfth_stroke_reads_as_numpy_reads_it() -> None:
-    start = time.perf_counter()
     for path in FILES[::12]:
         recording = stroke(path)
         assert recording.units["p_A"] == recording.units["p_B"] == COUNTS
@@ -32,7 +30,6 @@ def test_every_twelfth_stroke_reads_as_numpy_reads_it() -> None:
         expected = np.genfromtxt(path, delimiter="\t", skip_header=1, usecols=(8, 9))
         assert np.array_equal(recording["p_A"], expected[:, 0])
         assert np.array_equal(recording["p_B"], expected[:, 1])
-    assert time.perf_counter() - start < 60
 
 
 def test_ports_are_clean_but_for_the_strokes_that_fall_below_zero() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,6 +19,8 @@ from sealscope.simulation.leaks import parse_leak
 from sealscope.storage.opening import names_a_file
 from sealscope.storage.rows import ROWS
 from sealscope.units import parse_quantity
+
+from ..recordings.refusals import count_calls
 
 PLAN = '[campaign]\nname = "a"\nduration = "6 s"\ndetectors = ["rms change"]\n[[records]]\ncount = 1\n'
 
@@ -93,12 +94,14 @@ LONG = 200_000
 @pytest.mark.parametrize(
     "key", ["a." * LONG + "a = 1", "[" + "a." * LONG + "a]", "x = { " + '"a" . ' * LONG + "a = 1 }"]
 )
-def test_a_key_of_many_dots_is_refused_soon(key: str, tmp_path: Path) -> None:
+def test_a_key_of_many_dots_is_refused_with_little_work(key: str, tmp_path: Path) -> None:
     (tmp_path / "rig.toml").write_text(key)
-    start = time.process_time()
-    with pytest.raises(InputError, match=r"(a dotted key must have at most 30 dots|must be at most 1000000 bytes)"):
-        load_rig(tmp_path / "rig.toml")
-    assert time.process_time() - start < 1.0
+
+    def load() -> None:
+        with pytest.raises(InputError, match=r"(a dotted key must have at most 30 dots|must be at most 1000000 bytes)"):
+            load_rig(tmp_path / "rig.toml")
+
+    assert count_calls(load) < len(key)
 
 
 @pytest.mark.parametrize(
@@ -115,13 +118,14 @@ def test_a_key_of_many_dots_is_refused_soon(key: str, tmp_path: Path) -> None:
         lambda: load_rig("thesis" * LONG),
     ],
 )
-def test_long_options_are_refused_soon(read: Callable[[], object]) -> None:
-    start = time.process_time()
-    try:
-        read()
-    except InputError as error:
-        assert len(str(error)) < 5000
-    assert time.process_time() - start < 1.0
+def test_long_options_are_refused_with_little_work(read: Callable[[], object]) -> None:
+    def refuse() -> None:
+        try:
+            read()
+        except InputError as error:
+            assert len(str(error)) < 5000
+
+    assert count_calls(refuse) < LONG
 
 
 def test_a_long_command_is_checked_in_little_memory() -> None:

@@ -47,9 +47,9 @@ def kept() -> Kept:
 
 @pytest.fixture(scope="module", autouse=True)
 def shorter_drifts() -> Iterator[None]:
-    """Half a minute shows a drift, too."""
+    """A quarter of a minute shows a drift, too."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sealscope.thesis.chapters.chapter4.cases._DRIFT_DURATION", 30.0)
+        patch.setattr("sealscope.thesis.chapters.chapter4.cases._DRIFT_DURATION", 15.0)
         yield
 
 

@@ -24,6 +24,8 @@ _IMPULSE_X, _IMPULSE_P, _IMPULSE_THETA = 1e-3, 1e4, 1.0
 #: Time [s] in which a moving piston settles before the rig is linearised.
 _SETTLING = 0.5
 _FREQUENCIES = 4000
+#: Samples of an answer that are summed at once.
+_BLOCK = 64
 #: By how much each state is moved for a difference.
 _SIZES = (1e-3, 1e-3, 1e-2, 1e-3, 1e-6, 1e-6, 1e2, 1e2, 1e2, 1e2, 1e-9, 1e-9, 1e-7, 1e-4)
 
@@ -162,9 +164,12 @@ def _of_impulse(answer: Array, z: NDArray[np.complex128]) -> NDArray[np.complex1
     tail = answer[-1]
     changing = answer - tail
     last = int(np.flatnonzero(np.abs(changing) > 1e-9 * np.abs(answer).max())[-1]) + 1 if np.any(changing) else 0
+    blocks = np.zeros((math.ceil(last / _BLOCK), _BLOCK))
+    blocks.ravel()[:last] = changing[:last]
+    within = z[:, None] ** -np.arange(float(_BLOCK)) @ blocks.T
     total = np.zeros(z.size, dtype=complex)
-    for n in range(last - 1, -1, -1):  # Horner
-        total = total / z + changing[n]
+    for k in range(len(blocks) - 1, -1, -1):  # Horner, a block at a time
+        total = total * z**-_BLOCK + within[:, k]
     return np.asarray(total + tail / (1.0 - 1.0 / z))
 
 

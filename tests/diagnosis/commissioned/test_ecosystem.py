@@ -8,8 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sklearn.base import clone
-from sklearn.utils.estimator_checks import check_estimator
 
 import sealscope as ss
 
@@ -23,6 +21,8 @@ def leaking(tmp_path_factory):
 
 def test_the_estimator_learns_and_predicts(folder, leaking):
     """Order, subsets, copies and a pickle change nothing; a second fit forgets the first."""
+    from sklearn.base import clone
+
     healthy, new = sorted(folder.iterdir()), leaking.with_name("new.nc")
     ss.write(ss.simulate(command="3 sin(4t)", duration="20 s", seed=44), new)
     detector = ss.LeakDetector(rig="thesis")
@@ -54,6 +54,7 @@ APPLICABLE = {
 
 def test_the_estimator_passes_the_checks_of_scikit_learn_that_apply():
     """The others feed a matrix of numbers in place of files, and are refused by one line."""
+    from sklearn.utils.estimator_checks import check_estimator
 
     class OfMatrices(ss.LeakDetector):
         def __sklearn_tags__(self):

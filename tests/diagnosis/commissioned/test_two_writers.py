@@ -87,14 +87,9 @@ needs_fork = pytest.mark.skipif("fork" not in multiprocessing.get_all_start_meth
 
 
 @needs_fork
-def test_two_added_recordings_and_a_mark_at_once_are_all_there(pair, tmp_path):
-    attack(pair, tmp_path, 5)
-
-
-@needs_fork
-@pytest.mark.slow
-def test_nothing_is_lost_in_500_rounds(pair, tmp_path):
-    attack(pair, tmp_path, 500)
+@pytest.mark.parametrize("rounds", [3, pytest.param(500, marks=[pytest.mark.slow, pytest.mark.long])])
+def test_two_added_recordings_and_a_mark_at_once_are_all_there(pair, tmp_path, rounds):
+    attack(pair, tmp_path, rounds)
 
 
 def test_what_another_wrote_since_is_not_undone(pair, tmp_path):
