@@ -91,6 +91,8 @@ def rise_flow(
 ) -> Flow:
     """Estimate the mean flow of a leak that healthy recordings do not have, while it lasts, over laws and onsets.
 
+    It is that of the likeliest law, and the others make it uncertain.
+
     Parameters
     ----------
     blocks : Blocks
@@ -126,8 +128,11 @@ def rise_flow(
     logarithms = np.where(np.abs(flows) > largest, -np.inf, logarithms[:, None] + weights)
     if not np.isfinite(logarithms).any():
         return Flow(value * float(units[0]), deviation * float(units[0]))
-    mixture = np.exp(logarithms - logarithms.max()).ravel()
-    return mixed_flow(mixture, flows.ravel(), (deviation * units / shares[:, None]).ravel())
+    mixture = np.exp(logarithms - logarithms.max())
+    likeliest = int(mixture.sum(axis=0).argmax())
+    value = float(mixture[:, likeliest] @ flows[:, likeliest] / mixture[:, likeliest].sum())
+    squares = (deviation * units / shares[:, None]) ** 2 + (flows - value) ** 2
+    return Flow(value, float(np.sqrt((mixture * squares).sum() / mixture.sum())))
 
 
 def mixed_flow(weights: Array, flows: Array, deviations: Array) -> Flow:

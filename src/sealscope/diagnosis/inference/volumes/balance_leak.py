@@ -134,8 +134,12 @@ class BalanceLeak:
             return [(pressure, 0.0)] * len(EXPONENTS)
         root = balance.mean_of_blocks(balance.blocks.driving(root=True)) / law.regression
         readings: float = priors("inference")["size"]["readings"]
-        shares = 2.0 * (1.0 - np.array(EXPONENTS))
-        return [(pressure ** (1.0 - share) * root**share, share * readings * law.log_ratio) for share in shares]
+        laminar: float = priors("inference")["size"]["laminar"]
+        believed = np.log([laminar, *[(1.0 - laminar) / (len(EXPONENTS) - 1)] * (len(EXPONENTS) - 1)])
+        return [
+            (pressure ** (1.0 - share) * root**share, float(prior) + share * readings * law.log_ratio)
+            for share, prior in zip(2.0 * (1.0 - np.array(EXPONENTS)), believed, strict=True)
+        ]
 
     @property
     def excess(self) -> float | None:
