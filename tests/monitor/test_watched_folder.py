@@ -10,23 +10,30 @@ from pathlib import Path
 import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
+from starlette.testclient import TestClient
 
 import sealscope as ss
 from sealscope.diagnosis.commissioned.machine_file import write_machine
 from sealscope.diagnosis.commissioned.watched import is_remeasured, load_watched
 from sealscope.diagnosis.live.watch import watch
 from sealscope.diagnosis.verdict.machine import unstated
+from sealscope.diagnosis.verdict.states import state_of
+from sealscope.monitor.alarms import AlarmJudge
 from sealscope.monitor.outputs.prometheus import metrics_text
-from sealscope.monitor.settings import read_settings
+from sealscope.monitor.page.site import site
+from sealscope.monitor.settings import PageSettings, WatchSettings, read_settings
 from sealscope.monitor.sources.folder import WatchedFolder
 from sealscope.monitor.sources.source_block import SourceBlock
+from sealscope.monitor.supervisor import PartAway
+from sealscope.monitor.verdicts import RecordingVerdict
 from sealscope.recordings.recording import Recording
+from sealscope.reporting import messages
 
 from ..diagnosis.balance_machine import machine, step
 from .plant import served
 
 APRIL = datetime(2026, 4, 1, tzinfo=UTC).timestamp()
-LEAK = 3.0e-13
+LEAK, LARGE = 3.0e-13, 3.0e-12
 HEADINGS = {"p_A": ("bottom [bar]", 1e-5), "p_B": ("rod [bar]", 1e-5), "x": ("stroke [mm]", 1e3)}
 MAP = {"p_A": "bottom", "p_B": "rod", "x": "stroke", "theta": "angle [rad]"}
 
@@ -45,7 +52,8 @@ def log(path: Path, recording: Recording) -> Path:
 def commissioned(tmp_path_factory):
     """A machine's file of which areas, map and rate alone are stated."""
     folder = tmp_path_factory.mktemp("machine")
-    files = [log(folder / f"healthy/run{seed}.csv", machine(seed, rate=100.0, duration=60.0)) for seed in (1, 2, 3)]
+    days = ((seed, folder / f"healthy/run_2026-03-{10 + seed}_0600.csv") for seed in range(1, 6))
+    files = [log(path, machine(seed, rate=100.0, duration=60.0)) for seed, path in days]
     rig = unstated()
     areas = rig.cylinder.A_A, rig.cylinder.A_B
     rig = rig.with_areas(*areas, source="data sheet").with_overrides({"pump.q_b": 7.0e-6}, source="assumed: a guess")
@@ -78,12 +86,106 @@ def test_a_machine_of_areas_alone_is_watched_in_the_litres_of_a_diagnosis(commis
     service, out = served(settings)
     (event,) = [json.loads(line) for line in out.splitlines()]
     diagnosis = ss.read_machine(commissioned).diagnose(path)
-    low, high = diagnosis.leak_interval_lpm
-    assert low <= event["alarm"]["leak_lpm"] <= high
     summary = service.plain()["press"]
+    assert event["alarm"]["leak_lpm"] == summary["leak_lpm"] == diagnosis.leak_lpm
+    assert event["alarm"]["onset_s"] == pytest.approx(APRIL + 6.0 * 3600.0 + diagnosis.onset_s)
     assert summary["why_no_litres"] == ""
-    assert summary["leak_lpm"] == pytest.approx(diagnosis.leak_lpm, rel=0.1)
-    assert summary["leak_interval_lpm"][0] <= diagnosis.leak_lpm <= summary["leak_interval_lpm"][1]
+    course = [row["leak_lpm"] for row in service.store.course("press")]
+    assert course[0] is None and course[-1] == diagnosis.leak_lpm
+
+
+def surfaces(service, out: str, diagnosis):
+    """Compare the alarm, page, metrics and what a broker gets with a diagnosis; return the event and the page's row."""
+    (event,) = [json.loads(line) for line in out.splitlines()]
+    page = TestClient(site(service.actuators, PageSettings(), None), base_url="http://localhost")
+    (row,) = page.get("/api/fleet").json()["actuators"]
+    families = text_string_to_metric_families(page.get("/metrics").text)
+    metrics = {family.name: family.samples[0].value for family in families if family.samples}
+    ends = list(diagnosis.leak_interval_lpm)
+    assert event["event"] == "raised"
+    for shown in (event["alarm"], row):
+        assert (shown["leak_lpm"], shown["leak_interval_lpm"]) == (diagnosis.leak_lpm, ends)
+    figures = [metrics[f"sealscope_leak_{end}lpm"] for end in ("", "low_", "high_")]
+    assert figures == [diagnosis.leak_lpm, *ends]
+    assert metrics["sealscope_severity"] == diagnosis.state.severity
+    for shown in (row["state"], event["alarm"]["machine_state"]):
+        assert (shown["name"], shown["condition"]) == (diagnosis.state.name, diagnosis.state.condition)
+        assert (shown["cause"], shown["severity"]) == (diagnosis.cause, diagnosis.state.severity)
+    assert row["state"]["action"] == event["alarm"]["next_check"] == diagnosis.next_check
+    assert row["recording"]["reason"] == diagnosis.reason and diagnosis.reason in event["alarm"]["evidence"]
+    assert row["recording"]["size"] == messages.how_much(diagnosis)
+    return event, row
+
+
+def test_a_leak_from_the_first_sample_of_the_first_file_is_what_diagnose_says(commissioned, tmp_path):
+    settings = watching(tmp_path, commissioned)
+    worn = machine(9, G=step(0.0, LARGE, at=0.0), rate=100.0, duration=60.0)
+    path = log(tmp_path / "incoming/run_2026-04-01_0600.csv", worn)
+    diagnosis = ss.read_machine(commissioned).diagnose(path)
+    assert (diagnosis.verdict, diagnosis.onset_s) == ("leak", None)
+    service, out = served(settings)
+    event, row = surfaces(service, out, diagnosis)
+    start = APRIL + 6.0 * 3600.0
+    assert event["alarm"]["onset_s"] == row["state"]["since_s"] == pytest.approx(start, abs=0.1)
+    again, _ = served(settings)  # restarted, it says the same
+    assert again.plain()["press"] == service.plain()["press"]
+
+
+def test_the_bound_of_a_healthy_recording_is_that_of_diagnose_and_ends_the_alarm(commissioned, tmp_path):
+    settings = watching(tmp_path, commissioned)
+    log(
+        tmp_path / "incoming/run_2026-04-01_0600.csv",
+        machine(9, G=step(0.0, LARGE, at=0.0), rate=100.0, duration=60.0),
+    )
+    path = log(tmp_path / "incoming/run_2026-04-02_0600.csv", machine(12, rate=100.0, duration=60.0))
+    diagnosis = ss.read_machine(commissioned).diagnose(path)
+    assert diagnosis.verdict == "no leak"
+    service, out = served(settings)
+    assert [json.loads(line)["event"] for line in out.splitlines()] == ["raised", "returned"]
+    summary = service.plain()["press"]
+    assert (summary["leak_lpm"], summary["bound_lpm"]) == (None, diagnosis.bound_lpm)
+    assert summary["total_lpm"] == diagnosis.total_leakage.lpm
+    assert (summary["state"]["name"], summary["status"]) == (diagnosis.state.name, diagnosis.summary)
+    assert f'sealscope_bound_lpm{{actuator="press"}} {diagnosis.bound_lpm!r}' in metrics_text(service.plain(), {})
+
+
+def verdict(verdict="leak", chance=None, **more) -> RecordingVerdict:
+    state = state_of(verdict, "piston leak" if verdict == "leak" else None).as_dict()
+    words = {"file": "run.csv", "summary": verdict, "size": "", "reason": "", "cause": ""}
+    times = {"start_s": 0.0, "end_s": 60.0, **more}
+    return RecordingVerdict(verdict=verdict, state=state, chance=chance, **words, **times)
+
+
+def test_an_alarm_needs_evidence_as_rare_as_the_stated_rate_or_a_second_recording():
+    """A minute that one healthy recording in 100 looks like is no alarm at one in 1000 h; two in turn are."""
+    judge, settings, likely = AlarmJudge("press"), WatchSettings(), verdict(chance=0.01)
+    assert judge.take_verdict(likely, None, 1, settings) is None
+    assert judge.take_verdict(likely, verdict("no leak"), 1, settings) is None
+    alarm, event = judge.take_verdict(likely, likely, 1, settings)
+    assert event == "raised" and alarm.by_chance_per_1000_h == pytest.approx(600.0)
+    assert judge.take_verdict(verdict("cannot tell"), likely, 1, settings) is None
+    assert AlarmJudge("press").take_verdict(verdict(chance=1e-4), None, 1, settings)[1] == "raised"
+    assert AlarmJudge("press").take_verdict(likely, None, 1, WatchSettings(false_alarms_per_1000_h=700.0))
+
+
+def test_what_leaks_from_the_first_sample_began_after_the_last_healthy_recording():
+    healthy, worn = verdict("no leak"), verdict(start_s=500.0, end_s=560.0)
+    alarm, _ = AlarmJudge("press").take_verdict(worn, healthy, 1, WatchSettings())
+    assert (alarm.onset_s, alarm.onset_interval_s) == (500.0, (60.0, 500.0))
+
+
+def test_a_machines_file_that_cannot_be_read_holds_its_recordings_up(commissioned, tmp_path):
+    """None is lost: it is judged as soon as the file is whole again."""
+    (tmp_path / "press.toml").write_bytes(commissioned.read_bytes())
+    (tmp_path / "press.lessons").write_bytes(commissioned.with_suffix(".lessons").read_bytes())
+    folder = folder_of(tmp_path, tmp_path / "press.toml")
+    log(tmp_path / "incoming/run_2026-04-01_0600.csv", machine(12, rate=100.0, duration=20.0))
+    (tmp_path / "press.lessons").rename(tmp_path / "away.lessons")
+    with pytest.raises(PartAway, match="lessons must lie beside"):
+        list(folder.blocks())
+    (tmp_path / "away.lessons").rename(tmp_path / "press.lessons")
+    (block,) = folder.blocks()
+    assert block.verdict is not None and block.verdict.file == "run_2026-04-01_0600.csv"
 
 
 def test_the_displacement_is_measured_beside_the_stated_areas(commissioned):

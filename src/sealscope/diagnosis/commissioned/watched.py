@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sealscope.diagnosis.commissioned.machine import CommissionedMachine
 from sealscope.diagnosis.commissioned.machine_file import read_machine
 from sealscope.diagnosis.learnt import Learnt
 from sealscope.diagnosis.verdict.machine import unstated
@@ -36,12 +37,15 @@ class WatchedMachine:
         Sampling rate [Hz] of logs without a time column.
     limit_lpm : float, optional
         Leak from which it is to be repaired [L/min], None where it needs an area that is not stated.
+    machine : CommissionedMachine, optional
+        The machine whose healthy recordings judge whole recordings; None where there are none.
     """
 
     rig: Rig
     channel_map: ChannelMap = field(default_factory=dict)
     rate: float | None = None
     limit_lpm: float | None = None
+    machine: CommissionedMachine | None = None
 
 
 def load_watched(rig: str) -> WatchedMachine:
@@ -51,7 +55,8 @@ def load_watched(rig: str) -> WatchedMachine:
         return WatchedMachine(known, known.channel_map)
     machine = read_machine(rig)
     known = _with_measured_displacement(machine.rig or unstated(), machine.healthy)
-    return WatchedMachine(known, machine.channel_map, machine.rate, _limit_lpm(machine.limit, known))
+    limit_lpm, commissioned = _limit_lpm(machine.limit, known), machine if machine.healthy else None
+    return WatchedMachine(known, machine.channel_map, machine.rate, limit_lpm, commissioned)
 
 
 def is_remeasured(rig: Rig, before: Rig) -> bool:

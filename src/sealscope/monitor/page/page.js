@@ -14,12 +14,18 @@ function element(kind, className, text) {
   return made;
 }
 
-const litres = (value) => (value === null || value === undefined ? "–" : Number(value.toPrecision(2)).toString());
+const litres = (value) => (value === null || value === undefined ? "–" : Number(value.toPrecision(3)).toString());
 
 function flow(value, interval) {
   if (value === null || value === undefined) return "no L/min";
   const range = interval ? ` (${litres(interval[0])} to ${litres(interval[1])})` : "";
   return `${litres(Math.max(value, 0))}${range} L/min`;
+}
+
+// the leak of an actuator, or what none is above
+function leakOf(row) {
+  if (row.leak_lpm !== null) return `${litres(Math.max(row.leak_lpm, 0))} L/min`;
+  return row.bound_lpm === null || row.bound_lpm === undefined ? "" : `< ${Number(row.bound_lpm.toPrecision(2))} L/min`;
 }
 
 // the local time as ISO 8601 writes it, whatever the browser's language
@@ -113,7 +119,7 @@ function showFleet(fleet) {
     states.set(row.state.name, (states.get(row.state.name) || 0) + 1);
     if (row.name === chosen) button.setAttribute("aria-current", "true");
     button.append(element("span", "name", row.name));
-    button.append(element("span", "figure", row.leak_lpm === null ? "" : `${litres(Math.max(row.leak_lpm, 0))} L/min`));
+    button.append(element("span", "figure", leakOf(row)));
     button.append(badge(row.state), element("span", "state", stateOf(row)));
     button.addEventListener("click", () => choose(row.name));
     const item = element("li");
@@ -243,16 +249,21 @@ function showLife(life) {
   const oil = now.oil_celsius === null || now.oil_celsius === undefined ? "" : `, oil ${now.oil_celsius.toFixed(0)} °C`;
   const state = now.state;
   const since = state.since_s === null ? "" : ` since ${clock(state.since_s)}`;
-  const size = state.condition.startsWith("leak") ? ` ${flow(now.leak_lpm, now.leak_interval_lpm)}` : "";
+  const judged = now.recording;
+  const alarm = life.alarms.find((each) => each.state !== "closed" && each.state !== "invalid");
+  const leaks = state.condition.startsWith("leak");
+  const known = leaks && judged && judged.verdict !== "leak" && alarm ? alarm : now;
+  const size = judged && (judged.verdict === "leak") === leaks ? judged.size : leaks ? flow(known.leak_lpm, known.leak_interval_lpm) : "";
   const limit = life.limit_lpm ? `; limit ${litres(life.limit_lpm)} L/min` : "";
   byId("state").replaceChildren(
     badge(state),
-    element("strong", "", ` ${state.condition}${size}${since}${limit}`),
+    element("strong", "", ` ${state.condition}${size ? `: ${size}` : ""}${since}${limit}`),
     element("span", "action", `${state.cause ? `Cause: ${state.cause}. ` : ""}${state.action}`),
   );
-  byId("now").textContent =
-    `${clock(now.t)}: ${now.status}; ${now.why_no_litres ? `${now.why_no_litres}; ` : ""}pump and piston pass ${flow(now.total_lpm, now.total_interval_lpm)}, leak ${flow(now.leak_lpm, now.leak_interval_lpm)}${oil}${learned}`;
-  const alarm = life.alarms.find((each) => each.state !== "closed" && each.state !== "invalid");
+  const total = `pump and piston pass ${flow(now.total_lpm, now.total_interval_lpm)}`;
+  byId("now").textContent = judged
+    ? `${clock(now.t)}: ${judged.file}: ${judged.summary}: ${judged.reason}; ${total}${oil}; judged against the machine's healthy recordings`
+    : `${clock(now.t)}: ${now.status}; ${now.why_no_litres ? `${now.why_no_litres}; ` : ""}${total}, leak ${flow(now.leak_lpm, now.leak_interval_lpm)}${oil}${learned}`;
   byId("alarm").hidden = !alarm;
   if (alarm) {
     byId("alarm-title").textContent = `${alarm.level}: ${flow(alarm.leak_lpm, alarm.leak_interval_lpm)}, ${alarm.state}${alarm.returned_s == null ? "" : ", over"}`;

@@ -35,6 +35,7 @@ from sealscope.units import to_si
 if TYPE_CHECKING:
     from sealscope.monitor.settings import MonitorSettings
     from sealscope.monitor.supervisor import Supervisor
+    from sealscope.monitor.verdicts import RecordingVerdict
 
 #: Largest message [bytes].
 LARGEST = 16_000_000
@@ -122,7 +123,7 @@ class SourceBlock:
 
     `identity`: what tells the block from every other of the actuator, also after a restart; `samples`: None where there
     are none to take, only the identity to keep; `follows`: False where the clock begins anew; `done`: called when the
-    block is stored.
+    block is stored; `verdict`: on the whole recording that the samples are, None where it is not judged as such.
     """
 
     actuator: str
@@ -130,6 +131,7 @@ class SourceBlock:
     samples: Recording | None
     follows: bool = True
     done: Callable[[], None] = nothing
+    verdict: RecordingVerdict | None = None
 
     @property
     def bytes(self) -> int:
