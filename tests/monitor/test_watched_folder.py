@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -18,12 +19,13 @@ from sealscope.diagnosis.commissioned.watched import is_remeasured, load_watched
 from sealscope.diagnosis.live.watch import watch
 from sealscope.diagnosis.verdict.machine import unstated
 from sealscope.diagnosis.verdict.states import state_of
+from sealscope.errors import InputError
 from sealscope.monitor.alarms import AlarmJudge
 from sealscope.monitor.outputs.prometheus import metrics_text
-from sealscope.monitor.page.site import site
+from sealscope.monitor.page.site import PageServer, site
 from sealscope.monitor.settings import PageSettings, WatchSettings, read_settings
 from sealscope.monitor.sources.folder import WatchedFolder
-from sealscope.monitor.sources.source_block import SourceBlock
+from sealscope.monitor.sources.source_block import SourceBlock, decoded
 from sealscope.monitor.supervisor import PartAway
 from sealscope.monitor.verdicts import RecordingVerdict
 from sealscope.recordings.recording import Recording
@@ -269,3 +271,89 @@ def test_metrics_carry_the_interval():
     text = metrics_text({"press": {"leak_lpm": 1.4, "leak_interval_lpm": [1.2, 1.6]}}, {})
     values = {own.name: own.samples[0].value for own in text_string_to_metric_families(text)}
     assert [values[f"sealscope_leak_{end}lpm"] for end in ("", "low_", "high_")] == [1.4, 1.2, 1.6]
+
+
+def stream_settings(folder: Path, lines: str):
+    file = folder / "stream.toml"
+    head = 'lines = true\n[mqtt]\n[opcua]\nurl = "opc.tcp://localhost:4840"\n[[actuator]]\nname = "press"\n'
+    file.write_text(head + lines, encoding="utf-8")
+    return read_settings(file)
+
+
+def test_units_of_a_plants_signals_are_those_of_the_machines_file(commissioned, tmp_path):
+    """Its map has a heading with a unit, `angle [rad]`; what the table states comes first."""
+    nodes = "\n".join(f'nodes.{name} = "ns=2;s={name}"' for name in ("p_A", "p_B", "x", "theta"))
+    rig = f'rig = "{commissioned}"\n'
+    (actuator,) = stream_settings(tmp_path, rig + nodes).actuator
+    assert (actuator.units, actuator.rate) == ({"theta": "rad"}, 100.0)
+    (actuator,) = stream_settings(tmp_path, f'{rig}{nodes}\nunits = {{ theta = "deg", p_A = "bar" }}').actuator
+    assert actuator.units == {"theta": "deg", "p_A": "bar"}
+    (actuator,) = stream_settings(tmp_path, rig).actuator
+    assert actuator.units == {}  # a message is in SI or says otherwise
+
+
+def test_units_of_the_table_hold_for_every_stream_that_names_none(tmp_path):
+    (actuator,) = stream_settings(tmp_path, 'units = { p_A = "bar" }').actuator
+    units_of = {"press": actuator.units}
+    message = {"actuator": "press", "t": 0.0, "rate": 50, "p_A": [1.0], "p_B": [1e5]}
+    (p_a, p_b) = decoded(json.dumps(message).encode(), units_of=units_of).samples.channels.values()
+    assert (p_a[0], p_b[0]) == (1e5, 1e5)
+    stated = decoded(json.dumps({**message, "units": {"p_A": "MPa"}}).encode(), units_of=units_of)
+    assert stated.samples["p_A"][0] == 1e6
+    for lines, rule in (
+        ('units = { p_A = "mm" }', "units.p_A must have a unit of pressure"),
+        ('units = { pressure = "bar" }', "units must be of x"),
+        ('folder = "incoming"\nunits = { p_A = "bar" }', "units of files stand in their headings"),
+    ):
+        with pytest.raises(InputError, match=rule):
+            stream_settings(tmp_path, lines)
+
+
+#: Elements beyond the window's edges, or whose text is wider than they are.
+CUT = """() => [...document.querySelectorAll("body *")].filter((part) => {
+  if (part.closest("svg") || part.closest(".u-over") || part.tagName === "SCRIPT") return false;
+  const box = part.getBoundingClientRect();
+  if (!box.width || !box.height) return false;
+  const isText = !part.children.length && getComputedStyle(part).display !== "inline";
+  const wide = isText && part.scrollWidth > part.clientWidth + 1;
+  return wide || box.left < -1 || box.right > document.documentElement.clientWidth + 1;
+}).map((part) => `${part.tagName} ${part.id} ${part.textContent.slice(0, 60)}`)"""
+
+
+@pytest.mark.slow
+def test_the_page_of_judged_recordings_in_a_browser(commissioned, tmp_path):
+    """Headline, size and reason are those of diagnose; an alarm that is over says so; nothing is cut at 400 px."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    browser_path = shutil.which("chromium")
+    if browser_path is None:
+        pytest.skip("chromium is not installed")
+    settings, worn = watching(tmp_path, commissioned), machine(9, G=step(0.0, LARGE, at=0.0), rate=100.0, duration=60.0)
+    log(tmp_path / "incoming/run_2026-04-01_0600.csv", worn)
+    log(tmp_path / "incoming/run_2026-04-02_0600.csv", machine(12, rate=100.0, duration=60.0))
+    service, _ = served(settings)
+    recording = service.plain()["press"]["recording"]
+    server = PageServer(service.actuators, PageSettings(port=0))
+    try:
+        with playwright.sync_playwright() as player:
+            browser = player.chromium.launch(executable_path=browser_path, args=["--no-sandbox"])
+            for width in (400, 1280):
+                view = browser.new_page(viewport={"width": width, "height": 900})
+                view.goto(server.address)
+                view.wait_for_selector("#alarm:not([hidden])")
+                line = view.text_content("#state") or ""
+                assert f"{recording['summary']}: {recording['size']}" in line
+                assert recording["reason"] in (view.text_content("#now") or "")
+                assert f"alarm new, over; {recording['summary']}" in (view.text_content("#fleet .state") or "")
+                assert f"< {diagnosed_bound(service)} L/min" in (view.text_content("#fleet .figure") or "")
+                assert view.locator("#live-charts").is_hidden()  # no samples are kept of files
+                assert view.evaluate("document.documentElement.scrollWidth") <= width
+                assert view.evaluate(CUT) == []
+                view.close()
+            browser.close()
+    finally:
+        server.close()
+        service.actuators.closed = False
+
+
+def diagnosed_bound(service) -> str:
+    return f"{service.plain()['press']['bound_lpm']:.2g}"

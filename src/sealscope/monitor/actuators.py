@@ -44,7 +44,7 @@ PENDING_BLOCKS, PENDING_BYTES = 16, 400_000
 #: What a block is counted under that raised an error.
 DROPPED = "blocks that raised an error"
 #: Texts of a verdict on a recording that a summary shows.
-_SHOWN_OF_VERDICTS = ("file", "verdict", "summary", "size", "reason")
+_SHOWN_OF_VERDICTS = ("file", "verdict", "summary", "size", "odds", "reason")
 #: How long the samples of an alarm are kept [s].
 _KEPT_S = 120.0
 

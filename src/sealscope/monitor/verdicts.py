@@ -29,10 +29,11 @@ _FALSE_ALARM = priors("verdict")["false_alarm"]
 class RecordingVerdict:
     """The verdict on one recording, on the clock of the monitor, as plain values that a database holds.
 
-    `file`: its name; `summary`, `size`: the verdict and the leak's size or bound in the words of `diagnose`; `reason`,
-    `cause`: as in a Diagnosis; `state`: of NE 107; `start_s`, `end_s`: of its samples, `onset_s`, `onset_interval_s`:
-    None where it leaks from the first sample, or not at all [s]; `leak_lpm`, `total_lpm` and their 95 % intervals,
-    `bound_lpm`: None where not stated [L/min]; `chance`: probability that a leak-free recording scores as high.
+    `file`: its name; `summary`, `size`, `odds`: the verdict, the leak's size or bound, and the share of healthy
+    recordings that look like this, in the words of `diagnose`; `reason`, `cause`: as in a Diagnosis; `state`: of NE
+    107; `start_s`, `end_s`: of its samples, `onset_s`, `onset_interval_s`: None where it leaks from the first sample,
+    or not at all [s]; `leak_lpm`, `total_lpm` and their 95 % intervals, `bound_lpm`: None where not stated [L/min];
+    `chance`: probability that a leak-free recording scores as high.
     """
 
     file: str
@@ -52,6 +53,7 @@ class RecordingVerdict:
     total_interval_lpm: Interval | None = None
     bound_lpm: float | None = None
     chance: float | None = None
+    odds: str = ""
 
     @classmethod
     def from_diagnosis(cls, diagnosis: Diagnosis, start_s: float, end_s: float, shift: float) -> RecordingVerdict:
@@ -65,6 +67,7 @@ class RecordingVerdict:
             verdict=diagnosis.verdict,
             summary=diagnosis.summary,
             size=how_much(diagnosis) or "",
+            odds=diagnosis.odds or "",
             reason=diagnosis.reason,
             cause=diagnosis.named_cause or "",
             state={**plain["state"], "since_s": since},

@@ -101,8 +101,10 @@ function badge(state) {
 function stateOf(row) {
   const since = row.state.since_s === null ? "" : ` since ${clock(row.state.since_s)}`;
   const why = { "no data": "no data", "not comparable": `not comparable (${row.state.cause})`, learning: "learns its baseline" };
-  if (row.alarm) return `alarm ${row.alarm.state}; leak since ${clock(row.alarm.onset_s)}`;
-  return `${why[row.state.condition] || row.status}${since}`;
+  const now = `${why[row.state.condition] || row.status}${since}`;
+  if (!row.alarm) return now;
+  const over = row.alarm.returned_s !== null;
+  return over ? `alarm ${row.alarm.state}, over; ${now}` : `alarm ${row.alarm.state}; leak since ${clock(row.alarm.onset_s)}`;
 }
 
 function showFleet(fleet) {
@@ -129,23 +131,26 @@ function showFleet(fleet) {
   }
   const count = fleet.actuators.length;
   byId("budget").textContent =
-    `While all run, at most one false alarm in ${onceIn(fleet.false_alarms_per_1000_h)} is stated for all of them together.`;
+    `While all run, at most one false alarm in ${onceIn(fleet.false_alarms_per_1000_h)} is stated for all of them together` +
+    (fleet.actuators.some((row) => row.recording)
+      ? "; where recordings are judged whole and that is more, one in 10 000 healthy recordings."
+      : ".");
   const parts = [...states].map(([name, number]) => `${number} ${name}`);
   byId("overall").textContent = `${count} actuator${count === 1 ? "" : "s"}: ${parts.join(", ")}`;
   const dropped = Object.entries(fleet.counters).map(([reason, number]) => `${number} ${reason}`);
   byId("dropped").textContent = dropped.length ? `Since the start: ${dropped.join("; ")}` : "";
 }
 
-function facts(alarm) {
+function facts(alarm, judged) {
   const list = byId("alarm-facts");
   list.replaceChildren();
   const rows = [
     ["Since", `${clock(alarm.onset_s)} (${clock(alarm.onset_interval_s[0])} to ${clock(alarm.onset_interval_s[1])})`],
     ["Raised", clock(alarm.raised_s)],
     ["Evidence", alarm.evidence],
-    ["By chance", byChance(alarm)],
+    ["By chance", judged ? judged.odds : byChance(alarm)],
     ["Reason", alarm.reason],
-    ["Number", `${alarm.diagnostic_number}, baseline ${alarm.baseline}`],
+    ["Number", `${alarm.diagnostic_number}${alarm.baseline ? `, baseline ${alarm.baseline}` : ""}`],
   ];
   for (const [name, value] of rows.filter((row) => row[1])) list.append(element("dt", "", name), element("dd", "", value));
 }
@@ -166,6 +171,13 @@ function showWorkflow(alarm) {
 }
 
 const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+
+// the range of the chart of flows: from zero, and of what lies below a tenth of it
+function flowRange(least, most) {
+  if (least === null || most === null) return [0, 1];
+  const top = most > 0 ? 1.05 * most : 1;
+  return [Math.max(1.05 * Math.min(least, 0), -0.1 * top), top];
+}
 
 function draw(course, events) {
   const place = byId("chart");
@@ -190,7 +202,8 @@ function draw(course, events) {
     {
       width: Math.max(280, place.clientWidth),
       height: 240,
-      scales: { x: { time: dated } },
+      // blocks scatter below zero, where nothing flows: they must not press the leak flat
+      scales: { x: { time: dated }, y: { range: (plot, least, most) => flowRange(least, most) } },
       fmtDate: isoTemplate,
       bands: [{ series: [2, 1], fill: colour("--band") }],
       axes: [
@@ -257,7 +270,7 @@ function showLife(life) {
   const limit = life.limit_lpm ? `; limit ${litres(life.limit_lpm)} L/min` : "";
   byId("state").replaceChildren(
     badge(state),
-    element("strong", "", ` ${state.condition}${size ? `: ${size}` : ""}${since}${limit}`),
+    element("strong", "", ` ${known === now && judged ? judged.summary : state.condition}${size ? `: ${size}` : ""}${since}${limit}`),
     element("span", "action", `${state.cause ? `Cause: ${state.cause}. ` : ""}${state.action}`),
   );
   const total = `pump and piston pass ${flow(now.total_lpm, now.total_interval_lpm)}`;
@@ -267,7 +280,7 @@ function showLife(life) {
   byId("alarm").hidden = !alarm;
   if (alarm) {
     byId("alarm-title").textContent = `${alarm.level}: ${flow(alarm.leak_lpm, alarm.leak_interval_lpm)}, ${alarm.state}${alarm.returned_s == null ? "" : ", over"}`;
-    facts(alarm);
+    facts(alarm, judged);
     showWorkflow(alarm);
   }
   const list = byId("events");
