@@ -151,6 +151,23 @@ def test_the_bound_of_a_healthy_recording_is_that_of_diagnose_and_ends_the_alarm
     assert f'sealscope_bound_lpm{{actuator="press"}} {diagnosis.bound_lpm!r}' in metrics_text(service.plain(), {})
 
 
+@pytest.mark.parametrize("mark", ["invalid", "repaired"])
+def test_a_mark_that_ends_an_alarm_leaves_no_figures_and_the_next_recording_is_judged(commissioned, tmp_path, mark):
+    (tmp_path / "press.toml").write_bytes(commissioned.read_bytes())
+    (tmp_path / "press.lessons").write_bytes(commissioned.with_suffix(".lessons").read_bytes())
+    settings, worn = watching(tmp_path, tmp_path / "press.toml"), machine(9, G=step(0.0, LARGE, at=0.0), rate=100.0)
+    log(tmp_path / "incoming/run_2026-04-01_0600.csv", worn)
+    service, _ = served(settings)
+    service.actuators.mark("press", mark, text="no oil seen")
+    summary = service.plain()["press"]
+    assert (summary["status"], summary["leak_lpm"], summary["total_lpm"]) == (f"marked {mark}", None, None)
+    assert (summary["state"]["name"], summary["alarm"]) == ("good", None)
+    log(tmp_path / "incoming/run_2026-04-02_0600.csv", machine(10, G=step(0.0, LARGE, at=0.0), rate=100.0))
+    again, out = served(settings)
+    assert [json.loads(line)["alarm"]["id"] for line in out.splitlines()][-1] == "press-2"
+    assert again.plain()["press"]["state"]["condition"] == "leak"
+
+
 def verdict(verdict="leak", chance=None, **more) -> RecordingVerdict:
     state = state_of(verdict, "piston leak" if verdict == "leak" else None).as_dict()
     words = {"file": "run.csv", "summary": verdict, "size": "", "reason": "", "cause": ""}

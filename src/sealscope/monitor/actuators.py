@@ -350,8 +350,8 @@ class WatchedActuators:
             kept = list(actuator.kept)
             alarm = actuator.judge.marked(mark, t, until=t + hours * 3600.0, reason=text)
             try:
-                if mark in ("invalid", "repaired"):
-                    actuator.verdict = None  # on a recording before the mark
+                if mark in ("invalid", "repaired") and actuator.verdict is not None:
+                    actuator.verdict = actuator.verdict.mark_over(mark)
                 if mark == "invalid":
                     actuator.watch.dismiss()
                 elif mark == "repaired":

@@ -14,7 +14,8 @@ import numpy as np
 
 from sealscope.diagnosis.live.estimates import BlockEstimate, Interval
 from sealscope.diagnosis.priors import priors
-from sealscope.diagnosis.verdict.evidence import LEAK, NO_LEAK
+from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, LEAK, NO_LEAK
+from sealscope.diagnosis.verdict.states import state_of
 from sealscope.reporting.messages import how_much
 
 if TYPE_CHECKING:
@@ -106,6 +107,20 @@ class RecordingVerdict:
         """Return the number of healthy recordings in 1000 h that look like this, None where no chance is known."""
         hours = (self.end_s - self.start_s) / 3600.0
         return None if self.chance is None or hours <= 0.0 else 1000.0 * self.chance / hours
+
+    def mark_over(self, mark: str) -> RecordingVerdict:
+        """Return the verdict after a person's mark that ends its alarm: the next recording tells how the machine is."""
+        return RecordingVerdict(
+            file=self.file,
+            verdict=CANNOT_TELL,
+            summary=f"marked {mark}",
+            size="",
+            reason="the next recording is judged anew",
+            cause="",
+            state=state_of("watched").as_dict(),
+            start_s=self.start_s,
+            end_s=self.end_s,
+        )
 
     def restate_block(self, block: BlockEstimate) -> BlockEstimate:
         """Return a block's estimate with the leak of the recording that it is part of, from its onset on."""
