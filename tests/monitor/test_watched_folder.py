@@ -16,7 +16,7 @@ from starlette.testclient import TestClient
 import sealscope as ss
 from sealscope.diagnosis.commissioned.machine_file import write_machine
 from sealscope.diagnosis.commissioned.watched import is_remeasured, load_watched
-from sealscope.diagnosis.live.watch import watch
+from sealscope.diagnosis.live.watch import Watch, watch
 from sealscope.diagnosis.verdict.machine import unstated
 from sealscope.diagnosis.verdict.states import state_of
 from sealscope.errors import InputError
@@ -324,6 +324,31 @@ def test_units_of_the_table_hold_for_every_stream_that_names_none(tmp_path):
     ):
         with pytest.raises(InputError, match=rule):
             stream_settings(tmp_path, lines)
+
+
+def test_a_stream_begins_with_the_level_of_the_healthy_recordings(commissioned):
+    """What leaks from the first sample on shows against them alone, in litres, also after a restart."""
+    known = load_watched(str(commissioned))
+    worn, fresh = (machine(9, G=step(0.0, G, at=0.0), rate=100.0, duration=120.0) for G in (LARGE, 0.0))
+    leaks: dict[str, object] = {}
+    for name, healthy in (("with", known.healthy), ("without", None)):
+        live = watch(known.rig, healthy=healthy)
+        live.update(worn.between(0.0, 50.0))
+        live = Watch.from_state(json.loads(json.dumps(live.state())))
+        live.update(worn.between(50.0, 120.0))
+        leaks[name] = live.leak
+    assert leaks["without"] is None
+    assert leaks["with"].test == "level" and "healthy recordings" in leaks["with"].reason
+    low, high = leaks["with"].leak_interval_lpm
+    assert low <= LARGE * float(np.abs(worn["p_A"] - worn["p_B"]).mean()) * 6e4 <= high
+    live = watch(known.rig, healthy=known.healthy)
+    live.update(fresh)
+    assert live.leak is None
+    live.update(worn, follows=False)
+    assert live.leak is not None
+    live.dismiss()  # a person found none
+    live.update(worn, follows=False)
+    assert live.leak is None
 
 
 #: Elements beyond the window's edges, or whose text is wider than they are.

@@ -192,7 +192,13 @@ class WatchedActuators:
         """Restore an actuator from its last transaction, or begin anew if it is new or its settings changed."""
         name, rate = settings.name, settings.false_alarms_per_1000_h
         state, block_count = self.store.checkpoint(name), self.store.last_number(self.store.tables.blocks, name)
-        fresh = watch(load_watched(settings.rig).rig, false_alarms_per_1000_h=rate, learn_hours=settings.learn_hours)
+        machine = load_watched(settings.rig)
+        fresh = watch(
+            machine.rig,
+            false_alarms_per_1000_h=rate,
+            learn_hours=settings.learn_hours,
+            healthy=machine.healthy,
+        )
         actuator, anew = _Actuator(settings, fresh, AlarmJudge(name), taken=block_count), True
         if state is not None:
             stored, checkpoint, pending = state
@@ -214,6 +220,8 @@ class WatchedActuators:
                     actuator.judge_samples(samples, follows, before or settings, verdict)
                 anew = before != settings.watched_with
                 actuator.watch.false_alarms_per_1000_h = rate  # with the same baseline
+                if actuator.watch.healthy is not None:  # no person has said that it is another
+                    actuator.watch.healthy = machine.healthy
                 if not _learned_alike(actuator.watch, fresh):
                     _log.warning("%s: its rig or learn_hours are others than it learned with, begins anew", name)
                     fresh.continue_from(actuator.watch.blocks, actuator.watch.baseline_version)
