@@ -23,6 +23,7 @@ from sealscope.errors import InputError
 from sealscope.monitor.alarms import AlarmJudge
 from sealscope.monitor.outputs.prometheus import metrics_text
 from sealscope.monitor.page.site import PageServer, site
+from sealscope.monitor.service import Service
 from sealscope.monitor.settings import PageSettings, WatchSettings, read_settings
 from sealscope.monitor.sources.folder import WatchedFolder
 from sealscope.monitor.sources.source_block import SourceBlock, decoded
@@ -191,6 +192,28 @@ def test_what_leaks_from_the_first_sample_began_after_the_last_healthy_recording
     healthy, worn = verdict("no leak"), verdict(start_s=500.0, end_s=560.0)
     alarm, _ = AlarmJudge("press").take_verdict(worn, healthy, 1, WatchSettings())
     assert (alarm.onset_s, alarm.onset_interval_s) == (500.0, (60.0, 500.0))
+
+
+def test_recordings_that_cannot_tell_are_watched_block_by_block(commissioned, tmp_path):
+    """As of a logger that begins a file every 10 s; a recording without a leak takes the blocks' leak back."""
+    service = Service(watching(tmp_path, commissioned), once=True)
+    worn = machine(9, G=step(0.0, LEAK, at=120.0), rate=100.0, duration=170.0)
+
+    def take(number: int, said: str) -> dict:
+        part = worn.between(10.0 * number, 10.0 * (number + 1))
+        times = {"start_s": float(part.t[0]), "end_s": float(part.t[-1])}
+        block = SourceBlock("press", str(number), part, follows=number > 0, verdict=verdict(said, **times))
+        service.actuators.take([block])
+        return service.plain()["press"]
+
+    for number in range(16):
+        summary = take(number, "cannot tell")
+    alarm = service.store.alarms()[0]
+    assert (alarm["state"], alarm["onset_s"]) == ("new", pytest.approx(120.0, abs=4.0))
+    assert summary["leak_lpm"] == alarm["leak_lpm"] and summary["state"]["condition"] == "leak"
+    assert take(16, "no leak")["leak_lpm"] is None
+    assert service.store.alarms()[0]["returned_s"] == pytest.approx(170.0, abs=0.1)
+    service.close()
 
 
 def test_a_machines_file_that_cannot_be_read_holds_its_recordings_up(commissioned, tmp_path):

@@ -77,9 +77,10 @@ class _Actuator:
     ) -> tuple[list[BlockEstimate], list[tuple[Alarm, str, float]]]:
         """Judge samples: return their estimates and the events of alarms. A replay gives the same.
 
-        The `verdict` on the whole recording, where there is one, decides instead of the blocks' tests.
+        The `verdict` on the whole recording, where there is one that can tell, decides instead of the blocks' tests.
         """
         estimates, happened = [], []
+        decided = verdict is not None and verdict.decides
         self.pending += 1
         self.bytes += bytes_of(samples)
         if "T_oil" in samples and samples.units["T_oil"] == "K":
@@ -89,13 +90,15 @@ class _Actuator:
         for estimate, leak in self.watch.each(samples, follows=follows):
             version = 0 if self.watch.baseline is None else self.watch.baseline.version
             self.last = self.watch.over_cycles(estimate)
-            change = None if verdict is not None else self.judge.take(self.last, leak, version, settings)
-            estimates.append(estimate if verdict is None else verdict.restate_block(estimate))
+            change = None if decided else self.judge.take(self.last, leak, version, settings)
+            estimates.append(estimate if verdict is None or not decided else verdict.restate_block(estimate))
             if estimate.judged or self.judged_s is None or self.judged_s > estimate.t:  # the clock may be set back
                 self.judged_s = estimate.t
             if change is not None:
                 happened.append((*change, estimate.t))
-        if verdict is not None:
+        if verdict is not None and decided:
+            if verdict.clears and self.watch.leak is not None:
+                self.watch.dismiss()
             version = 0 if self.watch.baseline is None else self.watch.baseline.version
             change = self.judge.take_verdict(verdict, self.verdict, version, settings)
             if change is not None:
@@ -134,7 +137,7 @@ class _Actuator:
         """Return the present summary as plain values."""
         base, alarm, verdict = self.watch.baseline, self.judge.alarm, self.verdict
         last = self.last or BlockEstimate(0, math.nan, "waits for samples")
-        headline: BlockEstimate | RecordingVerdict = last if verdict is None else verdict
+        headline: BlockEstimate | RecordingVerdict = last if verdict is None or not verdict.decides else verdict
         t = None if self.last is None else last.t
         return {
             "blocks": self.watch.blocks,

@@ -34,7 +34,7 @@ class RecordingVerdict:
     recordings that look like this, in the words of `diagnose`; `reason`, `cause`: as in a Diagnosis; `state`: of NE
     107; `start_s`, `end_s`: of its samples, `onset_s`, `onset_interval_s`: None where it leaks from the first sample,
     or not at all [s]; `leak_lpm`, `total_lpm` and their 95 % intervals, `bound_lpm`: None where not stated [L/min];
-    `chance`: probability that a leak-free recording scores as high.
+    `chance`: probability that a leak-free recording scores as high; `mark`: of a person who ended its alarm.
     """
 
     file: str
@@ -55,6 +55,7 @@ class RecordingVerdict:
     bound_lpm: float | None = None
     chance: float | None = None
     odds: str = ""
+    mark: str = ""
 
     @classmethod
     def from_diagnosis(cls, diagnosis: Diagnosis, start_s: float, end_s: float, shift: float) -> RecordingVerdict:
@@ -94,6 +95,11 @@ class RecordingVerdict:
         """Test whether the verdict is that nothing leaks."""
         return bool(self.verdict == NO_LEAK)
 
+    @property
+    def decides(self) -> bool:
+        """Test whether the verdict or a person's mark says how the machine is; else its blocks do."""
+        return self.leaks or self.clears or self.mark != ""
+
     def is_rare(self, false_alarms_per_1000_h: float) -> bool:
         """Test whether a healthy machine looks like this no more often than its share of a rate of false alarms.
 
@@ -120,6 +126,7 @@ class RecordingVerdict:
             state=state_of("watched").as_dict(),
             start_s=self.start_s,
             end_s=self.end_s,
+            mark=mark,
         )
 
     def restate_block(self, block: BlockEstimate) -> BlockEstimate:
