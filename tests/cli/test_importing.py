@@ -49,9 +49,9 @@ BUDGETS = {
     "parameters": (430, ("scipy", "numba")),
     "inspect run.nc": (500, ("scipy", "numba")),
     "convert run.csv run2.nc": (560, ("scipy", "numba", "pandas")),
-    "diagnose run.csv": (1290, ("pandas", "sealscope.campaigns", "sealscope.simulation.experiment")),
-    "trend . --every 1d": (1360, ("pandas", "sealscope.campaigns")),
-    "report run.nc -o page.html": (1360, ("sealscope.campaigns", "sealscope.simulation.experiment")),
+    "diagnose run.csv": (1200, ("pandas", "sealscope.campaigns", "sealscope.simulation.experiment")),
+    "trend . --every 1d": (1280, ("pandas", "sealscope.campaigns")),
+    "report run.nc -o page.html": (1280, ("sealscope.campaigns", "sealscope.simulation.experiment")),
 }
 NEVER = ("sealscope.thesis", "sealscope.monitor", "sealscope.fmu", "pint", "xarray", "sklearn", "matplotlib", "dask")
 COUNT = """

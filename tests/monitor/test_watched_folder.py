@@ -402,7 +402,8 @@ def test_the_page_of_judged_recordings_in_a_browser(commissioned, tmp_path):
         with playwright.sync_playwright() as player:
             browser = player.chromium.launch(executable_path=browser_path, args=["--no-sandbox"])
             for width in (400, 1280):
-                view = browser.new_page(viewport={"width": width, "height": 900})
+                size = {"width": width, "height": 900}
+                view = browser.new_page(viewport=size, timezone_id="America/New_York")
                 view.goto(server.address)
                 view.wait_for_selector("#alarm:not([hidden])")
                 line = view.text_content("#state") or ""
@@ -410,6 +411,7 @@ def test_the_page_of_judged_recordings_in_a_browser(commissioned, tmp_path):
                 assert recording["reason"] in (view.text_content("#now") or "")
                 assert f"alarm new, over; {recording['summary']}" in (view.text_content("#fleet .state") or "")
                 assert f"< {diagnosed_bound(service)} L/min" in (view.text_content("#fleet .figure") or "")
+                assert "2026-04-01 06:00:00" in (view.text_content("#alarm-facts") or "")  # the logger's clock
                 assert view.locator("#live-charts").is_hidden()  # no samples are kept of files
                 assert view.evaluate("document.documentElement.scrollWidth") <= width
                 assert view.evaluate(CUT) == []

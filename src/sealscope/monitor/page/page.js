@@ -28,9 +28,10 @@ function leakOf(row) {
   return row.bound_lpm === null || row.bound_lpm === undefined ? "" : `< ${Number(row.bound_lpm.toPrecision(2))} L/min`;
 }
 
-// the local time as ISO 8601 writes it, whatever the browser's language
-function isoTime(t) {
-  const local = new Date(t * 1000 - new Date(t * 1000).getTimezoneOffset() * 60000);
+// the local time as ISO 8601 writes it, whatever the browser's language; of files the time that they state
+function isoTime(t, byFiles) {
+  const zone = byFiles ? 0 : new Date(t * 1000).getTimezoneOffset() * 60000;
+  const local = new Date(t * 1000 - zone);
   return local.toISOString().slice(0, 19).replace("T", " ");
 }
 
@@ -45,10 +46,13 @@ function isoTemplate(template) {
   return uPlot.fmtDate(iso);
 }
 
+// whether the chosen actuator's recordings are files, on their logger's clock
+let chosenByFiles = false;
+
 // clocks beyond 1973 are dates, others seconds since the beginning
-function clock(t) {
+function clock(t, byFiles = chosenByFiles) {
   if (t === null || t === undefined) return "";
-  if (t > 1e8) return isoTime(t);
+  if (t > 1e8) return isoTime(t, byFiles);
   const whole = Math.floor(t);
   const parts = [Math.floor(whole / 3600), Math.floor(whole / 60) % 60, whole % 60];
   return parts.map((part) => String(part).padStart(2, "0")).join(":");
@@ -68,7 +72,7 @@ async function asked(address, options) {
 // what the monitor does not reach, and what waits for it
 function showOutages(values) {
   const lines = (values.outages || []).map(
-    (outage) => `The ${outage.part} is not reached since ${clock(outage.since)}: ${outage.reason}`,
+    (outage) => `The ${outage.part} is not reached since ${clock(outage.since, false)}: ${outage.reason}`,
   );
   if (lines.length && values.waiting) lines.push(`${values.waiting} blocks wait to be stored`);
   const place = byId("outages");
@@ -99,12 +103,12 @@ function badge(state) {
 }
 
 function stateOf(row) {
-  const since = row.state.since_s === null ? "" : ` since ${clock(row.state.since_s)}`;
+  const since = row.state.since_s === null ? "" : ` since ${clock(row.state.since_s, row.by_files)}`;
   const why = { "no data": "no data", "not comparable": `not comparable (${row.state.cause})`, learning: "learns its baseline" };
   const now = `${why[row.state.condition] || row.status}${since}`;
   if (!row.alarm) return now;
   const over = row.alarm.returned_s !== null;
-  return over ? `alarm ${row.alarm.state}, over; ${now}` : `alarm ${row.alarm.state}; leak since ${clock(row.alarm.onset_s)}`;
+  return over ? `alarm ${row.alarm.state}, over; ${now}` : `alarm ${row.alarm.state}; leak since ${clock(row.alarm.onset_s, row.by_files)}`;
 }
 
 function showFleet(fleet) {
@@ -205,6 +209,7 @@ function draw(course, events) {
       // blocks scatter below zero, where nothing flows: they must not press the leak flat
       scales: { x: { time: dated }, y: { range: (plot, least, most) => flowRange(least, most) } },
       fmtDate: isoTemplate,
+      ...(chosenByFiles ? { tzDate: (t) => uPlot.tzDate(new Date(t * 1000), "UTC") } : {}),
       bands: [{ series: [2, 1], fill: colour("--band") }],
       axes: [
         { stroke: colour("--quiet"), grid, space: 80, ...(dated ? {} : { values: (plot, at) => at.map(clock) }) },
@@ -255,6 +260,7 @@ function showLife(life) {
   }
   byId("life").hidden = false;
   byId("life-title").textContent = life.name;
+  chosenByFiles = life.by_files;
   const now = life.summary;
   const base = now.baseline;
   const learned = base ? `; baseline ${base.version}, ${base.hours.toPrecision(2)} h` +
