@@ -25,6 +25,7 @@ from sealscope.monitor.outputs.prometheus import metrics_text
 from sealscope.monitor.page.site import PageServer, site
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import PageSettings, WatchSettings, read_settings
+from sealscope.monitor.sources import folder as folder_module
 from sealscope.monitor.sources.folder import WatchedFolder
 from sealscope.monitor.sources.source_block import SourceBlock, decoded
 from sealscope.monitor.supervisor import PartAway
@@ -214,6 +215,20 @@ def test_recordings_that_cannot_tell_are_watched_block_by_block(commissioned, tm
     assert take(16, "no leak")["leak_lpm"] is None
     assert service.store.alarms()[0]["returned_s"] == pytest.approx(170.0, abs=0.1)
     service.close()
+
+
+def test_a_recording_whose_judging_raises_an_error_is_watched_by_its_blocks(
+    commissioned, tmp_path, monkeypatch, caplog
+):
+    def fail(*arguments: object, **options: object) -> None:
+        raise ZeroDivisionError("of a plug-in")
+
+    monkeypatch.setattr(folder_module, "judge_recording", fail)
+    folder = folder_of(tmp_path, commissioned)
+    log(tmp_path / "incoming/run_2026-04-01_0600.csv", machine(12, rate=100.0, duration=20.0))
+    (block,) = folder.blocks()
+    assert block.samples is not None and block.verdict is None
+    assert "is not judged as a whole: ZeroDivisionError" in caplog.text
 
 
 def test_a_machines_file_that_cannot_be_read_holds_its_recordings_up(commissioned, tmp_path):

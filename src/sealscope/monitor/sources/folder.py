@@ -27,7 +27,7 @@ from sealscope.monitor.sources.source_block import (
     bytes_of,
 )
 from sealscope.monitor.supervisor import DATABASE, PartAway, place_of
-from sealscope.monitor.verdicts import judge_recording
+from sealscope.monitor.verdicts import RecordingVerdict, judge_recording
 from sealscope.recordings import Recording
 from sealscope.recordings.corrections.samples import correct_samples, without_holes
 from sealscope.recordings.joining import file_seconds
@@ -173,14 +173,22 @@ class WatchedFolder:
         known = recording.t[np.isfinite(recording.t)]
         shift = start - float(known[0]) if known.size else 0.0
         times = corrected.t + shift
-        verdict = None
-        if machine is not None:
-            verdict = judge_recording(machine, recording, _printable(path.name), shift, limit_lpm=self._limit_lpm)
+        verdict = None if machine is None else self._judge(machine, recording, path, shift)
         self._newest_s, self._end_s = start, float(np.nanmax(times, initial=start))
         channels, units = dict(corrected.channels), dict(corrected.units)
         if "T_oil" not in channels and (celsius := oil_temperature(corrected)) is not None:
             channels["T_oil"], units["T_oil"] = np.full(len(corrected), celsius + 273.15), "K"
         return replace(block, samples=Recording(times, channels, units, corrected.rate), verdict=verdict)
+
+    def _judge(
+        self, machine: CommissionedMachine, recording: Recording, path: Path, shift: float
+    ) -> RecordingVerdict | None:
+        """Judge a recording; None, and a line in the log, where that raises an error: its blocks are watched then."""
+        try:
+            return judge_recording(machine, recording, _printable(path.name), shift, limit_lpm=self._limit_lpm)
+        except Exception as error:
+            _log.warning("%s: %s is not judged as a whole: %s", self.actuator, _printable(path.name), place_of(error))
+            return None
 
     def _read_machine(self) -> CommissionedMachine | None:
         """Read the machine anew, for a mark or an engineer may have changed its file meanwhile."""
