@@ -93,12 +93,13 @@ def _with_measured_displacement(rig: Rig, healthy: tuple[Learnt, ...]) -> Rig:
 def _healthy_level(healthy: tuple[Learnt, ...], rig: Rig) -> HealthyLevel | None:
     """Estimate the leakage conductance of pump and piston together in healthy recordings, by the sums of their balance.
 
-    None where fewer than two of them have one: how it scatters is not known then.
+    None where fewer than two of them have one: how it scatters is not known then; and behind a valve, each edge of
+    which is a balance.
     """
     levels = []
     for recording in healthy:
-        lesson, equation = recording.lessons.get(_BALANCE), equations(rig, frozenset(recording.units))[:1]
-        if not isinstance(lesson, Mapping) or not equation:
+        lesson, equation = recording.lessons.get(_BALANCE), equations(rig, frozenset(recording.units))
+        if not isinstance(lesson, Mapping) or not lesson.keys() >= {"sums", "scale"} or len(equation) != 1:
             continue
         columns, sums = Columns(equation[0]), np.asarray(lesson["sums"], dtype=float)[0]
         if sums.shape != 2 * (columns.left + 1,):
