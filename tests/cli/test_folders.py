@@ -32,7 +32,7 @@ WATCH = """
 settle_s = 0.0
 [[actuator]]
 name = "press"
-rig = "press.toml"
+machine = "press.toml"
 folder = "incoming"
 """
 

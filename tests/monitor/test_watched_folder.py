@@ -82,6 +82,16 @@ def test_the_machines_file_states_rate_map_and_limit(commissioned, tmp_path):
     assert (actuator.rate, actuator.error_lpm) == (50.0, 1.0)
 
 
+def test_a_machine_is_stated_by_its_own_word(commissioned, tmp_path):
+    (actuator,) = stream_settings(tmp_path, f'machine = "{commissioned}"').actuator
+    assert (actuator.rig, actuator.rate) == (str(commissioned), 100.0)
+    (tmp_path / "rig.toml").write_text((Path(ss.__file__).parent / "parameters/rigs/thesis.toml").read_text("utf-8"))
+    with pytest.raises(InputError, match="machine must be a file that sealscope commission wrote, got a rig"):
+        stream_settings(tmp_path, 'machine = "rig.toml"')
+    with pytest.raises(InputError, match="must be readable, got: No such file"):
+        stream_settings(tmp_path, 'machine = "absent.toml"')
+
+
 def test_a_machine_of_areas_alone_is_watched_in_the_litres_of_a_diagnosis(commissioned, tmp_path):
     """Its logs have no time column, and its pump was guessed: 7.0 in place of 4.9 cm^3/rev."""
     settings = watching(tmp_path, commissioned)

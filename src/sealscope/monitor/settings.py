@@ -92,13 +92,21 @@ class ActuatorSettings(WatchSettings):
     def _machine_states_the_rest(cls, values: Any, info: ValidationInfo) -> Any:
         """Take rate, map, units and limit from the machine's file where the table does not state them.
 
-        Units are those of the columns of its logs; messages state their own, and files too.
+        `machine`, which must be such a file, stands for `rig`, which may be one. Units are those of the columns of its
+        logs; messages state their own, and files too.
         """
-        rig = values.get("rig") if isinstance(values, dict) else None
-        if not isinstance(rig, str) or not rig.endswith(".toml"):
+        if not isinstance(values, dict):
+            return values
+        commissioned = values.get("machine")
+        if isinstance(commissioned, str):
+            values = {name: value for name, value in values.items() if name != "machine"} | {"rig": commissioned}
+        rig = values.get("rig")
+        if not isinstance(rig, str) or not (rig.endswith(".toml") or rig is commissioned):
             return values
         place = Path(info.context["folder"]) / rig if info.context else Path(rig)
         machine = load_watched(os.fspath(place))
+        if rig is commissioned and machine.machine is None:
+            raise ValueError(f"machine must be a file that sealscope commission wrote, got a rig: {rig[:100]}")
         columns = {} if isinstance(machine.channel_map, str) else dict(machine.channel_map)
         units = {name: unit for name, column in columns.items() if (unit := _unit_of_column(name, column))}
         by_signals = units and (values.get("nodes") or values.get("sparkplug"))
