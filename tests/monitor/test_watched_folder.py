@@ -101,11 +101,16 @@ def test_a_machine_of_areas_alone_is_watched_in_the_litres_of_a_diagnosis(commis
     (event,) = [json.loads(line) for line in out.splitlines()]
     diagnosis = ss.read_machine(commissioned).diagnose(path)
     summary = service.plain()["press"]
-    assert event["alarm"]["leak_lpm"] == summary["leak_lpm"] == diagnosis.leak_lpm
+    assert event["alarm"]["leak_lpm"] == summary["leak_lpm"] == same(diagnosis.leak_lpm)
     assert event["alarm"]["onset_s"] == pytest.approx(APRIL + 6.0 * 3600.0 + diagnosis.onset_s)
     assert summary["why_no_litres"] == ""
     course = [row["leak_lpm"] for row in service.store.course("press")]
-    assert course[0] is None and course[-1] == diagnosis.leak_lpm
+    assert course[0] is None and course[-1] == same(diagnosis.leak_lpm)
+
+
+def same(figures):
+    """The same to the rounding of the linear algebra, whose threads may be others."""
+    return pytest.approx(figures, rel=1e-9)
 
 
 def surfaces(service, out: str, diagnosis):
@@ -115,12 +120,11 @@ def surfaces(service, out: str, diagnosis):
     (row,) = page.get("/api/fleet").json()["actuators"]
     families = text_string_to_metric_families(page.get("/metrics").text)
     metrics = {family.name: family.samples[0].value for family in families if family.samples}
-    ends = list(diagnosis.leak_interval_lpm)
+    figures = [diagnosis.leak_lpm, *diagnosis.leak_interval_lpm]
     assert event["event"] == "raised"
     for shown in (event["alarm"], row):
-        assert (shown["leak_lpm"], shown["leak_interval_lpm"]) == (diagnosis.leak_lpm, ends)
-    figures = [metrics[f"sealscope_leak_{end}lpm"] for end in ("", "low_", "high_")]
-    assert figures == [diagnosis.leak_lpm, *ends]
+        assert [shown["leak_lpm"], *shown["leak_interval_lpm"]] == same(figures)
+    assert [metrics[f"sealscope_leak_{end}lpm"] for end in ("", "low_", "high_")] == same(figures)
     assert metrics["sealscope_severity"] == diagnosis.state.severity
     for shown in (row["state"], event["alarm"]["machine_state"]):
         assert (shown["name"], shown["condition"]) == (diagnosis.state.name, diagnosis.state.condition)
@@ -157,10 +161,11 @@ def test_the_bound_of_a_healthy_recording_is_that_of_diagnose_and_ends_the_alarm
     service, out = served(settings)
     assert [json.loads(line)["event"] for line in out.splitlines()] == ["raised", "returned"]
     summary = service.plain()["press"]
-    assert (summary["leak_lpm"], summary["bound_lpm"]) == (None, diagnosis.bound_lpm)
-    assert summary["total_lpm"] == diagnosis.total_leakage.lpm
+    assert summary["leak_lpm"] is None
+    assert summary["bound_lpm"] == same(diagnosis.bound_lpm)
+    assert summary["total_lpm"] == same(diagnosis.total_leakage.lpm)
     assert (summary["state"]["name"], summary["status"]) == (diagnosis.state.name, diagnosis.summary)
-    assert f'sealscope_bound_lpm{{actuator="press"}} {diagnosis.bound_lpm!r}' in metrics_text(service.plain(), {})
+    assert f'sealscope_bound_lpm{{actuator="press"}} {summary["bound_lpm"]!r}' in metrics_text(service.plain(), {})
 
 
 @pytest.mark.parametrize("mark", ["invalid", "repaired"])
