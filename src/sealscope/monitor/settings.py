@@ -100,12 +100,12 @@ class ActuatorSettings(WatchSettings):
         commissioned = values.get("machine")
         if isinstance(commissioned, str):
             values = {name: value for name, value in values.items() if name != "machine"} | {"rig": commissioned}
-        rig = values.get("rig")
-        if not isinstance(rig, str) or not (rig.endswith(".toml") or rig is commissioned):
+        rig, is_machine = values.get("rig"), isinstance(commissioned, str)
+        if not isinstance(rig, str) or not (rig.endswith(".toml") or is_machine):
             return values
         place = Path(info.context["folder"]) / rig if info.context else Path(rig)
         machine = load_watched(os.fspath(place))
-        if rig is commissioned and machine.machine is None:
+        if is_machine and machine.machine is None:
             raise ValueError(f"machine must be a file that sealscope commission wrote, got a rig: {rig[:100]}")
         columns = {} if isinstance(machine.channel_map, str) else dict(machine.channel_map)
         units = {name: unit for name, column in columns.items() if (unit := _unit_of_column(name, column))}
