@@ -21,6 +21,7 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase
 from numba.core.compiler_machinery import PassManager
 from numba.core.registry import CPUDispatcher
+from numba.core.runtime import rtsys
 from numba.core.typed_passes import (
     AnnotateTypes,
     IRLegalization,
@@ -48,6 +49,7 @@ NAMES = {
     "numba.core.codegen": ("JITCodeLibrary",),
     "numba.core.compiler_machinery": ("PassManager",),
     "numba.core.registry": ("CPUDispatcher",),
+    "numba.core.runtime": ("rtsys",),
     "numba.core.typed_passes": (
         *("AnnotateTypes", "IRLegalization", "NativeLowering", "NoPythonBackend", "NopythonTypeInference"),
         "PreLowerStripPhis",
@@ -59,11 +61,15 @@ NAMES = {
 }
 #: Attributes of these classes and modules that are overridden, called or set.
 ATTRIBUTES = {
-    "numba.core.caching:FunctionCache": ("load_overload", "save_overload", "flush", "cache_path"),
+    "numba.core.caching:FunctionCache": (
+        *("load_overload", "_load_overload", "_guard_against_spurious_io_errors"),
+        *("save_overload", "flush", "cache_path"),
+    ),
     "numba.core.codegen:JITCodeLibrary": ("_finalize_final_module", "get_pointer_to_function"),
     "numba.core.compiler:CompilerBase": ("define_pipelines",),
     "numba.core.compiler_machinery:PassManager": ("add_pass", "finalize"),
     "numba.core.registry:CPUDispatcher": ("add_overload", "compile"),
+    "numba.core.runtime:rtsys": ("initialize",),
     "numba.core.config": ("CACHE_DIR",),
 }
 
@@ -72,14 +78,20 @@ class PatientCache(FunctionCache):  # type: ignore[misc]
     """numba's cache, where a file that cannot be read or written is a cache miss."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return the compiled code of a signature, None where there is none or it is damaged."""
+        """Return the compiled code of a signature, None where there is none or it is damaged.
+
+        Of what numba prepares before it compiles, which takes longer than the loading, machine code needs the memory's
+        reference counts alone. A compilation prepares the rest.
+        """
         try:
-            return super().load_overload(sig, target_context)
+            rtsys.initialize(target_context)
+            with self._guard_against_spurious_io_errors():
+                return self._load_overload(sig, target_context)
         except Exception as error:  # unpickling a cut-off file raises many kinds
             _log.debug("compiled code in %s is damaged: %s", self.cache_path, error)
             with suppress(OSError):
                 self.flush()
-            return None
+        return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Save the compiled code of a signature, if there is room for it."""

@@ -32,9 +32,8 @@ WATCH = """
 settle_s = 0.0
 [[actuator]]
 name = "press"
-rig = "press.toml"
+machine = "press.toml"
 folder = "incoming"
-learn_hours = 0.05
 """
 
 
@@ -127,8 +126,8 @@ def test_from_logs_of_several_loggers_to_a_watched_machine(press, call, monkeypa
     (event,) = map(json.loads, call("monitor", "watch.toml", "--once").out.splitlines())
     alarm = event["alarm"]
     assert event["event"] == "raised"
-    assert low <= alarm["leak_lpm"] <= high
-    assert alarm["leak_interval_lpm"][0] <= diagnosis.leak_lpm <= alarm["leak_interval_lpm"][1]
+    figures = pytest.approx([leaking["leak_lpm"], low, high], rel=1e-9)
+    assert [alarm["leak_lpm"], *alarm["leak_interval_lpm"]] == figures
 
     # monitor page and metrics, after a restart
     service = Service(read_settings(Path("watch.toml")), once=True)
@@ -136,7 +135,8 @@ def test_from_logs_of_several_loggers_to_a_watched_machine(press, call, monkeypa
     assert row["alarm"]["id"] == alarm["id"]
     assert metrics["sealscope_leak_lpm"] == pytest.approx(row["leak_lpm"])
     assert [metrics[f"sealscope_leak_{end}_lpm"] for end in ("low", "high")] == row["leak_interval_lpm"]
-    assert low <= row["leak_lpm"] <= high
+    assert [row["leak_lpm"], *row["leak_interval_lpm"]] == figures
+    assert row["recording"]["size"] == messages.how_much(diagnosis)
     assert row["state"]["name"] == leaking["state"]["name"]
     assert metrics["sealscope_severity"] == leaking["state"]["severity"]
     assert row["state"]["since_s"] == pytest.approx(1776751200.0, abs=86_400.0)  # of 2026-04-21, not of today

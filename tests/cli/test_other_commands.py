@@ -191,6 +191,17 @@ def test_other_shells_are_answered(kind, call, monkeypatch):
     assert "diagnose" not in done.out
 
 
+def test_inspect_shows_the_units_of_the_log_and_the_line_for_its_temperature(call, tmp_path):
+    rows = "".join(f"{k / 500:.3f},{20 + k % 9},50,{1 + k % 7},{k * 40},{60 + k % 3}\n" for k in range(600))
+    (tmp_path / "log.csv").write_text("time_s,pA_psi,pB_psi,x_in,theta_deg,temp_degF\n" + rows)
+    done = call("inspect", tmp_path / "log.csv", "--map", "auto")
+    lines = {line.split()[0]: line for line in done.out.splitlines() if line.strip()}
+    assert "1 to 7 in" in lines["x"] and "0 to 23960 deg" in lines["theta"] and "20 to 28 psi" in lines["p_A"]
+    assert "if it is the oil's temperature: --map 'T_oil=temp_degF'" in " ".join(done.out.split())
+    warm = call("inspect", tmp_path / "log.csv", "--map", "auto", "--map", "T_oil=temp_degF")
+    assert "60 to 62 degF" in warm.out and "oil's" not in warm.out
+
+
 def test_inspect_shows_what_a_foreign_file_holds_and_what_is_wrong(call, tmp_path):
     rows = "".join(f"{k / 500:.3f};{20 + k % 9};5;{k % 7}\n" for k in range(600))
     (tmp_path / "log.csv").write_text("Zeit [s];Druck A [bar];PB_bar;Weg_mm\n" + rows)
@@ -201,7 +212,7 @@ def test_inspect_shows_what_a_foreign_file_holds_and_what_is_wrong(call, tmp_pat
     (line,) = [line for line in done.out.splitlines() if line.split()[0] == "p_A"]
     assert "20 to 28 bar" in line
     assert "note: column Weg_mm read as x in mm" in done.out
-    assert "warning: p_B: is constant at 500000 Pa" in done.out
+    assert "warning: p_B: is constant at 5 bar" in done.out
     again = call("inspect", tmp_path / "log.csv", "--map", "auto", "--map", "p_B=#2")  # Druck A is p_B, so nothing p_A
     assert again.status == 0
     assert "note: column Druck A [bar] read as p_B in bar" in again.out

@@ -215,7 +215,7 @@ def test_a_decoding_that_was_begun_twice_is_not_begun_again(connection: Any, mon
     handed: list[RefusedMessage] = []
     monkeypatch.setattr(connection._service, "hand", handed.append)
 
-    def deadly(payload: bytes, actuator: str | None) -> None:
+    def deadly(*arguments: object) -> None:
         os._exit(3)
 
     poison, good = b"poison" * 100_000, json.dumps(GOOD).encode()
@@ -226,7 +226,7 @@ def test_a_decoding_that_was_begun_twice_is_not_begun_again(connection: Any, mon
             monkeypatch.setattr(broker_module, "decoded", deadly)
             connection._hand(0, wire(poison, dup=False))
         assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 3
-    monkeypatch.setattr(broker_module, "decoded", lambda payload, name: pytest.fail("it was read"))
+    monkeypatch.setattr(broker_module, "decoded", lambda *arguments: pytest.fail("it was read"))
     connection._hand(0, wire(poison))
     (refused,) = handed
     assert (refused.reason, refused.size) == (UNENDED, len(poison))

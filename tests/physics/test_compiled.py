@@ -287,3 +287,23 @@ def test_a_law_that_a_rig_leaves_out_is_not_compiled():
         guarded(numbers(1.5, (True,)))
     with pytest.raises(TypingError, match="nothing_of_this_name"):  # a branch that is not settled is compiled
         chosen(numbers(1.5, ()))
+
+
+LOADED = """
+import sys
+import sealscope as ss
+recording = ss.simulate(command="3 sin(4t)", duration="10 s", seed=1)
+print(float(recording["p_A"].sum()), int("numba.np.linalg" in sys.modules))
+"""
+
+
+def test_code_from_the_cache_needs_nothing_that_compiles(tmp_path):
+    """What numba declares for a compilation takes longer than the loading of all kernels."""
+    environment = {**os.environ, "SEALSCOPE_CACHE_DIR": str(tmp_path / "cache")}
+    answers = [
+        subprocess.run([sys.executable, "-c", LOADED], env=environment, capture_output=True, text=True, check=True)
+        for _ in range(2)
+    ]
+    (first, compiles), (second, compiles_again) = (answer.stdout.split() for answer in answers)
+    assert first == second
+    assert (compiles, compiles_again) == ("1", "0")

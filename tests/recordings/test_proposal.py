@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings import read
 from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.headings.proposal import proposed_map
+from sealscope.recordings.formats.headings.proposal import proposed_map, split_unit
 
 
 @pytest.mark.parametrize(
@@ -130,3 +130,18 @@ def test_any_names_give_a_map_of_these_columns(names: list[str]) -> None:
     labels = [Label.parse(name) for name in names]
     for column in proposed_map(labels).values():
         assert any(column.startswith(label.whole) for label in labels)
+
+
+@pytest.mark.parametrize(
+    ("heading", "parts"),
+    [
+        ("p_min", ("p_min", None)),  # a least pressure, not minutes
+        ("p_d", ("p_d", None)),  # a demand, not days
+        ("x_s", ("x_s", None)),
+        ("time_min", ("time", "min")),
+        ("time_d", ("time", "d")),
+        ("p_bar", ("p", "bar")),
+    ],
+)
+def test_an_ending_that_may_be_no_unit_is_one_behind_a_word_of_its_kind(heading, parts):
+    assert split_unit(heading) == parts

@@ -71,6 +71,11 @@ def _thesis(folder: Path):
     return [*made, ItemStatus(Item("fig-1.1", 4, "figure", "F", print), "not made")]
 
 
+#: Tables of sentences that must be scrolled sideways to be read.
+WIDE_TABLES = """() => [...document.querySelectorAll(".table.rows")]
+  .filter((table) => table.scrollWidth > table.clientWidth).map((table) => table.ariaLabel)"""
+
+
 def faults(browser, page: Path, width: int, scheme: str) -> list[str]:
     """Return what axe-core calls serious or critical on a page whose folds are all open."""
     from axe_playwright_python.sync_playwright import Axe
@@ -82,6 +87,7 @@ def faults(browser, page: Path, width: int, scheme: str) -> list[str]:
         shown.evaluate("document.querySelectorAll('details').forEach((fold) => { fold.open = true; })")
         shown.wait_for_timeout(200)  # charts in the folds are drawn
         assert shown.evaluate("document.documentElement.scrollWidth") <= width, "the page is wider than its window"
+        assert shown.evaluate(WIDE_TABLES) == []
         violations = Axe().run(shown).response["violations"]
     finally:
         context.close()

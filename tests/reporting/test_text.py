@@ -6,6 +6,7 @@ import pytest
 
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.diagnosis.verdict.states import state_of
+from sealscope.recordings.quality import Finding
 from sealscope.reporting import messages
 from sealscope.reporting.messages import diagnosis_text
 
@@ -106,3 +107,11 @@ def test_control_characters_of_a_file_name_do_not_reach_the_terminal(make_diagno
 )
 def test_false_alarm_rates_in_words(make_diagnosis, p, shown):
     assert shown in messages.false_alarms(make_diagnosis(false_alarm_probability=p))
+
+
+def test_a_healthy_recording_left_out_as_its_own_baseline_is_no_fault_of_its_data(make_diagnosis):
+    """Each file of the healthy folder is judged against the others."""
+    left_out = Finding("baseline_left_out", "warning", None, 1, None, "1 of 7 baseline recordings is left out")
+    healthy = {"verdict": "no leak", "score": 1.5, "onset_s": None, "leak_lpm": None}
+    with_it, without = (make_diagnosis(**healthy, quality=quality) for quality in ((left_out,), ()))
+    assert messages.next_steps(with_it) == messages.next_steps(without)

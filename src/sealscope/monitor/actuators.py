@@ -33,6 +33,7 @@ from sealscope.monitor.database.store import KEPT_IDENTITIES, MonitorStore, Stor
 from sealscope.monitor.settings import ActuatorSettings, WatchSettings
 from sealscope.monitor.sources.source_block import SourceBlock, bytes_of
 from sealscope.monitor.supervisor import Supervisor
+from sealscope.monitor.verdicts import RecordingVerdict
 from sealscope.recordings.recording import Recording
 from sealscope.storage.plain_state import part_of, restored, saved
 
@@ -42,6 +43,8 @@ _LONGEST_TEXT = 2000
 PENDING_BLOCKS, PENDING_BYTES = 16, 400_000
 #: What a block is counted under that raised an error.
 DROPPED = "blocks that raised an error"
+#: Texts of a verdict on a recording that a summary shows.
+_SHOWN_OF_VERDICTS = ("file", "verdict", "summary", "size", "odds", "reason")
 #: How long the samples of an alarm are kept [s].
 _KEPT_S = 120.0
 
@@ -51,8 +54,9 @@ class _Actuator:
     """The state of an actuator in memory.
 
     `pending`, `bytes`: blocks since the checkpoint; `taken`: blocks so far; `judged_s`: end of the last block that was
-    judged [s]; `last`: the last estimate, of flows over the cycles seen; `kept`: the last samples while there is an
-    alarm, which a machine's file may be taught.
+    judged [s]; `last`: the last estimate, of flows over the cycles seen; `verdict`: on the last recording, None where
+    no whole recordings are judged; `kept`: the last samples while there is an alarm, which a machine's file may be
+    taught.
     """
 
     settings: ActuatorSettings
@@ -65,13 +69,18 @@ class _Actuator:
     shown: dict[str, Any] | None = None
     oil_celsius: float | None = None
     judged_s: float | None = None
+    verdict: RecordingVerdict | None = None
     kept: list[Recording] = field(default_factory=list)
 
     def judge_samples(
-        self, samples: Recording, follows: bool, settings: WatchSettings
+        self, samples: Recording, follows: bool, settings: WatchSettings, verdict: RecordingVerdict | None = None
     ) -> tuple[list[BlockEstimate], list[tuple[Alarm, str, float]]]:
-        """Judge samples: return their estimates and the events of alarms. A replay gives the same."""
+        """Judge samples: return their estimates and the events of alarms. A replay gives the same.
+
+        The `verdict` on the whole recording, where there is one that can tell, decides instead of the blocks' tests.
+        """
         estimates, happened = [], []
+        decided = verdict is not None and verdict.decides
         self.pending += 1
         self.bytes += bytes_of(samples)
         if "T_oil" in samples and samples.units["T_oil"] == "K":
@@ -81,12 +90,20 @@ class _Actuator:
         for estimate, leak in self.watch.each(samples, follows=follows):
             version = 0 if self.watch.baseline is None else self.watch.baseline.version
             self.last = self.watch.over_cycles(estimate)
-            change = self.judge.take(self.last, leak, version, settings)
-            estimates.append(estimate)
+            change = None if decided else self.judge.take(self.last, leak, version, settings)
+            estimates.append(estimate if verdict is None or not decided else verdict.restate_block(estimate))
             if estimate.judged or self.judged_s is None or self.judged_s > estimate.t:  # the clock may be set back
                 self.judged_s = estimate.t
             if change is not None:
                 happened.append((*change, estimate.t))
+        if verdict is not None and decided:
+            if verdict.clears and self.watch.leak is not None:
+                self.watch.dismiss()
+            version = 0 if self.watch.baseline is None else self.watch.baseline.version
+            change = self.judge.take_verdict(verdict, self.verdict, version, settings)
+            if change is not None:
+                happened.append((*change, verdict.end_s))
+        self.verdict = verdict
         same_format = self.kept and (self.kept[0].units, self.kept[0].rate) == (samples.units, samples.rate)
         if self.judge.alarm is None or not (follows and same_format):
             self.kept = []
@@ -99,13 +116,15 @@ class _Actuator:
 
     def state(self) -> dict[str, Any]:
         """Return the state for a checkpoint as plain values."""
-        return saved(self, ("watch", "judge", "last", "oil_celsius", "judged_s"))
+        return saved(self, ("watch", "judge", "last", "oil_celsius", "judged_s", "verdict"))
 
     def _machine_state(self) -> MachineState:
         """Return the state of NE 107, as far as the samples tell."""
         alarm, baseline, over = self.judge.alarm, self.watch.baseline, self.judge.over_s
         if alarm is not None and alarm.active:
             return state_of(alarm.condition, alarm.cause, since_s=alarm.onset_s, action=alarm.next_check)
+        if self.verdict is not None:
+            return MachineState(**self.verdict.state)
         if self.last is None or self.judged_s is None:
             return state_of("no data")
         if self.last.t - self.judged_s > self.settings.not_comparable_s:
@@ -116,19 +135,23 @@ class _Actuator:
 
     def summary(self) -> dict[str, Any]:
         """Return the present summary as plain values."""
-        base, alarm = self.watch.baseline, self.judge.alarm
+        base, alarm, verdict = self.watch.baseline, self.judge.alarm, self.verdict
         last = self.last or BlockEstimate(0, math.nan, "waits for samples")
+        headline: BlockEstimate | RecordingVerdict = last if verdict is None or not verdict.decides else verdict
+        t = None if self.last is None else last.t
         return {
             "blocks": self.watch.blocks,
-            "t": None if self.last is None else last.t,
-            "status": last.status,
+            "t": t if verdict is None else verdict.end_s,
+            "status": last.status if verdict is None else verdict.summary,
             "state": self._machine_state().as_dict(),
             "by": self.watch.method,
-            "total_lpm": last.total_lpm,
-            "total_interval_lpm": last.total_interval_lpm,
-            "leak_lpm": last.leak_lpm,
-            "leak_interval_lpm": last.leak_interval_lpm,
-            "why_no_litres": self.watch.why_no_litres,
+            "total_lpm": headline.total_lpm,
+            "total_interval_lpm": headline.total_interval_lpm,
+            "leak_lpm": headline.leak_lpm,
+            "leak_interval_lpm": headline.leak_interval_lpm,
+            "bound_lpm": None if verdict is None else verdict.bound_lpm,
+            "recording": None if verdict is None else {name: getattr(verdict, name) for name in _SHOWN_OF_VERDICTS},
+            "why_no_litres": self.watch.why_no_litres if verdict is None else "",
             "oil_celsius": self.oil_celsius,
             "baseline": None if base is None else {"version": base.version, "hours": base.hours, "lpm": base.lpm},
             "alarm": None if alarm is None else alarm.id,
@@ -172,7 +195,13 @@ class WatchedActuators:
         """Restore an actuator from its last transaction, or begin anew if it is new or its settings changed."""
         name, rate = settings.name, settings.false_alarms_per_1000_h
         state, block_count = self.store.checkpoint(name), self.store.last_number(self.store.tables.blocks, name)
-        fresh = watch(load_watched(settings.rig).rig, false_alarms_per_1000_h=rate, learn_hours=settings.learn_hours)
+        machine = load_watched(settings.rig)
+        fresh = watch(
+            machine.rig,
+            false_alarms_per_1000_h=rate,
+            learn_hours=settings.learn_hours,
+            healthy=machine.healthy,
+        )
         actuator, anew = _Actuator(settings, fresh, AlarmJudge(name), taken=block_count), True
         if state is not None:
             stored, checkpoint, pending = state
@@ -188,10 +217,14 @@ class WatchedActuators:
                     None if checkpoint["last"] is None else restored(BlockEstimate, checkpoint["last"], "last")
                 )
                 actuator.oil_celsius, actuator.judged_s = checkpoint.get("oil_celsius"), checkpoint.get("judged_s")
-                for samples, follows in pending:  # as they were judged before
-                    actuator.judge_samples(samples, follows, before or settings)
+                if checkpoint.get("verdict") is not None:
+                    actuator.verdict = restored(RecordingVerdict, checkpoint["verdict"], "verdict")
+                for samples, follows, verdict in pending:  # as they were judged before
+                    actuator.judge_samples(samples, follows, before or settings, verdict)
                 anew = before != settings.watched_with
                 actuator.watch.false_alarms_per_1000_h = rate  # with the same baseline
+                if actuator.watch.healthy is not None:  # no person has said that it is another
+                    actuator.watch.healthy = machine.healthy
                 if not _learned_alike(actuator.watch, fresh):
                     _log.warning("%s: its rig or learn_hours are others than it learned with, begins anew", name)
                     fresh.continue_from(actuator.watch.blocks, actuator.watch.baseline_version)
@@ -268,7 +301,7 @@ class WatchedActuators:
             for block, actuator in mine:
                 actuator.taken += 1
                 if block.samples is not None:
-                    self._add_samples(rows, actuator, block.samples, block.follows)
+                    self._add_samples(rows, actuator, block, block.samples)
             self.store.keep_rows(connection, rows)
 
     def _actuator(self, name: str) -> _Actuator:
@@ -276,10 +309,10 @@ class WatchedActuators:
             self._actuators[name] = self._restore(self.settings[name])
         return self._actuators[name]
 
-    def _add_samples(self, rows: StoredRows, actuator: _Actuator, samples: Recording, follows: bool) -> None:
-        """Judge samples of an actuator, and add the results to the rows."""
-        name = actuator.settings.name
-        estimates, happened = actuator.judge_samples(samples, follows, actuator.settings)
+    def _add_samples(self, rows: StoredRows, actuator: _Actuator, block: SourceBlock, samples: Recording) -> None:
+        """Judge the samples of an actuator's block, and add the results to the rows."""
+        name, follows, verdict = actuator.settings.name, block.follows, block.verdict
+        estimates, happened = actuator.judge_samples(samples, follows, actuator.settings, verdict)
         rows.add_estimates(name, estimates, actuator.oil_celsius)
         for alarm, kind, t in happened:
             rows.add_alarm(alarm, kind, t)
@@ -287,7 +320,7 @@ class WatchedActuators:
         if turn == 0 or actuator.bytes >= PENDING_BYTES:
             self._checkpoint(actuator, rows)
         else:
-            rows.add_pending(name, actuator.pending, samples, follows)
+            rows.add_pending(name, actuator.pending, samples, follows, verdict)
             self._show(actuator, rows)
 
     def _checkpoint(self, actuator: _Actuator, rows: StoredRows) -> None:
@@ -328,6 +361,8 @@ class WatchedActuators:
             kept = list(actuator.kept)
             alarm = actuator.judge.marked(mark, t, until=t + hours * 3600.0, reason=text)
             try:
+                if mark in ("invalid", "repaired") and actuator.verdict is not None:
+                    actuator.verdict = actuator.verdict.mark_over(mark)
                 if mark == "invalid":
                     actuator.watch.dismiss()
                 elif mark == "repaired":

@@ -17,6 +17,7 @@ from sealscope.diagnosis.live.estimates import BlockEstimate, Interval, WatchedL
 from sealscope.diagnosis.verdict.states import state_of
 from sealscope.errors import InputError
 from sealscope.monitor.settings import WatchSettings
+from sealscope.monitor.verdicts import RecordingVerdict
 from sealscope.storage.plain_state import saved
 
 Level = Literal["warning", "error"]
@@ -178,6 +179,58 @@ class AlarmJudge:
             leak_lpm, interval = estimate.leak_lpm, estimate.leak_interval_lpm
             now = replace(now, leak_lpm=leak_lpm, leak_interval_lpm=interval, by_chance_per_1000_h=by_chance)
         return self._keep(now), happened
+
+    def take_verdict(
+        self, verdict: RecordingVerdict, earlier: RecordingVerdict | None, baseline: int, settings: WatchSettings
+    ) -> tuple[Alarm, str] | None:
+        """Return the alarm and what happened to it, as `take` does, by the verdict on a whole recording.
+
+        A leak is an alarm where a healthy machine looks like this as seldom as stated, or the recording before, whose
+        verdict is `earlier`, leaks as well. It is over with the first recording without a leak.
+        """
+        alarm, lpm = self.alarm, verdict.leak_lpm
+        lasts = alarm is not None and alarm.active
+        above = verdict.leaks and (lpm is None or lpm >= settings.warning_lpm)
+        if not above:
+            if alarm is None or not lasts or not (verdict.clears or verdict.leaks):
+                return None
+            over: AlarmState = "new" if alarm.state == "new" else "closed"
+            end_s = verdict.end_s
+            return self._keep(replace(alarm, state=over, returned_s=end_s, updated_s=end_s)), "returned"
+        level: Level = "error" if verdict.state["condition"] == _CONDITIONS["error"] else "warning"
+        found: dict[str, Any] = {
+            "level": level,
+            "updated_s": verdict.end_s,
+            "leak_lpm": lpm,
+            "leak_interval_lpm": verdict.leak_interval_lpm,
+            "evidence": f"{verdict.file}: {verdict.reason}",
+            "next_check": verdict.state["action"],
+            "by_chance_per_1000_h": verdict.by_chance_per_1000_h,
+        }
+        if alarm is not None and lasts:
+            is_worse = level == "error" and alarm.level == "warning"
+            state: AlarmState = "new" if is_worse and alarm.state != "valid" else alarm.state
+            return self._keep(replace(alarm, **found, state=state)), "" if level == alarm.level else level
+        is_repeated = earlier is not None and earlier.leaks
+        if not (is_repeated or verdict.is_rare(settings.false_alarms_per_1000_h)):
+            return None
+        self.raised += alarm is None
+        since = verdict.start_s if verdict.onset_s is None else verdict.onset_s
+        # what leaks from the first sample on began after the last recording that did not
+        before = verdict.start_s if earlier is None or not earlier.clears else min(earlier.end_s, verdict.start_s)
+        self.alarm = Alarm(
+            id=f"{self.actuator}-{self.raised}",
+            actuator=self.actuator,
+            state="new",
+            raised_s=verdict.end_s,
+            onset_s=since,
+            onset_interval_s=verdict.onset_interval_s or (before, since),
+            cause=verdict.cause,
+            baseline=baseline,
+            shelved_until_s=0.0 if alarm is None else alarm.shelved_until_s,
+            **found,
+        )
+        return self.alarm, "raised"
 
     def _keep(self, alarm: Alarm) -> Alarm:
         if not alarm.active:

@@ -13,7 +13,11 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, IPvAnyAddress
 from sealscope.diagnosis.commissioned.watched import load_watched
 from sealscope.diagnosis.live.joining import CHANNELS, in_words, ways_to_watch
 from sealscope.errors import InputError
+from sealscope.recordings.channels import CHANNEL_UNITS
+from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.proposal import split_unit
 from sealscope.storage.toml_file import read_model, read_toml
+from sealscope.units import same_dimension, to_si
 
 _Place = TypeVar("_Place", Path, str)
 _Text = Annotated[str, Field(min_length=1, max_length=100)]
@@ -86,14 +90,28 @@ class ActuatorSettings(WatchSettings):
     @model_validator(mode="before")
     @classmethod
     def _machine_states_the_rest(cls, values: Any, info: ValidationInfo) -> Any:
-        """Take rate, map and limit from the machine's file where the table does not state them."""
-        rig = values.get("rig") if isinstance(values, dict) else None
-        if not isinstance(rig, str) or not rig.endswith(".toml"):
+        """Take rate, map, units and limit from the machine's file where the table does not state them.
+
+        `machine`, which must be such a file, stands for `rig`, which may be one. Units are those of the columns of its
+        logs; messages state their own, and files too.
+        """
+        if not isinstance(values, dict):
+            return values
+        commissioned = values.get("machine")
+        if isinstance(commissioned, str):
+            values = {name: value for name, value in values.items() if name != "machine"} | {"rig": commissioned}
+        rig, is_machine = values.get("rig"), isinstance(commissioned, str)
+        if not isinstance(rig, str) or not (rig.endswith(".toml") or is_machine):
             return values
         place = Path(info.context["folder"]) / rig if info.context else Path(rig)
         machine = load_watched(os.fspath(place))
+        if is_machine and machine.machine is None:
+            raise ValueError(f"machine must be a file that sealscope commission wrote, got a rig: {rig[:100]}")
         columns = {} if isinstance(machine.channel_map, str) else dict(machine.channel_map)
+        units = {name: unit for name, column in columns.items() if (unit := _unit_of_column(name, column))}
+        by_signals = units and (values.get("nodes") or values.get("sparkplug"))
         stated = {"map": columns or None, "rate": machine.rate, "error_lpm": machine.limit_lpm}
+        stated |= {"units": units if by_signals else None}
         return {**{name: value for name, value in stated.items() if value is not None}, **values}
 
 
@@ -197,9 +215,14 @@ class MonitorSettings(_Part):
         for watched in actuators:
             if watched.nodes and (self.opcua is None or watched.rate is None):
                 raise ValueError(f"an actuator with nodes needs the table [opcua] and its rate, got {watched.name!r}")
-            for channel in {**watched.nodes, **watched.units} if watched.nodes else ():
-                if channel not in CHANNELS:
-                    raise ValueError(f"nodes must be of {', '.join(CHANNELS)}, got {channel[:40]!r}")
+            for table, channels in (("nodes", watched.nodes), ("units", watched.units)):
+                for channel in channels:
+                    if channel not in CHANNELS:
+                        raise ValueError(f"{table} must be of {', '.join(CHANNELS)}, got {channel[:40]!r}")
+            for channel, unit in watched.units.items():
+                to_si(0.0, unit, CHANNEL_UNITS[channel], name=f"units.{channel}", place=watched.name)
+            if watched.units and watched.folder is not None:
+                raise ValueError(f"units of files stand in their headings, got units of {watched.name!r}, a folder")
             ways = ways_to_watch(load_watched(watched.rig).rig) if watched.nodes else ()
             if watched.nodes and not any(watched.nodes.keys() >= {*way} for way in ways):
                 raise ValueError(
@@ -214,6 +237,13 @@ class MonitorSettings(_Part):
         if page is not None and page.host not in ("127.0.0.1", "localhost", "::1") and page.token_file is None:
             raise ValueError(f"a page beyond this machine needs page.token_file, got host {page.host!r} without")
         return self
+
+
+def _unit_of_column(channel: str, column: str) -> str | None:
+    """Return the unit in the heading of a channel's column, None where there is none that the channel may have."""
+    label = Label.parse(column)
+    unit = label.unit or split_unit(label.name)[1]
+    return unit if unit and channel in CHANNELS and same_dimension(unit, CHANNEL_UNITS[channel]) else None
 
 
 def topic_part(name: str) -> str:

@@ -20,6 +20,7 @@ from sealscope.recordings.formats.columns import counted
 from sealscope.recordings.motion import constant, runs_of, spacing, stuck
 from sealscope.recordings.recording import Recording
 from sealscope.storage.toml_file import priors_of
+from sealscope.units import from_si
 
 Severity = Literal["note", "warning", "fatal"]
 
@@ -168,6 +169,12 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
     def add(code: str, count: int, first: int, text: str, severity: Severity = "warning") -> None:
         findings.append(Finding(code, severity, name, count, _moment(recording, first), f"{name}: {text}"))
 
+    def in_log(value: float, digits: int = 6, *, is_span: bool = False) -> str:
+        shown = recording.unit_in_log(name) or unit
+        if shown != unit:
+            value = from_si(value, shown, unit) - (from_si(0.0, shown, unit) if is_span else 0.0)
+        return f"{value:.{digits}g} {shown}"
+
     if pressure and unit == COUNTS:
         text = f"is in raw counts: state the unit (--map '{name}=COLUMN bar'), or a leak's size stays relative"
         add("raw_counts", values.size, 0, text, "note")
@@ -190,7 +197,7 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
     impossible = flag_impossible(values, unit)
     wild = np.flatnonzero(impossible)
     if wild.size:
-        text = f"{counted(wild.size, 'sample')} beyond what any sensor reads, first {values[wild[0]]:g} {unit}"
+        text = f"{counted(wild.size, 'sample')} beyond what any sensor reads, first {in_log(values[wild[0]])}"
         add("impossible", wild.size, int(wild[0]), text)
     present = np.flatnonzero(np.isfinite(values) & ~impossible)
     kept = values[present]
@@ -198,12 +205,12 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
         return findings
     if constant(kept):
         # a command may be constant, and a flow meter on a closed bypass reads one value; a pressure never does
-        text = f"is constant at {kept[0]:g} {unit}"
+        text = f"is constant at {in_log(kept[0])}"
         add("constant", kept.size, int(present[0]), text, "note" if steady else "warning")
         return findings
     held = stuck(kept)
     for rail in clipped(kept, held, low=pressure) if pressure or name == "q_leak" else ():
-        text = f"{counted(rail.samples, 'sample')} at the {rail.side} end, {rail.value:g} {unit}: clipped"
+        text = f"{counted(rail.samples, 'sample')} at the {rail.side} end, {in_log(rail.value)}: clipped"
         add("clipped", rail.samples, int(present[rail.first]), text)
     if pressure:  # at an end of its values it is clipped
         held = held[(kept[held[:, 0]] > kept.min()) & (kept[held[:, 0]] < kept.max())]
@@ -212,7 +219,7 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
         text = f"does not move {_times(len(held))} while it should, first for {length / rate:g} s"
         add("stuck", int(held[:, 1].sum()), int(present[first]), text)
     for frequency, amplitude, share in hum(kept, rate) if kept.size > 0.9 * values.size else ():
-        text = f"mains hum of {frequency:g} Hz, amplitude {amplitude:.3g} {unit}"
+        text = f"mains hum of {frequency:g} Hz, amplitude {in_log(amplitude, 3, is_span=True)}"
         text += f", {100 * share:.2g} % of the power over 20 Hz"
         text += ": is the sensor connected?" if share > _HUM["alone"] else ""
         add("mains_hum", kept.size, int(present[0]), text, "warning" if share > _HUM["loud"] else "note")

@@ -91,12 +91,14 @@ class Chart(NamedTuple):
 
 
 def shown_values(recording: Recording, name: str, pressure_unit: str) -> tuple[str, Array]:
-    """Return the display unit of a channel and its values (n,) in it; a temperature keeps the unit of its log."""
-    if recording.units[name] == "K":
-        unit = recording.unit_in_log(name) or "degC"
-        return unit, from_si(recording[name], unit, "K")
-    unit, size = shown_unit(recording.units[name], pressure_unit)
-    return unit, recording[name] / size
+    """Return the display unit of a channel and its values (n,) in it; all but pressures keep the unit of their log."""
+    si_unit = recording.units[name]
+    unit = None if si_unit in ("Pa", COUNTS) else recording.unit_in_log(name)
+    if unit is not None or si_unit == "K":
+        unit = unit or "degC"
+        return unit, from_si(recording[name], unit, si_unit)
+    shown, size = shown_unit(si_unit, pressure_unit)
+    return shown, recording[name] / size
 
 
 def shown_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tuple[str, float]:

@@ -302,7 +302,9 @@ def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
         steps = [diagnosis.next_check, say("next.longer")]
     else:
         steps = [say("next.cause"), say("next.record")]
-    trouble = [finding for finding in diagnosis.quality if finding.severity != "note"]
+    # a baseline that was left out, such as the recording itself, is no fault of its data
+    findings = (finding for finding in diagnosis.quality if finding.code != "baseline_left_out")
+    trouble = [finding for finding in findings if finding.severity != "note"]
     if trouble:
         names = [f"{entry.code.replace('_', ' ')}{f' ({entry.channel})' if entry.channel else ''}" for entry in trouble]
         key = "rule_out" if named or diagnosis.verdict == "leak" else "care"

@@ -39,6 +39,11 @@ def curve(values: Array, width: int = CURVE) -> str:
     return "".join(bars)
 
 
+def _short(value: float) -> str:
+    """Format a number with four digits, without an exponent where it is large."""
+    return f"{value:.0f}" if 1e4 <= abs(value) < 1e9 else f"{value:.4g}"
+
+
 def overview_text(name: str, recording: Recording, findings: Sequence[Finding]) -> str:
     """Format a recording for inspection before a verdict: clock, channels with range and curve, notes, findings."""
     provenance = recording.provenance
@@ -51,7 +56,7 @@ def overview_text(name: str, recording: Recording, findings: Sequence[Finding]) 
     for channel, values in recording.channels.items():
         unit, values_shown = shown_values(recording, channel, recording.pressure_unit)
         known = values_shown[np.isfinite(values_shown)]
-        ends = f"{known.min():.4g} to {known.max():.4g} {unit}" if known.size else "no values"
+        ends = f"{_short(known.min())} to {_short(known.max())} {unit}" if known.size else "no values"
         line = f"  {channel:<7}{LONG_NAMES[channel]:<24}{ends:<28}"
         lines.append(line + curve(values, max(CURVE // 2, WIDTH - len(line))))
     texts = [f"{name}: {value}" for name, value in remarks_of(provenance).items()]

@@ -79,6 +79,21 @@ class WatchedLeak:
 
 
 @dataclass(frozen=True)
+class HealthyLevel:
+    """Leakage conductance of a machine in its healthy recordings, which a watch begins with.
+
+    `level`, `low`, `high`: mean, least and largest of the recordings', `deviation` of one of them [m^3/(s Pa)];
+    `known_s`: when the last of them was made [s since 1970].
+    """
+
+    level: float
+    low: float
+    high: float
+    deviation: float
+    known_s: float
+
+
+@dataclass(frozen=True)
 class WatchBaseline:
     """A healthy machine, as it was while the baseline was learned.
 
@@ -106,23 +121,36 @@ class WatchBaseline:
 
         `deviation`: of `g`; `probability`: of a look at a healthy machine as warm as that.
         """
-        from scipy.special import ndtri
+        return estimate_rise(self, "baseline", (now, self.learned_s, now), g, deviation, probability)
 
-        warmest = priors("inference")["oil"]["warmest"]
-        ceiling = warmest * max(self.low, 0.0)
-        score, threshold = (g - ceiling) / deviation, -float(ndtri(probability))
-        if score <= threshold:
-            return None
-        reason = (
-            f"the leakage conductance is {g:.3g} m^3/(s Pa), over {warmest:g} times the least of the baseline: more "
-            f"than the warmest oil makes of it (score {score:.1f}, threshold {threshold:.1f})"
-        )
-        # what is healthy may be anywhere from the least of the baseline to the ceiling
-        healthy = max(self.level - self.low, ceiling - self.level, 0.0) / WITHIN_95
-        size = g - max(self.level, 0.0)
-        return StepEstimate(
-            score, (now, self.learned_s, now), size, math.hypot(deviation, healthy), "level", threshold, reason
-        )
+
+def estimate_rise(
+    healthy: HealthyLevel | WatchBaseline,
+    name: str,
+    onset: tuple[float, float, float],
+    g: float,
+    deviation: float,
+    probability: float,
+) -> StepEstimate | None:
+    """Estimate the rise of a mean conductance over a healthy level called `name`, as `WatchBaseline.rise` does.
+
+    `onset`: since when, and its interval [s], where there is a rise.
+    """
+    from scipy.special import ndtri
+
+    warmest = priors("inference")["oil"]["warmest"]
+    ceiling = warmest * max(healthy.low, 0.0)
+    score, threshold = (g - ceiling) / deviation, -float(ndtri(probability))
+    if score <= threshold:
+        return None
+    reason = (
+        f"the leakage conductance is {g:.3g} m^3/(s Pa), over {warmest:g} times the least of the {name}: more than the "
+        f"warmest oil makes of it (score {score:.1f}, threshold {threshold:.1f})"
+    )
+    # what is healthy may be anywhere from the least to the ceiling
+    spread = max(healthy.level - healthy.low, ceiling - healthy.level, 0.0) / WITHIN_95
+    size = g - max(healthy.level, 0.0)
+    return StepEstimate(score, onset, size, math.hypot(deviation, spread), "level", threshold, reason)
 
 
 def within(duty: Duty, low: Duty, high: Duty) -> bool:

@@ -17,7 +17,15 @@ from sealscope.diagnosis.decision.texts import text_of
 from sealscope.diagnosis.decision.verdicts import bound_worth_stating, decide_verdict
 from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.live.balance import LEARNED, BlockConductance, LiveBalance, NotJudged, Shown
-from sealscope.diagnosis.live.estimates import BaselineLearning, BlockEstimate, WatchBaseline, WatchedLeak, within
+from sealscope.diagnosis.live.estimates import (
+    BaselineLearning,
+    BlockEstimate,
+    HealthyLevel,
+    WatchBaseline,
+    WatchedLeak,
+    estimate_rise,
+    within,
+)
 from sealscope.diagnosis.live.joining import SampleJoiner, ways_to_watch
 from sealscope.diagnosis.live.pressures import PressureEstimator
 from sealscope.diagnosis.live.sequential import RECENT, StepDetector, StepEstimate
@@ -25,7 +33,7 @@ from sealscope.diagnosis.priors import priors
 from sealscope.diagnosis.verdict.evidence import NO_LEAK, Evidence
 from sealscope.errors import InputError
 from sealscope.recordings.corrections.gaps import remove_dropouts
-from sealscope.recordings.formats.timebase import clock_text
+from sealscope.recordings.formats.timebase import clock_text, counts_from_1970
 from sealscope.recordings.recording import Array, Recording
 from sealscope.storage.plain_state import part_of, recall, restored, saved
 from sealscope.units import LITRE_PER_MINUTE
@@ -34,7 +42,7 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 #: Format of the saved state.
-STATE_VERSION = 13
+STATE_VERSION = 14
 _PRIORS = priors("live")["watch"]
 #: Blocks of one mean that is compared with the baseline, and of the mean that is the leak after an alarm.
 GROUP, _OF_NOW = _PRIORS["group"], _PRIORS["recent"]
@@ -63,6 +71,8 @@ class Watch:
         As for `watch`.
     litres : mapping of str to bool, optional
         Whether the rig states what turns a conductance into L/min, for each way of watching; by default it is asked.
+    healthy : HealthyLevel, optional
+        As for `watch`.
 
     Attributes
     ----------
@@ -87,13 +97,19 @@ class Watch:
     """
 
     def __init__(
-        self, rig: Rig, false_alarms_per_1000_h: float, learn_hours: float, *, litres: Mapping[str, bool] | None = None
+        self,
+        rig: Rig,
+        false_alarms_per_1000_h: float,
+        learn_hours: float,
+        *,
+        litres: Mapping[str, bool] | None = None,
+        healthy: HealthyLevel | None = None,
     ) -> None:
         self.false_alarms_per_1000_h, self.learn_hours = false_alarms_per_1000_h, learn_hours
         self._probability("step", LiveBalance.block_seconds)
         if not 0.0 < learn_hours <= 1000.0:
             raise InputError(f"learn_hours must be > 0 and at most 1000 h, got {learn_hours:g}")
-        self._rig = rig
+        self._rig, self.healthy = rig, healthy
         self._litres = {by: kind.states_flow(rig) for by, kind in _KINDS.items()} if litres is None else litres
         self._samples = SampleJoiner(ways_to_watch(rig))
         self._estimator: Estimator | None = None
@@ -228,8 +244,11 @@ class Watch:
         self.dismiss()
 
     def dismiss(self) -> None:
-        """Withdraw the leak and compare with no block before now; keep the baseline."""
-        self.leak = None
+        """Withdraw the leak and compare with no block before now; keep the baseline.
+
+        The level of the healthy recordings, which may have raised it, is not compared with any more.
+        """
+        self.leak = self.healthy = None
         self._forget()
 
     def _forget(self) -> None:
@@ -321,13 +340,30 @@ class Watch:
         end, g, offset = (float(self._group[name].mean()) for name in ("end", "g", "offset"))
         sd = math.sqrt(sum(value**2 for value in self._group["sd"].tolist())) / GROUP
         self._group = self._group[:0]
-        if self.leak is not None or self.baseline is None:
+        if self.leak is not None:
+            return
+        if self.baseline is None:
+            self._test_healthy_level(estimator, block, math.hypot(sd, offset))
             return
         # what all conductances are off by is in the ceiling that many times
         deviation = math.hypot(sd, offset * (priors("inference")["oil"]["warmest"] - 1.0))
         rise = self.baseline.rise(end, g, deviation, self._probability("level", GROUP * self.block_seconds))
         if rise is not None:
             self._raise(estimator, rise, block, self.baseline.level)
+
+    def _test_healthy_level(self, estimator: Estimator, block: BlockConductance, deviation: float) -> None:
+        """Compare the last blocks' total conductance with that of the healthy recordings, until there is a baseline."""
+        healthy = self.healthy
+        if healthy is None or not estimator.levels:
+            return
+        total, first, now = float(self._last["total"][-GROUP:].mean()), float(self._last["end"][0]), block.end
+        since = min(healthy.known_s, first) if counts_from_1970(now) else first
+        probability = self._probability("level", GROUP * self.block_seconds)
+        onset = first, since, now
+        deviation = math.hypot(deviation, healthy.deviation)
+        rise = estimate_rise(healthy, "healthy recordings", onset, total, deviation, probability)
+        if rise is not None:
+            self._raise(estimator, rise, block, healthy.level)
 
     def _raise(
         self, estimator: Estimator, rise: StepEstimate, block: BlockConductance, before: float | None = None
@@ -469,9 +505,9 @@ class Watch:
 #: Attributes that are the state beside rig and estimator; types of those that may be None.
 _SAVED = (
     *("false_alarms_per_1000_h", "learn_hours", "blocks", "baseline_version", "_samples", "_detector"),
-    *("_learning", "baseline", "leak", "_last", "_group"),
+    *("_learning", "baseline", "leak", "healthy", "_last", "_group"),
 )
-_KINDS_OF_SAVED = {"baseline": WatchBaseline, "leak": WatchedLeak}
+_KINDS_OF_SAVED = {"baseline": WatchBaseline, "leak": WatchedLeak, "healthy": HealthyLevel}
 
 
 @lru_cache(maxsize=256)
@@ -487,7 +523,11 @@ def _parse_rig(text: str) -> Rig:
 
 @checked_call
 def watch(
-    rig: Rig | str | os.PathLike[str] = "thesis", *, false_alarms_per_1000_h: float = 1.0, learn_hours: float = 8.0
+    rig: Rig | str | os.PathLike[str] = "thesis",
+    *,
+    false_alarms_per_1000_h: float = 1.0,
+    learn_hours: float = 8.0,
+    healthy: HealthyLevel | None = None,
 ) -> Watch:
     """Watch a running actuator: blocks in, L/min with an interval and alarms out.
 
@@ -499,6 +539,9 @@ def watch(
         False alarms of a healthy machine per 1000 operating hours, at most.
     learn_hours : float, default 8
         Operating hours of healthy running that the baseline is learned from; then it is frozen.
+    healthy : HealthyLevel, optional
+        Of a machine's healthy recordings: until there is a baseline, the total leakage is compared with it, so that a
+        leak shows that is there from the first sample.
 
     Returns
     -------
@@ -519,4 +562,4 @@ def watch(
     """
     from sealscope.parameters import load_rig
 
-    return Watch(load_rig(rig), false_alarms_per_1000_h, learn_hours)
+    return Watch(load_rig(rig), false_alarms_per_1000_h, learn_hours, healthy=healthy)

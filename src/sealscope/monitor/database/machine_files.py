@@ -57,7 +57,7 @@ def pass_on(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording]) -> 
 def _recording(samples: Sequence[Recording], shift: float) -> Recording:
     """Return samples as one recording that begins at 0 s of a date, their clock and `shift` [s since 1970]."""
     if not samples:
-        raise SealscopeError("no samples of the alarm are kept")
+        raise SealscopeError("no samples of the alarm are kept: add its recording by sealscope commission --add")
     whole = join(samples) if len(samples) > 1 else samples[0]
     start = datetime.fromtimestamp(float(whole.t[0]) + shift, UTC).replace(tzinfo=None)
     return replace(whole, t=whole.t - whole.t[0], provenance={"start": start.isoformat(timespec="milliseconds")})

@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import sqlalchemy as sa
@@ -26,7 +26,9 @@ from sealscope.errors import InputError
 from sealscope.monitor.alarms import Alarm
 from sealscope.monitor.database import tables
 from sealscope.monitor.database.postgresql import engine_options, limit_answers
+from sealscope.monitor.verdicts import RecordingVerdict
 from sealscope.recordings.recording import Recording
+from sealscope.storage.plain_state import restored
 
 #: Identities of blocks that are kept for each actuator: more than a day of messages of 1 s.
 KEPT_IDENTITIES = 100_000
@@ -60,9 +62,11 @@ class StoredRows:
             row = {"actuator": actuator, "number": estimate.number, "t": estimate.t, "status": estimate.status[:160]}
             self.estimates.append({**row, **dict(zip(tables.FIGURES, figures, strict=True))})
 
-    def add_pending(self, actuator: str, number: int, samples: Recording, follows: bool) -> None:
-        """Add samples that a restart goes through once more after the checkpoint."""
-        self.pending.append({"actuator": actuator, "number": number, "samples": _pack(samples, follows)})
+    def add_pending(
+        self, actuator: str, number: int, samples: Recording, follows: bool, verdict: RecordingVerdict | None = None
+    ) -> None:
+        """Add samples that a restart goes through once more after the checkpoint, with the verdict on them."""
+        self.pending.append({"actuator": actuator, "number": number, "samples": _pack(samples, follows, verdict)})
 
     def add_alarm(self, alarm: Alarm, kind: str, t: float, by_whom: str = "", text: str = "") -> None:
         """Add an alarm in its present state, and the event or the person's remark if `kind` is not empty."""
@@ -86,6 +90,14 @@ class StoredRows:
             "actuator": actuator,
             "summary": orjson.dumps(summary, option=orjson.OPT_SERIALIZE_NUMPY).decode(),
         }
+
+
+class StoredSamples(NamedTuple):
+    """Samples of a block, whether they follow those before, and the verdict on the recording that they are."""
+
+    samples: Recording
+    follows: bool
+    verdict: RecordingVerdict | None
 
 
 class MonitorStore:
@@ -255,11 +267,8 @@ class MonitorStore:
         """Return the number of an actuator's last row of a table, `tables.blocks` or `tables.estimates`."""
         return self._value(select(func.max(table.c.number)).where(table.c.actuator == actuator))
 
-    def checkpoint(self, actuator: str) -> tuple[str, dict[str, Any], list[tuple[Recording, bool]]] | None:
-        """Return the settings and state of the checkpoint and the samples since, None without a checkpoint.
-
-        Of the samples of each block, whether they follow those before.
-        """
+    def checkpoint(self, actuator: str) -> tuple[str, dict[str, Any], list[StoredSamples]] | None:
+        """Return the settings and state of the checkpoint and the samples since, None without a checkpoint."""
         states, pending = tables.actuators, tables.pending
         samples = select(pending.c.samples).where(pending.c.actuator == actuator).order_by(pending.c.number)
         with self.engine.connect() as connection:
@@ -269,7 +278,7 @@ class MonitorStore:
 
     def last_samples(self, actuator: str) -> list[Recording]:
         """Return the samples of an actuator since its last checkpoint."""
-        return [samples for samples, _ in (self.checkpoint(actuator) or ("", {}, []))[2]]
+        return [stored.samples for stored in (self.checkpoint(actuator) or ("", {}, []))[2]]
 
     def summaries(self) -> dict[str, dict[str, Any]]:
         """Return the last summary of each actuator."""
@@ -349,9 +358,11 @@ def outage_reason(error: BaseException) -> str | None:
     return " ".join(str(error.orig).split())[:200]
 
 
-def _pack(samples: Recording, follows: bool) -> bytes:
+def _pack(samples: Recording, follows: bool, verdict: RecordingVerdict | None) -> bytes:
     """Return samples as one line of JSON and their numbers, little endian, the clock first."""
     head = _head(tuple((name, samples.units[name]) for name in samples.channels), samples.rate, follows)
+    if verdict is not None:
+        head = json.dumps({**json.loads(head), "verdict": vars(verdict)}).encode() + b"\n"
     return head + np.array([samples.t, *samples.channels.values()], dtype="<f8").tobytes()
 
 
@@ -360,12 +371,16 @@ def _head(units: tuple[tuple[str, str], ...], rate: float, follows: bool) -> byt
     return json.dumps({"units": dict(units), "rate": rate, "follows": follows}).encode() + b"\n"
 
 
-def _unpack(data: bytes) -> tuple[Recording, bool]:
-    """Unpack samples from the bytes of `_pack`; the flag tells whether they follow the samples before."""
+def _unpack(data: bytes) -> StoredSamples:
+    """Unpack samples from the bytes of `_pack`."""
     line, _, numbers = data.partition(b"\n")
     head = json.loads(line)
     t, *channels = np.frombuffer(numbers, dtype="<f8").reshape(1 + len(head["units"]), -1)
-    return Recording(t, dict(zip(head["units"], channels, strict=True)), head["units"], head["rate"]), head["follows"]
+    samples = Recording(t, dict(zip(head["units"], channels, strict=True)), head["units"], head["rate"])
+    verdict = head.get("verdict")
+    return StoredSamples(
+        samples, head["follows"], None if verdict is None else restored(RecordingVerdict, verdict, "verdict")
+    )
 
 
 def _event(row: Any) -> dict[str, Any]:

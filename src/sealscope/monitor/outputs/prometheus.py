@@ -15,6 +15,7 @@ _OF_ACTUATORS = {
     "sealscope_leak_lpm": ("Leak beyond the healthy machine over the cycles seen [L/min]", "leak_lpm"),
     "sealscope_leak_low_lpm": ("Lower end of its 95 % interval [L/min]", "leak_low"),
     "sealscope_leak_high_lpm": ("Upper end of its 95 % interval [L/min]", "leak_high"),
+    "sealscope_bound_lpm": ("95 % bound of a leak where a recording shows none [L/min]", "bound_lpm"),
     "sealscope_total_lpm": ("Flow past pump and piston together over the cycles seen [L/min]", "total_lpm"),
     "sealscope_oil_temperature_celsius": ("Oil temperature as recorded [deg C]", "oil_celsius"),
     "sealscope_status_word": ("Bits: 1 warning, 2 error, 4 new", "status_word"),

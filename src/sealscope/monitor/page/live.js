@@ -82,6 +82,7 @@ function showLive(live) {
   if (live.name !== chosen) return;
   latest = live;
   const says = byId("live-says");
+  byId("live-charts").hidden = live.t === null;
   if (live.t === null) {
     says.textContent = live.error || "Waits for samples.";
     emptied("pressures", "");

@@ -14,7 +14,7 @@ function element(kind, className, text) {
   return made;
 }
 
-const litres = (value) => (value === null || value === undefined ? "–" : Number(value.toPrecision(2)).toString());
+const litres = (value) => (value === null || value === undefined ? "–" : Number(value.toPrecision(3)).toString());
 
 function flow(value, interval) {
   if (value === null || value === undefined) return "no L/min";
@@ -22,9 +22,16 @@ function flow(value, interval) {
   return `${litres(Math.max(value, 0))}${range} L/min`;
 }
 
-// the local time as ISO 8601 writes it, whatever the browser's language
-function isoTime(t) {
-  const local = new Date(t * 1000 - new Date(t * 1000).getTimezoneOffset() * 60000);
+// the leak of an actuator, or what none is above
+function leakOf(row) {
+  if (row.leak_lpm !== null) return `${litres(Math.max(row.leak_lpm, 0))} L/min`;
+  return row.bound_lpm === null || row.bound_lpm === undefined ? "" : `< ${Number(row.bound_lpm.toPrecision(2))} L/min`;
+}
+
+// the local time as ISO 8601 writes it, whatever the browser's language; of files the time that they state
+function isoTime(t, byFiles) {
+  const zone = byFiles ? 0 : new Date(t * 1000).getTimezoneOffset() * 60000;
+  const local = new Date(t * 1000 - zone);
   return local.toISOString().slice(0, 19).replace("T", " ");
 }
 
@@ -39,10 +46,13 @@ function isoTemplate(template) {
   return uPlot.fmtDate(iso);
 }
 
+// whether the chosen actuator's recordings are files, on their logger's clock
+let chosenByFiles = false;
+
 // clocks beyond 1973 are dates, others seconds since the beginning
-function clock(t) {
+function clock(t, byFiles = chosenByFiles) {
   if (t === null || t === undefined) return "";
-  if (t > 1e8) return isoTime(t);
+  if (t > 1e8) return isoTime(t, byFiles);
   const whole = Math.floor(t);
   const parts = [Math.floor(whole / 3600), Math.floor(whole / 60) % 60, whole % 60];
   return parts.map((part) => String(part).padStart(2, "0")).join(":");
@@ -62,7 +72,7 @@ async function asked(address, options) {
 // what the monitor does not reach, and what waits for it
 function showOutages(values) {
   const lines = (values.outages || []).map(
-    (outage) => `The ${outage.part} is not reached since ${clock(outage.since)}: ${outage.reason}`,
+    (outage) => `The ${outage.part} is not reached since ${clock(outage.since, false)}: ${outage.reason}`,
   );
   if (lines.length && values.waiting) lines.push(`${values.waiting} blocks wait to be stored`);
   const place = byId("outages");
@@ -93,10 +103,12 @@ function badge(state) {
 }
 
 function stateOf(row) {
-  const since = row.state.since_s === null ? "" : ` since ${clock(row.state.since_s)}`;
+  const since = row.state.since_s === null ? "" : ` since ${clock(row.state.since_s, row.by_files)}`;
   const why = { "no data": "no data", "not comparable": `not comparable (${row.state.cause})`, learning: "learns its baseline" };
-  if (row.alarm) return `alarm ${row.alarm.state}; leak since ${clock(row.alarm.onset_s)}`;
-  return `${why[row.state.condition] || row.status}${since}`;
+  const now = `${why[row.state.condition] || row.status}${since}`;
+  if (!row.alarm) return now;
+  const over = row.alarm.returned_s !== null;
+  return over ? `alarm ${row.alarm.state}, over; ${now}` : `alarm ${row.alarm.state}; leak since ${clock(row.alarm.onset_s, row.by_files)}`;
 }
 
 function showFleet(fleet) {
@@ -113,7 +125,7 @@ function showFleet(fleet) {
     states.set(row.state.name, (states.get(row.state.name) || 0) + 1);
     if (row.name === chosen) button.setAttribute("aria-current", "true");
     button.append(element("span", "name", row.name));
-    button.append(element("span", "figure", row.leak_lpm === null ? "" : `${litres(Math.max(row.leak_lpm, 0))} L/min`));
+    button.append(element("span", "figure", leakOf(row)));
     button.append(badge(row.state), element("span", "state", stateOf(row)));
     button.addEventListener("click", () => choose(row.name));
     const item = element("li");
@@ -123,23 +135,26 @@ function showFleet(fleet) {
   }
   const count = fleet.actuators.length;
   byId("budget").textContent =
-    `While all run, at most one false alarm in ${onceIn(fleet.false_alarms_per_1000_h)} is stated for all of them together.`;
+    `While all run, at most one false alarm in ${onceIn(fleet.false_alarms_per_1000_h)} is stated for all of them together` +
+    (fleet.actuators.some((row) => row.recording)
+      ? "; where recordings are judged whole and that is more, one in 10 000 healthy recordings."
+      : ".");
   const parts = [...states].map(([name, number]) => `${number} ${name}`);
   byId("overall").textContent = `${count} actuator${count === 1 ? "" : "s"}: ${parts.join(", ")}`;
   const dropped = Object.entries(fleet.counters).map(([reason, number]) => `${number} ${reason}`);
   byId("dropped").textContent = dropped.length ? `Since the start: ${dropped.join("; ")}` : "";
 }
 
-function facts(alarm) {
+function facts(alarm, judged) {
   const list = byId("alarm-facts");
   list.replaceChildren();
   const rows = [
     ["Since", `${clock(alarm.onset_s)} (${clock(alarm.onset_interval_s[0])} to ${clock(alarm.onset_interval_s[1])})`],
     ["Raised", clock(alarm.raised_s)],
     ["Evidence", alarm.evidence],
-    ["By chance", byChance(alarm)],
+    ["By chance", judged ? judged.odds : byChance(alarm)],
     ["Reason", alarm.reason],
-    ["Number", `${alarm.diagnostic_number}, baseline ${alarm.baseline}`],
+    ["Number", `${alarm.diagnostic_number}${alarm.baseline ? `, baseline ${alarm.baseline}` : ""}`],
   ];
   for (const [name, value] of rows.filter((row) => row[1])) list.append(element("dt", "", name), element("dd", "", value));
 }
@@ -160,6 +175,13 @@ function showWorkflow(alarm) {
 }
 
 const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+
+// the range of the chart of flows: from zero, and of what lies below a tenth of it
+function flowRange(least, most) {
+  if (least === null || most === null) return [0, 1];
+  const top = most > 0 ? 1.05 * most : 1;
+  return [Math.max(1.05 * Math.min(least, 0), -0.1 * top), top];
+}
 
 function draw(course, events) {
   const place = byId("chart");
@@ -184,8 +206,10 @@ function draw(course, events) {
     {
       width: Math.max(280, place.clientWidth),
       height: 240,
-      scales: { x: { time: dated } },
+      // blocks scatter below zero, where nothing flows: they must not press the leak flat
+      scales: { x: { time: dated }, y: { range: (plot, least, most) => flowRange(least, most) } },
       fmtDate: isoTemplate,
+      ...(chosenByFiles ? { tzDate: (t) => uPlot.tzDate(new Date(t * 1000), "UTC") } : {}),
       bands: [{ series: [2, 1], fill: colour("--band") }],
       axes: [
         { stroke: colour("--quiet"), grid, space: 80, ...(dated ? {} : { values: (plot, at) => at.map(clock) }) },
@@ -236,6 +260,7 @@ function showLife(life) {
   }
   byId("life").hidden = false;
   byId("life-title").textContent = life.name;
+  chosenByFiles = life.by_files;
   const now = life.summary;
   const base = now.baseline;
   const learned = base ? `; baseline ${base.version}, ${base.hours.toPrecision(2)} h` +
@@ -243,20 +268,25 @@ function showLife(life) {
   const oil = now.oil_celsius === null || now.oil_celsius === undefined ? "" : `, oil ${now.oil_celsius.toFixed(0)} °C`;
   const state = now.state;
   const since = state.since_s === null ? "" : ` since ${clock(state.since_s)}`;
-  const size = state.condition.startsWith("leak") ? ` ${flow(now.leak_lpm, now.leak_interval_lpm)}` : "";
+  const judged = now.recording;
+  const alarm = life.alarms.find((each) => each.state !== "closed" && each.state !== "invalid");
+  const leaks = state.condition.startsWith("leak");
+  const known = leaks && judged && judged.verdict !== "leak" && alarm ? alarm : now;
+  const size = judged && (judged.verdict === "leak") === leaks ? judged.size : leaks ? flow(known.leak_lpm, known.leak_interval_lpm) : "";
   const limit = life.limit_lpm ? `; limit ${litres(life.limit_lpm)} L/min` : "";
   byId("state").replaceChildren(
     badge(state),
-    element("strong", "", ` ${state.condition}${size}${since}${limit}`),
+    element("strong", "", ` ${known === now && judged ? judged.summary : state.condition}${size ? `: ${size}` : ""}${since}${limit}`),
     element("span", "action", `${state.cause ? `Cause: ${state.cause}. ` : ""}${state.action}`),
   );
-  byId("now").textContent =
-    `${clock(now.t)}: ${now.status}; ${now.why_no_litres ? `${now.why_no_litres}; ` : ""}pump and piston pass ${flow(now.total_lpm, now.total_interval_lpm)}, leak ${flow(now.leak_lpm, now.leak_interval_lpm)}${oil}${learned}`;
-  const alarm = life.alarms.find((each) => each.state !== "closed" && each.state !== "invalid");
+  const total = `pump and piston pass ${flow(now.total_lpm, now.total_interval_lpm)}`;
+  byId("now").textContent = judged
+    ? `${clock(now.t)}: ${judged.file}: ${judged.summary}: ${judged.reason}; ${total}${oil}; judged against the machine's healthy recordings`
+    : `${clock(now.t)}: ${now.status}; ${now.why_no_litres ? `${now.why_no_litres}; ` : ""}${total}, leak ${flow(now.leak_lpm, now.leak_interval_lpm)}${oil}${learned}`;
   byId("alarm").hidden = !alarm;
   if (alarm) {
     byId("alarm-title").textContent = `${alarm.level}: ${flow(alarm.leak_lpm, alarm.leak_interval_lpm)}, ${alarm.state}${alarm.returned_s == null ? "" : ", over"}`;
-    facts(alarm);
+    facts(alarm, judged);
     showWorkflow(alarm);
   }
   const list = byId("events");

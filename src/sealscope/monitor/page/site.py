@@ -104,6 +104,8 @@ class _Pages:
         self._actuators, self._store, self._waits, self._live = actuators, actuators.store, waits, live
         self._supervisor = actuators.supervisor
         self._machines = {name: machine_of(settings.rig) for name, settings in actuators.settings.items()}
+        # times of files are those of their logger's clock, whatever the browser's zone
+        self._by_files = {name for name, settings in actuators.settings.items() if settings.folder is not None}
         self._listeners, self._most_listeners = 0, min(_MOST_LISTENERS, most_connections() // 2)
         self._admission = None if token is None else Admission(token)
 
@@ -118,6 +120,7 @@ class _Pages:
 
     def fleet(self, request: Request) -> Response:
         rows = ranked(self._actuators.plain(), self._store.alarms(open_only=True))
+        rows = [{**row, "by_files": row["name"] in self._by_files} for row in rows]
         budget = self._actuators.false_alarms_per_1000_h
         return JSONResponse({"actuators": rows, **self._counters_and_outages(), "false_alarms_per_1000_h": budget})
 
@@ -132,6 +135,7 @@ class _Pages:
             "name": name,
             "summary": summary,
             "machine": self._machines[name],
+            "by_files": name in self._by_files,
             "course": self._store.course(name, seconds=seconds),
             "events": self._store.last_events(name),
             "limit_lpm": settings.error_lpm or settings.warning_lpm or None,

@@ -73,6 +73,7 @@ class _Connection:
         self._settings, self._service = settings, service
         self._broker = service.supervisor.part(BROKER)
         self._names = {actuator.topic: actuator.name for actuator in service.settings.actuator if actuator.topic}
+        self._units_of = {actuator.name: actuator.units for actuator in service.settings.actuator}
         self._name = settings.client_id
         will = None if settings.host_id is None else self._offline
         self._link = MqttLink(settings, self._name, password, will, retain=True)
@@ -204,7 +205,7 @@ class _Connection:
         """Return the block of a message, None for one of Sparkplug without; raises RefusedMessage."""
         if self._host is not None and topic.startswith(f"{NAMESPACE}/"):
             return self._host.receive(topic, payload)
-        return decoded(payload, self._names.get(topic))
+        return decoded(payload, self._names.get(topic), self._units_of)
 
     @contextmanager
     def _note_decoding(self, message: Any) -> Iterator[None]:

@@ -6,6 +6,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from datetime import UTC, datetime
 from fnmatch import fnmatch
 from functools import partial
@@ -14,7 +15,7 @@ from stat import S_ISREG
 
 import numpy as np
 
-from sealscope.diagnosis.commissioned.machine import read_of_machine
+from sealscope.diagnosis.commissioned.machine import CommissionedMachine, read_of_machine
 from sealscope.diagnosis.commissioned.watched import load_watched
 from sealscope.errors import SealscopeError
 from sealscope.monitor.settings import ActuatorSettings
@@ -26,6 +27,7 @@ from sealscope.monitor.sources.source_block import (
     bytes_of,
 )
 from sealscope.monitor.supervisor import DATABASE, PartAway, place_of
+from sealscope.monitor.verdicts import RecordingVerdict, judge_recording
 from sealscope.recordings import Recording
 from sealscope.recordings.corrections.samples import correct_samples, without_holes
 from sealscope.recordings.joining import file_seconds
@@ -64,8 +66,10 @@ class WatchedFolder:
         assert settings.folder is not None
         self.actuator, self.folder, self.pattern = settings.name, settings.folder, settings.pattern
         self.settle_s, self._known = settle_s, known
-        self._channel_map = settings.map or load_watched(settings.rig).channel_map
-        self._rate = settings.rate
+        watched = load_watched(settings.rig)
+        self._rig, self._channel_map, self._rate = settings.rig, settings.map or watched.channel_map, settings.rate
+        # the machine's limit stays in its words: a creep is compared with a creep
+        self._limit_lpm = None if settings.error_lpm == watched.limit_lpm else settings.error_lpm
         self._newest_s = self._end_s = newest_s
         self._met: dict[str, float] = {}  # clock at which a file was met [s]
         self._starts: dict[str, float] = {}  # when the first sample of a file was taken [s since 1970]
@@ -98,8 +102,11 @@ class WatchedFolder:
             if reason:
                 yield RefusedMessage(UNREADABLE_FILE, f"{self.actuator}: {reason}")
                 samples = None
+            block = SourceBlock(self.actuator, identity, None, follows=False)
+            if samples is not None and len(samples):
+                block = self._judged_block(block, samples, path)
             self._handed.add(identity)
-            yield SourceBlock(self.actuator, identity, self._on_the_clock(samples, path), follows=False)
+            yield block
 
     def _is_whole(self, written: float, path: Path, identity: str) -> bool:
         """Test whether a file has settled, is not stored, and is due for another attempt."""
@@ -150,27 +157,45 @@ class WatchedFolder:
         dates = (datetime.fromtimestamp(clock, UTC).isoformat(" ", "seconds")[:19] for clock in (start, self._newest_s))
         return "{} must not be older than what was watched, got {} after {}".format(_printable(path.name), *dates)
 
-    def _on_the_clock(self, samples: Recording | None, path: Path) -> Recording | None:
-        """Return a recording at the times at which it was made [s since 1970].
+    def _judged_block(self, block: SourceBlock, recording: Recording, path: Path) -> SourceBlock:
+        """Add to a block its recording's samples, and the verdict on them where its machine has healthy recordings.
 
-        One of a day without a time of day follows those of the day that were watched. Its samples are corrected as for
-        `diagnose`. The oil's temperature that the file states beside its samples becomes a channel.
+        Samples are at the times at which they were taken [s since 1970]; those of a day without a time of day follow
+        those of the day that were watched. They are corrected as for `diagnose`. The oil's temperature that the file
+        states beside its samples becomes a channel. Raises PartAway where the machine's file cannot be read.
         """
-        if samples is None or not len(samples):
-            return samples
-        start = file_seconds(samples, path)
-        samples = without_holes(correct_samples(samples).recording)
-        if not len(samples):
-            return samples
+        start, corrected = file_seconds(recording, path), without_holes(correct_samples(recording).recording)
+        if not len(corrected):
+            return replace(block, samples=corrected)
+        machine = self._read_machine()
         if _is_day(start, self._newest_s):
             start = max(start, self._end_s + _APART_S)
-        known = samples.t[np.isfinite(samples.t)]
-        times = samples.t + (start - float(known[0]) if known.size else 0.0)
+        known = recording.t[np.isfinite(recording.t)]
+        shift = start - float(known[0]) if known.size else 0.0
+        times = corrected.t + shift
+        verdict = None if machine is None else self._judge(machine, recording, path, shift)
         self._newest_s, self._end_s = start, float(np.nanmax(times, initial=start))
-        channels, units = dict(samples.channels), dict(samples.units)
-        if "T_oil" not in channels and (celsius := oil_temperature(samples)) is not None:
-            channels["T_oil"], units["T_oil"] = np.full(len(samples), celsius + 273.15), "K"
-        return Recording(times, channels, units, samples.rate)
+        channels, units = dict(corrected.channels), dict(corrected.units)
+        if "T_oil" not in channels and (celsius := oil_temperature(corrected)) is not None:
+            channels["T_oil"], units["T_oil"] = np.full(len(corrected), celsius + 273.15), "K"
+        return replace(block, samples=Recording(times, channels, units, corrected.rate), verdict=verdict)
+
+    def _judge(
+        self, machine: CommissionedMachine, recording: Recording, path: Path, shift: float
+    ) -> RecordingVerdict | None:
+        """Judge a recording; None, and a line in the log, where that raises an error: its blocks are watched then."""
+        try:
+            return judge_recording(machine, recording, _printable(path.name), shift, limit_lpm=self._limit_lpm)
+        except Exception as error:
+            _log.warning("%s: %s is not judged as a whole: %s", self.actuator, _printable(path.name), place_of(error))
+            return None
+
+    def _read_machine(self) -> CommissionedMachine | None:
+        """Read the machine anew, for a mark or an engineer may have changed its file meanwhile."""
+        try:
+            return load_watched(self._rig).machine
+        except (SealscopeError, OSError) as error:
+            raise PartAway(_printable(str(error))) from None
 
     def _files(self) -> Iterator[tuple[float, Path, str]]:
         try:

@@ -56,9 +56,7 @@ class _OpcUaSession:
             self._gatherers[actuator.name] = ValueGatherer(tuple(actuator.nodes), rate, settings.block_s, service.count)
             for channel in actuator.nodes:
                 si, unit = CHANNEL_UNITS[channel], actuator.units.get(channel)
-                scale = partial(to_si, unit=unit or si, si_unit=si, name=channel)
-                scale(np.zeros(1))  # raises InputError for a wrong unit
-                self._scales[actuator.name, channel] = scale
+                self._scales[actuator.name, channel] = partial(to_si, unit=unit or si, si_unit=si, name=channel)
         self._channels: dict[Any, tuple[str, str]] = {}
         self._waiting: Waiting[SourceBlock] = Waiting(_ROOM, _ROOM_BYTES)
 

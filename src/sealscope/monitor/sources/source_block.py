@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import blake2b
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -35,6 +36,7 @@ from sealscope.units import to_si
 if TYPE_CHECKING:
     from sealscope.monitor.settings import MonitorSettings
     from sealscope.monitor.supervisor import Supervisor
+    from sealscope.monitor.verdicts import RecordingVerdict
 
 #: Largest message [bytes].
 LARGEST = 16_000_000
@@ -122,7 +124,7 @@ class SourceBlock:
 
     `identity`: what tells the block from every other of the actuator, also after a restart; `samples`: None where there
     are none to take, only the identity to keep; `follows`: False where the clock begins anew; `done`: called when the
-    block is stored.
+    block is stored; `verdict`: on the whole recording that the samples are, None where it is not judged as such.
     """
 
     actuator: str
@@ -130,6 +132,7 @@ class SourceBlock:
     samples: Recording | None
     follows: bool = True
     done: Callable[[], None] = nothing
+    verdict: RecordingVerdict | None = None
 
     @property
     def bytes(self) -> int:
@@ -138,13 +141,16 @@ class SourceBlock:
 
 
 @refusing()
-def decoded(payload: bytes, actuator: str | None = None) -> SourceBlock:
+def decoded(
+    payload: bytes, actuator: str | None = None, units_of: Mapping[str, Mapping[str, str]] = MappingProxyType({})
+) -> SourceBlock:
     """Decode the block of a message: JSON if it begins with ``{``, else CBOR.
 
     Its mapping has ``t``, the clock of the first sample [s], ``rate`` [Hz], and for each channel a list of numbers,
     null where one is missing, or in CBOR a typed array of floats (RFC 8746), NaN where one is missing; a channel that
     changes slowly (``T_oil``) may be a single number; ``units`` names those that are not SI; ``actuator`` where the
-    source does not say; ``id`` where the contents are not the identity.
+    source does not say; ``id`` where the contents are not the identity. `units_of`: units by actuator where a message
+    names none.
     Raises RefusedMessage for anything else.
     """
     if len(payload) > LARGEST:
@@ -161,6 +167,7 @@ def decoded(payload: bytes, actuator: str | None = None) -> SourceBlock:
     t, rate = _number(values, "t"), _number(values, "rate")
     if not rate > 0.0:
         raise RefusedMessage(NO_CLOCK, f"rate must be > 0 Hz, got {rate:g}")
+    units = {**units_of.get(name, {}), **units}
     channels = {channel: _channel(values[channel], channel, units) for channel in CHANNELS if channel in values}
     sizes = {values.size for channel, values in channels.items() if channel not in SLOW}
     if sizes and max(sizes) > MOST_SAMPLES:

@@ -232,7 +232,7 @@ class SparkplugHost:
         for name, channel in by_name.items():
             if channel in SLOW and isinstance(known := birth.metrics[name].value, (int, float)):
                 values[channel] = np.full(count, float(known))
-        units = {channel: birth.metrics[name].unit for name, channel in by_name.items()}
+        units = {channel: birth.metrics[name].unit or actuator.units.get(channel) for name, channel in by_name.items()}
         converted = {channel: in_si(array, units.get(channel), channel) for channel, array in values.items()}
         return Recording(t, converted, {channel: CHANNEL_UNITS[channel] for channel in converted}, rate)
 

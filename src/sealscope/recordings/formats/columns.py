@@ -18,6 +18,7 @@ from sealscope.recordings.formats.headings.proposal import (
     ends_in,
     is_recorded,
     is_scaled,
+    is_temperature,
     is_time,
     map_options,
     proposed_map,
@@ -371,6 +372,9 @@ def choose_columns(labels: Sequence[Label], request: Wanted, stated_rate: float 
             {name: column for name, column in proposed_map(labels).items() if name not in channel_names}
         )
         hint = f"; map auto would also read {guess}" if guess else ""
+        warmth = [label.whole for label in left if is_temperature(label)]
+        if warmth and "T_oil" not in channel_names:
+            hint += f"; if it is the oil's temperature: --map 'T_oil={warmth[0]}'"
         choice.notes.append(f"{UNUSED}: {listed((label.whole for label in left), 40)}{hint}")
     if rate is not None:
         choice.time = choice.time_label = choice.date = None

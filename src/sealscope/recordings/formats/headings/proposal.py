@@ -112,6 +112,10 @@ def measures(text: str) -> bool:
     return _guess(Label.parse(text)) is not None
 
 
+#: Endings that are units behind words of their kind alone: a set point x_s, a demand p_d, a least pressure p_min.
+_AMBIGUOUS = {**dict.fromkeys(("s", "min", "h", "d"), "time"), "m": "position"}
+
+
 def split_unit(name: str) -> tuple[str, str | None]:
     """Split `PA_bar`, `flow_l_min` or `MainPaBar` into name and unit; (name, None) without a channel's unit."""
     parts = name.replace(" ", "_").split("_")
@@ -122,7 +126,7 @@ def split_unit(name: str) -> tuple[str, str | None]:
     for before, unit in endings:
         if not before or not unit or unit in ("A", "B", "a", "b"):
             continue
-        kind = {"s": "time", "m": "position"}.get(unit)
+        kind = _AMBIGUOUS.get(unit)
         if kind is not None and not _words_of(before) & _MEASURED[kind]:  # x_s may as well be a set point
             continue
         known = (*CHANNEL_UNITS.values(), "s", "m/s")
@@ -136,6 +140,12 @@ def ends_in(name: str, words: str) -> bool:
     tokens = ([token.casefold() for token in _TOKEN.findall(_plain(text))] for text in (name, words))
     name_tokens, ending = (["channel" if token in WORDS["input"] else token for token in text] for text in tokens)
     return words[:1].isalpha() and 0 < len(ending) <= len(name_tokens) and name_tokens[-len(ending) :] == ending
+
+
+def is_temperature(label: Label) -> bool:
+    """Test whether a column is in a unit of temperature."""
+    unit = split_unit(label.name)[1] if label.unit is None else label.unit
+    return unit is not None and same_dimension(unit, "K")
 
 
 def is_recorded(label: Label) -> bool:
