@@ -95,7 +95,7 @@ class Rise(NamedTuple):
     @property
     def chance(self) -> float:
         """Probability that a healthy recording scores as high."""
-        return self._exceedance(self.score)
+        return min(self._exceedance(self.score), 1.0)
 
     def _exceedance(self, score: float) -> float:
         from scipy.special import ndtr, stdtr
