@@ -37,12 +37,12 @@ class HealthyNull:
     def chance(self, observable: Observable) -> float:
         """Compute the predictive probability of an observable at least as rare in a healthy recording."""
         weights, inflations = self._inflation(key_of(observable))
-        return float(weights @ np.exp(-observable.rarity / inflations))
+        return min(float(weights @ np.exp(-observable.rarity / inflations)), 1.0)
 
     def inflate(self, key: str, chance: float) -> float:
         """Compute the predictive probability of an event from its chance by the law."""
         weights, inflations = self._inflation(key)
-        return float(weights @ np.exp(np.log(max(chance, np.finfo(float).tiny)) / inflations))
+        return min(float(weights @ np.exp(np.log(max(chance, np.finfo(float).tiny)) / inflations)), 1.0)
 
     def law_chance(self, key: str, chance: float) -> float:
         """Compute the chance by the law whose predictive probability is `chance`."""
