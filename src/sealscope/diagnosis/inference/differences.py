@@ -18,6 +18,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sealscope.diagnosis.inference.observable import Observable
+from sealscope.diagnosis.priors import priors
 
 #: Fewest healthy recordings that show a scatter.
 FEWEST = 3
@@ -57,3 +58,10 @@ def difference(
     if not np.isfinite(score):
         return None
     return Observable(name=name, data=data, score=score, chance=min(1.0, tail * (1.0 if above else 2.0)), size=change)
+
+
+def rarity_of_size(table: str, step: float, above: bool = False) -> float:
+    """Compute -2 times the logarithm of a step's prior density over the largest; `above`: no smaller one is rare."""
+    size, spread = (priors("inference")[table][name] for name in ("size", "spread"))
+    away = float(np.log(max(abs(step), np.finfo(float).tiny) / size)) / spread
+    return float(max(away, 0.0) ** 2 if above else away**2)

@@ -20,6 +20,7 @@ from sealscope.diagnosis.inference.blocks import (
     total,
     zero_of,
 )
+from sealscope.diagnosis.inference.differences import rarity_of_size
 from sealscope.diagnosis.inference.leak_law import law_shapes
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import Information, StepTest, step_tests
@@ -88,14 +89,14 @@ def volume_observables(
         if name.startswith(LEAK) or name == PUMP:
             advantage = -cost
         elif name == SCALE:
-            advantage = -_rarity_of_size("scale", step.fitted[0])
+            advantage = -rarity_of_size("scale", step.fitted[0])
         elif name == OUTSIDE:
-            advantage = -_rarity_of_size("outside", step.fitted[0], above=True)
+            advantage = -rarity_of_size("outside", step.fitted[0], above=True)
         elif name.startswith("external leak"):
             stored = lost.get(name.removesuffix(MADE_UP))
             advantage = 0.0 if stored is None else _agreement(step, stored)
             flow = step.fitted[0] * _mean_increment(recorded, first, name)
-            advantage -= _rarity_of_size("outside", flow, above=True)
+            advantage -= rarity_of_size("outside", flow, above=True)
         observables.append(
             Observable.of_test(name, VOLUMES, step, looks=len(steps), sign=signs[best], advantage=advantage)
         )
@@ -117,13 +118,6 @@ def _name_of(term: Term) -> str:
     if term.name != BIAS:
         return term.name
     return OUTSIDE if term.cause == "external leak" else "zero of the flow"
-
-
-def _rarity_of_size(table: str, step: float, above: bool = False) -> float:
-    """Compute -2 times the logarithm of a step's prior density over the largest; `above`: no smaller one is rare."""
-    size, spread = (priors("inference")[table][name] for name in ("size", "spread"))
-    away = float(np.log(max(abs(step), np.finfo(float).tiny) / size)) / spread
-    return float(max(away, 0.0) ** 2 if above else away**2)
 
 
 def _mean_increment(blocks: Blocks, columns: Columns, name: str) -> float:

@@ -8,11 +8,12 @@ the same number between the healthy recordings is its null (`differences`).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from sealscope.diagnosis.inference.blocks import Columns, solve
-from sealscope.diagnosis.inference.differences import difference
+from sealscope.diagnosis.inference.differences import difference, rarity_of_size
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.scatter import RISE, RecordingSums
 from sealscope.diagnosis.inference.terms import AIR, LEAK, SPEED_LOSS, TURNING
@@ -41,7 +42,8 @@ def rival_rises(
         ]
         data = TURNING_DATA if names[k] == TURNING else RISE
         observable = difference(names[k], data, values[0], values[1:], above=names[k] != AIR)
-        observables += [] if observable is None else [observable]
+        if observable is not None:
+            observables.append(_by_size(observable, judged) if names[k].startswith("external leak") else observable)
     return (*observables, *(held or ()))
 
 
@@ -56,8 +58,13 @@ def held_rivals(judged: RecordingSums, healthy: Sequence[RecordingSums]) -> tupl
         numbers = [float(held[k]) for held in known]
         error = max(float(np.median([judged.held[k + 1], *(held[k + 1] for held in known)])), least)
         observable = difference(f"external leak {side}", RISE, float(judged.held[k]), numbers, error, above=True)
-        observables += [] if observable is None else [observable]
+        observables += [] if observable is None else [_by_size(observable, judged)]
     return tuple(observables)
+
+
+def _by_size(observable: Observable, judged: RecordingSums) -> Observable:
+    """Return a leak to the outside with its size against it: a large one is seen."""
+    return replace(observable, advantage=-rarity_of_size("outside", observable.size * judged.pressure, above=True))
 
 
 def _shift(sums: Array, reference: Array, columns: Sequence[Columns], test: int) -> float:
