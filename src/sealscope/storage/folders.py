@@ -68,10 +68,10 @@ def locked(file: Path, busy: str | None, wait: float = 0.0) -> Iterator[None]:
     """
     from filelock import FileLock, Timeout
 
-    lock = FileLock(file, timeout=-1 if busy is None else wait, poll_interval=0.01)
+    lock = FileLock(file, timeout=-1 if busy is None else wait)
     try:
         open_inner(file, "a lock", "ab+").close()
-        lock.acquire()
+        lock.acquire(poll_interval=0.01)
     except Timeout:
         raise InputError(str(busy)) from None
     except (OSError, NotImplementedError) as error:
