@@ -2,11 +2,11 @@
 
 The pump is cut off, so that each chamber is a closed volume but for what leaks. From the begin of a hold on,
 
-    m_A dx + V_A (kappa_A dp_A - alpha p_0 d(1/p_A)) = -G I - e_A I_A,
-   -m_B dx + V_B (kappa_B dp_B - alpha p_0 d(1/p_B)) = +G I - e_B I_B,
+    m_A dx + V_A (dp_A/K - alpha p_0 d(1/p_A)) = -G I - e_A I_A,
+   -m_B dx + V_B (dp_B/K - alpha p_0 d(1/p_B)) = +G I - e_B I_B,
 
 with what the piston displaces (m_A, m_B the areas in the unit of the pump's flow), the volumes V of oil, their
-compressibility kappa and free air alpha, and the integrals I of a power of p_A - p_B - z, I_A and I_B of the
+bulk modulus K and free air alpha, and the integrals I of a power of p_A - p_B - z, I_A and I_B of the
 pressures. A piston that leaks takes from A what it brings to B; a rod seal takes from one side alone, and a check valve
 may make up what the piston then displaces on the other. Readings of all holds, each side of a hold about its mean, are
 one linear regression, with what is believed of the oil (`priors.toml`, `held_oil`) as readings beside them. Onset of
