@@ -45,6 +45,8 @@ RISE = "rise"
 NODES, WIDEST, MOST = 32, 3.0, 60
 #: Widths of what recordings differ by that are weighed, and how far from what is believed [deviations].
 SCALES, FARTHEST = 11, 2.5
+#: Fewest healthy recordings that hold pressures: their mean and scatter.
+FEWEST_HELD = 2
 #: Least deviation: what is divided by is no zero.
 TINY = 1e-300
 #: Laws that one of logarithms is split into, how much narrower each is, where logarithms end, what weighs nothing.
@@ -192,12 +194,13 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
 
 
 def held_rise(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> Rise | None:
-    """Estimate the rise of what passes the piston while valves shut the chambers; None where one of them holds nothing.
+    """Estimate the rise of what passes the piston while valves shut the chambers; None where too few hold pressures.
 
     A leak that begins within the recording raises it by anything between nothing and its mean.
     """
+    baseline = [recording for recording in baseline if recording.held is not None]
     known = [recording.held for recording in baseline if recording.held is not None]
-    if judged.held is None or not known or len(known) < len(baseline):
+    if judged.held is None or len(known) < FEWEST_HELD:
         return None
     count, by_flow = len(known), judged.flow / judged.pressure if judged.pressure > 0.0 else 0.0
     healthy = np.array(known)

@@ -38,8 +38,9 @@ class BalanceLeak:
 
     @property
     def cause(self) -> Cause:
-        """Cause of a leak: the pressures at the pump separate its leak from the piston's."""
-        return "piston leak" if len(self.balance.columns) > 1 else "piston or pump leak"
+        """Cause of a leak: behind a servo valve, or where valves surely hold pressures, the pump has no part in it."""
+        is_piston = len(self.balance.columns) > 1 or self._held_rise is not None
+        return "piston leak" if is_piston else "piston or pump leak"
 
     @property
     def step(self) -> StepTest | None:

@@ -15,7 +15,7 @@ import numpy as np
 from sealscope.diagnosis.inference.blocks import Columns, solve
 from sealscope.diagnosis.inference.differences import difference, rarity_of_size
 from sealscope.diagnosis.inference.observable import Observable
-from sealscope.diagnosis.inference.scatter import RISE, RecordingSums
+from sealscope.diagnosis.inference.scatter import FEWEST_HELD, RISE, RecordingSums
 from sealscope.diagnosis.inference.terms import AIR, LEAK, SPEED_LOSS, TURNING
 from sealscope.diagnosis.priors import priors
 from sealscope.recordings.recording import Array
@@ -48,9 +48,9 @@ def rival_rises(
 
 
 def held_rivals(judged: RecordingSums, healthy: Sequence[RecordingSums]) -> tuple[Observable, ...] | None:
-    """Compare what either side loses to the outside while valves shut the chambers; None where one holds nothing."""
+    """Compare what either side loses to the outside while valves shut the chambers; None where too few hold any."""
     known = [recording.held for recording in healthy if recording.held is not None]
-    if judged.held is None or len(known) < len(healthy):
+    if judged.held is None or len(known) < FEWEST_HELD:
         return None
     by_flow = judged.flow / judged.pressure if judged.pressure > 0.0 else 0.0
     least, observables = priors("inference")["scatter"]["finest"] * by_flow, list[Observable]()
