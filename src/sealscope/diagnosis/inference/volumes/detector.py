@@ -92,12 +92,12 @@ class VolumeBalance:
                 return f"{name} is constant or missing"
         return None
 
-    def balance(self, recording: Recording, odds: float | None = None) -> RecordedBalance | None:
+    def balance(self, recording: Recording, odds: float = 0.0, *, is_locked: bool = False) -> RecordedBalance | None:
         """Return the recording's balance; None if it has none.
 
         Of several it is the one with the smallest bound. Without a recorded position a balance says nothing, unless
-        the pump surely makes good its loss. `odds`: log odds by healthy recordings that the pump is cut off at rest, by
-        default its own.
+        the pump surely makes good its loss. `odds`: log odds by healthy recordings that the pump is cut off at rest;
+        `is_locked`: they surely say so, whatever a leak makes of this recording's rests.
         """
         balances = equations(self.rig, frozenset(recording.channels))
         if not balances:
@@ -122,9 +122,8 @@ class VolumeBalance:
         recorded = self._recorded(recording)
         if recorded is None:
             return None
-        believed = priors("inference")["rest"]
-        if odds is None or odds < believed["locked"]:  # a leak past the piston makes rests like motion
-            odds = (odds or 0.0) + float(np.clip(recorded.odds, -believed["alone"], believed["alone"]))
+        most: float = priors("inference")["rest"]["alone"]
+        odds = np.inf if is_locked else odds + float(np.clip(recorded.odds, -most, most))
         return self._balance(recording, recorded.regime(odds))
 
     def _recorded(self, recording: Recording) -> RecordedBlocks | None:
@@ -159,7 +158,7 @@ class VolumeBalance:
 
     def next_rise(self, lessons: Sequence[Lesson], channels: frozenset[str], repeated: int = 1) -> Rise:
         """Return the rise of a healthy recording like these on a later day, as after `repeated` times as many days."""
-        shut = (self._odds_of(lessons, channels) or 0.0) > 0.0
+        shut = _is_locked(lessons) or self._odds_of(lessons, channels) > 0.0
         healthy = [_sums_of(lesson, shut) for lesson in lessons]
         later = [sums._replace(start_s=_later(sums, k)) for k in range(repeated) for sums in healthy]
         flow, pressure = (float(np.median([lesson[name] for lesson in lessons])) for name in ("flow", "pressure"))
@@ -167,22 +166,17 @@ class VolumeBalance:
         dated = next((sums for sums in healthy if sums.start_s is not None), middle)
         return rise(middle._replace(start_s=_later(dated, repeated)), later, self._columns(channels, shut))
 
-    def _odds_of(self, lessons: Sequence[Lesson], channels: frozenset[str]) -> float | None:
-        """Compute the log odds, by healthy recordings, that the pump is cut off at rest; None where none of them rests.
+    def _odds_of(self, lessons: Sequence[Lesson], channels: frozenset[str]) -> float:
+        """Compute the log odds, by healthy recordings, that the pump is cut off at rest.
 
-        Where each says by itself that pressures are held, they are: then a judged recording has no say, as a leak past
-        the piston makes its rests like motion. Else enough recordings tell by how far their leakage scatters under
-        either hypothesis, the ratio of the likelihoods of an unknown scale; fewer by the sum of what they say.
+        Of enough recordings by how far their leakage scatters under either hypothesis, the ratio of the likelihoods of
+        an unknown scale: that under which healthy recordings agree also shows the smaller leak. Of fewer by the sum of
+        what each says of itself.
         """
         known = [lesson for lesson in lessons if "shut_sums" in lesson]
-        if not known:
-            return None
-        alone = [lesson.get("shut_odds", 0.0) for lesson in known]
-        if np.mean(alone) > priors("inference")["rest"]["locked"]:
-            return float(np.sum(alone))
         if len(known) < FEWEST_THAT_SCATTER:
             most: float = priors("inference")["rest"]["alone"]
-            return float(np.sum(np.clip(alone, -most, most)))
+            return float(np.sum(np.clip([lesson.get("shut_odds", 0.0) for lesson in known], -most, most)))
         scatter = []
         for shut in (False, True):
             sums = [_sums_of(lesson, shut) for lesson in known]
@@ -197,14 +191,14 @@ class VolumeBalance:
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
         """Return the steps of the balance's terms, and the leak against healthy recordings."""
         lessons = lessons_of(self, baseline)
+        is_locked = _is_locked(lessons)
         odds = self._odds_of(lessons, frozenset(recording.channels))
-        balance = self.balance(recording, odds)
+        balance = self.balance(recording, odds, is_locked=is_locked)
         if balance is None:
             return Observed(self.name, lack=_NO_BALANCE["x" in recording].format(recording.duration))
         names = [name for name in balance.columns[0].names if name != TURNING]
-        locked = balance.shut and odds is not None and odds > priors("inference")["rest"]["locked"]
         known = [_sums_of(lesson, balance.shut) for lesson in lessons if lesson["terms"] == names]
-        return self._report(balance, known if locked else [sums._replace(held=None) for sums in known])
+        return self._report(balance, known if is_locked else [sums._replace(held=None) for sums in known])
 
     def observe_regimes(self, recording: Recording) -> Mapping[bool, Observed]:
         """Observe a recording by itself, with the pump in the circuit at rest (False) or cut off (True)."""
@@ -239,6 +233,12 @@ def _motion_observable(balance: RecordedBalance, healthy: Sequence[RecordingSums
     ]
     observable = difference("motion", "motion", change, known, priors("inference")["size"]["motion"])
     yield from () if observable is None else (observable,)
+
+
+def _is_locked(lessons: Sequence[Lesson]) -> bool:
+    """Tell whether healthy recordings surely say that valves hold the pressures while the pump rests."""
+    odds = [lesson["shut_odds"] for lesson in lessons if "shut_odds" in lesson]
+    return bool(odds) and float(np.mean(odds)) > priors("inference")["rest"]["locked"]
 
 
 def _later(recorded: RecordingSums, times: int) -> float | None:
