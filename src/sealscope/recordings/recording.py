@@ -201,7 +201,7 @@ class Recording:
 
     @property
     def pressure_unit(self) -> str:
-        """Unit in which pressures are shown: that of the log, else bar."""
+        """Unit in which pressures are shown, that of the log, else bar."""
         units = (self.unit_in_log(name) for name in self.channels if name.startswith("p_"))
         return next((unit for unit in units if unit in SHOWN_UNITS), "bar")
 
@@ -263,8 +263,8 @@ class Recording:
 
         Returns
         -------
-        numpy.ndarray of matplotlib.axes.Axes
-            The axes (k,), one for each unit, above one another.
+        axes : ndarray
+            Of `matplotlib.axes.Axes`, (k,), one for each unit, above one another.
 
         Raises
         ------

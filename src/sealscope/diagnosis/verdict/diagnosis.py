@@ -175,7 +175,7 @@ class Diagnosis(Evidence):
 
     @property
     def named_cause(self) -> str | None:
-        """Cause named by the verdict: a leak's for `leak`, else another event's; None where it names none."""
+        """Cause named by the verdict, a leak's for `leak`, else another event's; None where it names none."""
         return self.cause if (self.verdict == LEAK) == (self.cause in LEAKS) else None
 
     @property
@@ -202,7 +202,7 @@ class Diagnosis(Evidence):
 
     @property
     def is_baseline(self) -> bool:
-        """True if the recording may serve as a baseline: its total is shown to be like the healthy recordings'."""
+        """True if the recording may serve as a baseline, its total shown to be like the healthy recordings'."""
         against = self._question(AGAINST)
         if self.verdict != NO_LEAK or self.cause is not None or against is None or not _is_usual(against):
             return False
