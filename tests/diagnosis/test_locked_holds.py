@@ -8,8 +8,7 @@ import pytest
 from sealscope.diagnosis.inference.circuit.locked_holds import (
     CylinderSides,
     HeldChambers,
-    LeakShape,
-    find_holds,
+    find_locked_holds,
 )
 from sealscope.recordings.recording import Array
 from sealscope.units import P_ATM
@@ -64,7 +63,7 @@ def held_press(
         x[k] = middle + (a * AREA_A - b * AREA_B) / FRAME
     noise = random.standard_normal((3, count))
     channels = (t, p_A + zero + P_ATM + 3e3 * noise[0], p_B + P_ATM + 3e3 * noise[1], x + 2e-6 * noise[2])
-    holds = find_holds(channels, rests[1:], RATE)
+    holds = find_locked_holds(channels, rests[1:], RATE)
     sides = CylinderSides(AREA_A, AREA_B, 0.05 * STROKE, float(x.max()))
     return HeldChambers(holds, sides, float(t[0]), float(t[-1]), CHARGE + P_ATM)
 
@@ -96,15 +95,15 @@ def test_a_rod_seal_takes_from_one_side_alone() -> None:
 
 def test_a_leak_that_begins_within_the_recording_is_dated_by_the_holds() -> None:
     chambers = held_press(piston=SEAL, since=47.0)
-    shape, _ = chambers.piston
-    assert shape.onset == pytest.approx(47.0, abs=3.0)
-    assert chambers.level(shape, 0.0).value == pytest.approx(SEAL, rel=0.3)
+    onset, _ = chambers.piston
+    assert onset == pytest.approx(47.0, abs=3.0)
+    assert chambers.level(onset, 0.0).value == pytest.approx(SEAL, rel=0.3)
 
 
 def test_pressures_that_decay_tell_the_law_of_the_leak() -> None:
     for exponent, other in ((1.0, 0.5), (0.5, 1.0)):
         chambers = held_press(piston=SEAL, exponent=exponent)
-        likelihoods = {tried: chambers.level(LeakShape(0.0, tried), 0.0).likelihood for tried in (1.0, 0.5)}
+        likelihoods = {tried: chambers.level(0.0, 0.0, tried).likelihood for tried in (1.0, 0.5)}
         assert likelihoods[exponent] > likelihoods[other] + 5.0
 
 
@@ -113,8 +112,8 @@ def test_a_hold_with_a_missing_sample_and_one_that_is_short_are_left_out() -> No
     p = np.full(3000, 1e6)
     x = np.full(3000, 0.1)
     rests = ((t > 2.0) & (t < 6.0)) | ((t > 10.0) & (t < 10.5)) | ((t > 15.0) & (t < 20.0))
-    holds = find_holds((t, p, p, x), rests[1:], RATE)
+    holds = find_locked_holds((t, p, p, x), rests[1:], RATE)
     assert [round(float(hold.t[0])) for hold in holds] == [2, 15]
     p = p.copy()
     p[400] = np.nan
-    assert len(find_holds((t, p, x, x), rests[1:], RATE)) == 1
+    assert len(find_locked_holds((t, p, x, x), rests[1:], RATE)) == 1

@@ -28,8 +28,6 @@ _JUMP = 1.5
 _TOLD = 2**18
 #: Longest run of repeated rows.
 _LONGEST_REPEAT = 3
-#: Share of a channel's changes that a leap exceeds.
-_LEAP = 0.99
 
 
 def without_stale_samples(recording: Recording) -> tuple[Recording, list[Finding]]:
@@ -109,7 +107,9 @@ def _is_constant(values: Array) -> bool:
 def _leaps(values: Array, row: int) -> bool:
     """Test whether a channel changes about a sample by more than it does elsewhere between samples."""
     change = np.abs(values[min(row + _LONGEST_REPEAT, len(values) - 1)] - values[max(row - _LONGEST_REPEAT - 1, 0)])
-    usual = np.nanquantile(np.abs(values[2 * _LONGEST_REPEAT + 1 :] - values[: -2 * _LONGEST_REPEAT - 1]), _LEAP)
+    usual = np.nanquantile(
+        np.abs(values[2 * _LONGEST_REPEAT + 1 :] - values[: -2 * _LONGEST_REPEAT - 1]), _PRIORS["leap"]
+    )
     return bool(change > usual)
 
 

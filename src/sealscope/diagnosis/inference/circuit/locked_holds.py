@@ -36,12 +36,16 @@ from sealscope.units import P_ATM
 FIRST, GROWS, FEWEST_READINGS = 0.05, 1.2, 8
 #: Rate that is enough for pressures that valves shut in [Hz].
 FASTEST = 100.0
-#: Readings of one side of a hold that count as one each: what the regression leaves is smooth.
-INDEPENDENT = 4.0
 #: Zeros that are tried, over what is believed of one [deviations], and how many between the best one's neighbours;
 #: onsets that are tried within a hold.
 CLOSER, ONSETS = 17, 4
 ZEROS = np.array([0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0])
+#: Signs of a leak's flow in the balances of sides A and B, past the piston and of either side to the outside.
+PISTON, OUTSIDE = (1.0, -1.0), {"A": (1.0, 0.0), "B": (0.0, 1.0)}
+#: Deviation of a leak that no reading tells of.
+UNKNOWN = 1e30
+#: Turns of a fit and the change of its variance that ends them; what is added to a matrix.
+TURNS, TOLERANCE, RIDGE = 20, 1e-3, 1e-12
 
 
 class CylinderSides(NamedTuple):
@@ -67,13 +71,8 @@ class LockedHold(NamedTuple):
         sums = np.add.reduceat(values, self.edges[:-1], axis=-1)
         return np.asarray(sums / np.diff(self.edges))
 
-    def integral(self, values: Array) -> Array:
-        """Return the mean integral of samples (n,) from the begin to each reading, (k,)."""
-        steps = 0.5 * (values[1:] + values[:-1]) * np.diff(self.t)
-        return self.mean(np.concatenate([[0.0], np.cumsum(steps)]))
 
-
-def find_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate: float) -> list[LockedHold]:
+def find_locked_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate: float) -> list[LockedHold]:
     """Find the holds of a recording: rests of the pump (n - 1,), from when valves have shut.
 
     `channels`: time, absolute pressures of A and B, and position, (n,) each. A hold that is short, or has missing
@@ -97,17 +96,6 @@ def find_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate: float)
         if len(edges) > FEWEST_READINGS and np.isfinite([p_A, p_B, x]).all():
             holds.append(LockedHold(t, p_A, p_B, x, np.array(edges)))
     return holds
-
-
-class LeakShape(NamedTuple):
-    """A leak from its `onset` on [s], by a power `exponent` of the pressure difference."""
-
-    onset: float
-    exponent: float = 1.0
-
-    def over(self, t: Array) -> Array:
-        """Return 1 at times (n,) at which it leaks, else 0."""
-        return np.asarray((t >= self.onset).astype(float))
 
 
 class HeldLeaks(NamedTuple):
@@ -153,7 +141,8 @@ class HeldChambers:
     @cached_property
     def readings(self) -> float:
         """Number of independent readings."""
-        return INDEPENDENT * 2.0 * len(self.holds)
+        independent: float = priors("inference")["held_oil"]["independent"]
+        return independent * 2.0 * len(self.holds)
 
     def _regression(self, feeds: bool) -> tuple[Array, Array, Array]:
         """Return the left side (r,) of the readings, the columns (r, 4) of the oil, and the widths of its priors.
@@ -185,26 +174,15 @@ class HeldChambers:
         """Flag the samples (n,) of a chamber's pressure above that of the charge: no check valve feeds it."""
         return np.asarray(p > self.charge * (1.0 + priors("inference")["held_oil"]["charge"]))
 
-    def _leak_column(self, shape: LeakShape, zero: float) -> Array:
-        """Return the column (r,) of a leak past the piston."""
-        parts = []
-        for hold in self.holds:
-            difference = hold.p_A - hold.p_B - zero
-            flow = shape.over(hold.t) * np.sign(difference) * np.abs(difference) ** shape.exponent
-            integral = _centred(hold.integral(flow))
-            parts += [integral, -integral]
-        return np.concatenate(parts)
+    def _piston_flows(self, zero: float, exponent: float = 1.0) -> list[Array]:
+        """Return the flow of a leak of one past the piston in the samples (n,) of each hold."""
+        differences = [hold.p_A - hold.p_B - zero for hold in self.holds]
+        return [np.sign(difference) * np.abs(difference) ** exponent for difference in differences]
 
-    def _outside_column(self, side: str, shape: LeakShape) -> Array:
-        """Return the column (r,) of a leak of one side to the outside."""
-        parts = []
-        for hold in self.holds:
-            p = hold.p_A if side == "A" else hold.p_B
-            flow = shape.over(hold.t) * np.maximum(p - P_ATM, 0.0) * self._closed(p)
-            integral = _centred(hold.integral(flow))
-            none = np.zeros_like(integral)
-            parts += [integral, none] if side == "A" else [none, integral]
-        return np.concatenate(parts)
+    def _outside_flows(self, side: str) -> list[Array]:
+        """Return the flow of a leak of one from a side to the outside in the samples (n,) of each hold."""
+        pressures = [hold.p_A if side == "A" else hold.p_B for hold in self.holds]
+        return [np.maximum(p - P_ATM, 0.0) * self._closed(p) for p in pressures]
 
     def _fit(self, columns: Sequence[Array], feeds: bool = False) -> tuple[Array, Array, Array, float]:
         """Fit columns (r,) beside the oil: coefficients, covariances by noise and by the oil, and the variance."""
@@ -239,16 +217,18 @@ class HeldChambers:
         share: float = believed["misfit"]
         return max(share**2 * float(compressed @ compressed) / len(oil), float(np.finfo(float).tiny))
 
-    def level(self, shape: LeakShape, zero: float) -> HeldLevel:
-        """Fit a leak past the piston of a shape, about a zero of p_A - p_B [Pa]."""
-        return self._level(self._leak_column(shape, zero), cost_of_zero(zero))
+    def level(self, onset: float, zero: float, exponent: float = 1.0) -> HeldLevel:
+        """Fit a leak past the piston from `onset` [s] on, by a power of p_A - p_B about its zero [Pa]."""
+        flows = self._piston_flows(zero, exponent)
+        return self._level(self._leak_columns(flows, PISTON, np.array([onset])), cost_of_zero(zero))
 
-    def outside(self, side: str, shape: LeakShape) -> HeldLevel:
-        """Fit a leak of one side to the outside, of a shape."""
-        return self._level(self._outside_column(side, shape), 0.0, feeds=True)
+    def outside(self, side: str, onset: float) -> HeldLevel:
+        """Fit a leak of one side to the outside from `onset` [s] on."""
+        flows = self._outside_flows(side)
+        return self._level(self._leak_columns(flows, OUTSIDE[side], np.array([onset])), 0.0, feeds=True)
 
     def _level(self, column: Array, cost: float, feeds: bool = False) -> HeldLevel:
-        values, noise, oil, variance = self._fit([column] if column.any() else [], feeds)
+        values, noise, oil, variance = self._fit([*column.T] if column.any() else [], feeds)
         value, deviation, by_oil = 0.0, UNKNOWN, 0.0
         if len(values):
             value, deviation, by_oil = float(values[0]), float(noise[0, 0]) ** 0.5, float(max(oil[0, 0], 0.0)) ** 0.5
@@ -270,17 +250,17 @@ class HeldChambers:
         """Logarithm of the prior of each onset: half of all leaks are there from the start."""
         return np.asarray(np.log(np.append(0.5, np.full(len(self.onsets) - 1, 0.5 / max(len(self.onsets) - 1, 1)))))
 
-    def _columns_since(self, flows: Sequence[Array], signs: tuple[float, float]) -> Array:
-        """Return the columns (r, o) of a leak since each of the onsets, by its flow in the samples of each hold.
+    def _leak_columns(self, flows: Sequence[Array], signs: tuple[float, float], onsets: Array) -> Array:
+        """Return the columns (r, o) of a leak since each of the onsets (o,), by its flow in the samples of each hold.
 
-        `signs`: how it counts for sides A and B.
+        `signs`: those of its flow in the balances of sides A and B.
         """
         parts = []
         for hold, flow in zip(self.holds, flows, strict=True):
             steps = 0.5 * (flow[1:] + flow[:-1]) * np.diff(hold.t)
             integral = np.concatenate([[0.0], np.cumsum(steps)])
-            before = np.interp(self.onsets, hold.t, integral)
-            readings = hold.mean(np.maximum(hold.t >= self.onsets[:, None], 0.0) * (integral - before[:, None])).T
+            before = np.interp(onsets, hold.t, integral)
+            readings = hold.mean((hold.t >= onsets[:, None]) * (integral - before[:, None])).T
             readings -= readings.mean(axis=0)
             parts += [sign * readings for sign in signs]
         return np.vstack(parts)
@@ -303,19 +283,19 @@ class HeldChambers:
         return np.asarray(-0.5 * self.readings * np.log(np.maximum(float(left @ left) - gain, least)))
 
     @cached_property
-    def piston(self) -> tuple[LeakShape, float]:
-        """Likeliest shape of a leak past the piston, and zero of p_A - p_B [Pa]."""
+    def piston(self) -> tuple[float, float]:
+        """Likeliest onset [s] of a leak past the piston, and zero of p_A - p_B [Pa]."""
         tried = np.unique(np.concatenate([-ZEROS, ZEROS])) * priors("inference")["zero"]["pressure"]
         best = self._likeliest_zero(tried)
         between = np.linspace(tried[max(best[1] - 1, 0)], tried[min(best[1] + 1, len(tried) - 1)], CLOSER)
         onset, place, _ = self._likeliest_zero(between)
-        return LeakShape(float(self.onsets[onset])), float(between[place])
+        return float(self.onsets[onset]), float(between[place])
 
     def _likeliest_zero(self, zeros: Array) -> tuple[int, int, float]:
         """Return the likeliest onset and zero, as indices, with the likelihood."""
         found = []
         for place, zero in enumerate(zeros):
-            columns = self._columns_since([hold.p_A - hold.p_B - zero for hold in self.holds], (1.0, -1.0))
+            columns = self._leak_columns(self._piston_flows(float(zero)), PISTON, self.onsets)
             likelihoods = self._scan(columns) + self._priors - 0.5 * cost_of_zero(float(zero))
             onset = int(likelihoods.argmax())
             found.append((onset, place, float(likelihoods[onset])))
@@ -324,14 +304,12 @@ class HeldChambers:
     @cached_property
     def leaks(self) -> HeldLeaks:
         """Mean leaks past the piston and to the outside, each by the probability that it is the one."""
-        shape, zero = self.piston
-        onset = int(np.abs(self.onsets - shape.onset).argmin())
-        found = [(self.level(shape, zero), onset)]
-        for side, signs in (("A", (1.0, 0.0)), ("B", (0.0, 1.0))):
-            pressures = [hold.p_A if side == "A" else hold.p_B for hold in self.holds]
-            flows = [np.maximum(p - P_ATM, 0.0) * self._closed(p) for p in pressures]
-            onset = int((self._scan(self._columns_since(flows, signs), feeds=True) + self._priors).argmax())
-            found.append((self.outside(side, LeakShape(float(self.onsets[onset]))), onset))
+        begin, zero = self.piston
+        found = [(self.level(begin, zero), int(np.abs(self.onsets - begin).argmin()))]
+        for side, signs in OUTSIDE.items():
+            columns = self._leak_columns(self._outside_flows(side), signs, self.onsets)
+            onset = int((self._scan(columns, feeds=True) + self._priors).argmax())
+            found.append((self.outside(side, float(self.onsets[onset])), onset))
         logarithms = np.array([level.likelihood + self._priors[onset] for level, onset in found])
         shares = np.exp(logarithms - logarithms.max())
         shares /= shares.sum()
@@ -340,12 +318,6 @@ class HeldChambers:
             lasts = (self.end - self.onsets[onset]) / max(self.end - self.begin, np.finfo(float).tiny)
             numbers += [float(share * lasts) * level.value, float(lasts) * level.deviation]
         return HeldLeaks(*numbers)
-
-
-#: Deviation of what nothing tells.
-UNKNOWN = 1e30
-#: Turns of a fit and the change of its variance that ends them; what is added to a matrix.
-TURNS, TOLERANCE, RIDGE = 20, 1e-3, 1e-12
 
 
 def _centred(values: Array) -> Array:

@@ -109,22 +109,17 @@ class BalanceLeak:
         """Return the mean flow of what the holds show, over laws by their likelihoods."""
         balance, held = self.balance, self.balance.chambers
         assert held is not None
-        recording, (shape, zero) = balance.recording, held.piston
-        difference = np.abs(recording["p_A"] - recording["p_B"] - zero)[recording.t >= shape.onset]
-        units = [float(np.nanmean(difference**exponent)) for exponent in EXPONENTS]
-        levels = [held.level(shape._replace(exponent=exponent), zero) for exponent in EXPONENTS]
-        likelihoods = np.array([level.likelihood for level in levels])
+        recording, (onset, zero) = balance.recording, held.piston
+        difference = np.abs(recording["p_A"] - recording["p_B"] - zero)[recording.t >= onset]
+        units = np.array([float(np.nanmean(difference**exponent)) for exponent in EXPONENTS])
+        levels = [held.level(onset, zero, exponent) for exponent in EXPONENTS]
+        values, deviations, by_oil, likelihoods = np.array(levels).T
         low, high = rise.interval()
         scatter = (high - low) / (2.0 * WITHIN_95) * units[0]
         return mixed_flow(
             np.exp(likelihoods - likelihoods.max()),
-            np.array([level.value * unit for level, unit in zip(levels, units, strict=True)]),
-            np.array(
-                [
-                    np.hypot(scatter, np.hypot(level.deviation, level.by_oil) * unit)
-                    for level, unit in zip(levels, units, strict=True)
-                ]
-            ),
+            values * units,
+            np.hypot(scatter, np.hypot(deviations, by_oil) * units),
         )
 
     def _rise_laws(self) -> list[tuple[float, float]]:

@@ -12,7 +12,7 @@ import numpy as np
 from sealscope.diagnosis.inference.balance import still_rate
 from sealscope.diagnosis.inference.blocks import Blocks, Columns, information, mean_of, solve, zero_of
 from sealscope.diagnosis.inference.changes.volumes import volume_observables
-from sealscope.diagnosis.inference.circuit.locked_holds import CylinderSides, HeldChambers, find_holds
+from sealscope.diagnosis.inference.circuit.locked_holds import CylinderSides, HeldChambers, find_locked_holds
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import WITHIN_95, Course, Information, Interval, StepTest, course, step_test
 from sealscope.diagnosis.inference.scatter import RecordingSums
@@ -108,7 +108,7 @@ class RecordedBalance:
         least = float(np.nanquantile(lowest, CHARGED))
         to_absolute = max(P_ATM, LEAST_ABSOLUTE - float(np.nanmin(lowest)))
         channels = (recording.t, *(values + to_absolute for values in pressures.values()), recording["x"])
-        holds = find_holds(channels, rests, recording.rate)
+        holds = find_locked_holds(channels, rests, recording.rate)
         ends = float(recording.t[0]), float(recording.t[-1])
         return HeldChambers(holds, sides, *ends, least + to_absolute) if holds else None
 
