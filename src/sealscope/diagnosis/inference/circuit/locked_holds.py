@@ -1,17 +1,16 @@
 """Leakage while valves shut a cylinder from its pump: the two chambers balance each other.
 
-The pump is cut off, so that each chamber is a closed volume but for what leaks. From the begin of a hold on,
+The pump is cut off, so each chamber is a closed volume with leaks. From the begin of a hold on,
 
     m_A dx + V_A (dp_A/K - alpha p_0 d(1/p_A)) = -G I - e_A I_A,
    -m_B dx + V_B (dp_B/K - alpha p_0 d(1/p_B)) = +G I - e_B I_B,
 
-with what the piston displaces (m_A, m_B the areas in the unit of the pump's flow), the volumes V of oil, their
-bulk modulus K and free air alpha, and the integrals I of a power of p_A - p_B - z, I_A and I_B of the
-pressures. A piston that leaks takes from A what it brings to B; a rod seal takes from one side alone, and a check valve
-may make up what the piston then displaces on the other. Readings of all holds, each side of a hold about its mean, are
-one linear regression, with what is believed of the oil (`priors.toml`, `held_oil`) as readings beside them. Onset of
-the leak and z, the zero of the pressures' difference, are the likeliest: where a leak has made the pressures equal,
-they show it. Of the three leaks each counts with the probability that it is the one.
+with the piston's areas m_A and m_B in the unit of the pump's flow, the volumes V of oil, their bulk modulus K and free
+air alpha. I integrates a power of p_A - p_B - z over time, I_A and I_B the pressures. A leaking piston moves oil from A
+to B; a leaking rod seal takes oil from one side alone, and the piston then gives way: a check valve may fill the other
+side. All holds together are one linear regression, each side of a hold about its mean, with the priors of the oil
+(`priors.toml`, `held_oil`) as further readings. The onset of the leak and z, the zero of p_A - p_B, are the likeliest;
+a leak that has made the pressures equal shows z. The three leaks are hypotheses, each weighed by its probability.
 
 Source: Merritt, Hydraulic Control Systems, 1967, section 6.3 (continuity of the chambers).
 """
@@ -110,7 +109,7 @@ class HeldLeaks(NamedTuple):
 
 
 class HeldLevel(NamedTuple):
-    """A leak's coefficient with its deviation by noise, that by what is believed of the oil, and its log likelihood."""
+    """A leak's coefficient with its deviations, by noise and by the priors of the oil, and its log likelihood."""
 
     value: float
     deviation: float
@@ -147,10 +146,10 @@ class HeldChambers:
     def _regression(self, feeds: bool) -> tuple[Array, Array, Array]:
         """Return the left side (r,) of the readings, the columns (r, 4) of the oil, and the widths of its priors.
 
-        The left side is what the piston displaces but for what the oil is believed to give. The columns: the
-        compressibility, that of the dead volume of either side beyond what is believed, and free air. The rows: for
-        each hold its readings of side A, then of side B, about their means. `feeds`: check valves make up what the
-        piston displaces at the charge pressure.
+        The left side is the volume displaced by the piston, less the compression expected by the priors. The columns
+        are deviations from these: of the compressibility, of the dead volumes of A and B, and of free air. The rows
+        are the readings of each hold, side A before side B, about their means. `feeds`: at the charge pressure check
+        valves replace the displaced oil.
         """
         believed, stroke = priors("inference")["held_oil"], self.sides.high - self.sides.low
         give, dead, air = believed["compressibility"], believed["dead"], believed["air"]
@@ -211,7 +210,7 @@ class HeldChambers:
         return solved[:count], covariance[:count, :count] - by_oil, by_oil, variance
 
     def _least(self, oil: Array) -> float:
-        """Return the least variance of a reading: terms describe the compressed volume to within a share."""
+        """Return the least variance of a reading: the terms describe the compressed volume to within a share."""
         believed = priors("inference")["held_oil"]
         compressed = oil @ [believed["compressibility"], 0.0, 0.0, believed["air"]]
         share: float = believed["misfit"]
